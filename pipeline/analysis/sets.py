@@ -16,6 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from magpend_core import neighbours
+
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.models.model import Model
@@ -56,23 +58,29 @@ class Geometry:
     @cached_property
     def circumference(self) -> np.ndarray:
         """Circumference of each angle's circle in units of its scale; 0 for states that are no angles."""
-        return np.where(self.is_angle, TWO_PI / np.asarray(self.scales), 0.0)
+        return np.where(self.is_angle, TWO_PI / self._divisors, 0.0)
+
+    @cached_property
+    def _divisors(self) -> np.ndarray:
+        return np.asarray(self.scales)
+
+    @cached_property
+    def _circles(self) -> list[tuple[int, float]]:
+        return [(i, length) for i, length in enumerate(self.circumference.tolist()) if length > 0.0]
 
     def scaled(self, points: np.ndarray) -> np.ndarray:
         """Divide states (..., state) by their scales, and wrap angles to [0, circumference)."""
-        scaled = np.asarray(points, np.float64) / np.asarray(self.scales)
-        for i, length in enumerate(self.circumference):
-            if length > 0.0:
-                folded = np.mod(scaled[..., i], length)
-                scaled[..., i] = np.where(folded >= length, 0.0, folded)
+        scaled = np.asarray(points, np.float64) / self._divisors
+        for i, length in self._circles:
+            folded = np.mod(scaled[..., i], length)
+            scaled[..., i] = np.where(folded >= length, 0.0, folded)
         return np.asarray(scaled)
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the difference a - b in units of the scales, along the shorter arc for angles."""
-        difference = (np.asarray(a) - np.asarray(b)) / np.asarray(self.scales)
-        for i, length in enumerate(self.circumference):
-            if length > 0.0:
-                difference[..., i] -= length * np.round(difference[..., i] / length)
+        difference = (np.asarray(a) - np.asarray(b)) / self._divisors
+        for i, length in self._circles:
+            difference[..., i] -= length * np.round(difference[..., i] / length)
         return np.asarray(difference)
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -82,7 +90,8 @@ class Geometry:
     def tree(self, points: np.ndarray) -> cKDTree:
         """Build a nearest-neighbour search tree of states (query it with `scaled` states and ``p=inf``)."""
         # sliding midpoints: trees are asked a few times each, and a balanced one costs more than it saves
-        return cKDTree(self.scaled(points), boxsize=self.circumference, balanced_tree=False, compact_nodes=False)
+        boxsize = self.circumference if self._circles else None
+        return cKDTree(self.scaled(points), boxsize=boxsize, balanced_tree=False, compact_nodes=False)
 
     def boxes(self, points: np.ndarray, side: float) -> np.ndarray:
         """Return the integer coordinates of the box that holds each state; boxes have the side `side` in scaled
@@ -155,13 +164,15 @@ def hashes(rows: np.ndarray) -> np.ndarray:
 def groups(n: int, pairs: np.ndarray) -> np.ndarray:
     """Return the number of the connected component of each node, in a graph of `n` nodes with edges (m, 2)."""
     edges = np.asarray(pairs, np.int64).reshape(-1, 2)
+    if not len(edges):
+        return np.arange(n)
     graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.ndarray:
     """Return the distance of each state of `a` from the nearest state of `b`."""
-    return np.asarray(geometry.tree(b).query(geometry.scaled(a), p=np.inf)[0])
+    return neighbours.nearest_distances(geometry.scaled(b), geometry.scaled(a), geometry.circumference)
 
 
 def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:

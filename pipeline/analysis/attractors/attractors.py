@@ -111,7 +111,7 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.describing.features import ENERGY, Features
-from pipeline.analysis.attractors.describing.labelling import Found, analyse
+from pipeline.analysis.attractors.describing.labelling import Found, analyse, follow
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
@@ -204,7 +204,9 @@ def identify(
         if dynamics.can_rest and not dynamics.is_flow and options.polish:
             tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
         works = {index: analyse(point, search) for index, point in points.items()}
-        found |= answer_all(works, points, settings)
+        own = answer_all(works, points, settings)
+        follow(own, points, search)
+        found |= own
     return _with_exponents(_dataset(ds, found, search), ds)
 
 

@@ -212,7 +212,7 @@ class Destinations:
                 found[left[i]] = self._rest_id(int(number[i]))
         if self._clouds and flights.section.shape[1] >= IN_CLOUD:
             left = np.flatnonzero(found < 0)
-            number = members(flights.section[left, -IN_CLOUD:], self._clouds, self.geometry)
+            number = members(flights.section[left, -IN_CLOUD:], self._clouds)
             found[left] = np.array([*self._cloud_ids, UNDECIDED])[number]
         return found
 
@@ -244,7 +244,7 @@ class Destinations:
         cloud = self._clouds[self._cloud_ids.index(number)] if number in self._cloud_ids else None
         if cloud is None:
             return np.ones(len(path), bool)
-        inside = cloud.distances(path, self.geometry) <= REACHED
+        inside = cloud.distances(path) <= REACHED
         share = np.cumsum(inside[::-1])[::-1] / np.arange(len(inside), 0, -1)
         return np.asarray(share >= INSIDE)
 
@@ -275,6 +275,8 @@ class Destinations:
         return replace(
             self.point,
             cube=cube,
+            at={},
+            arrays={},
             start_dims=(START,),
             block_cells=n,
             at_rest=None,
@@ -295,7 +297,7 @@ class Destinations:
         if rest is not None:
             return self._rest_id(rest)
         if course.goes_on and course.length >= IN_CLOUD:
-            number = int(members(course.extension[None, -IN_CLOUD:], self._clouds, self.geometry)[0])
+            number = int(members(course.extension[None, -IN_CLOUD:], self._clouds)[0])
             return self._cloud_ids[number] if number >= 0 else UNDECIDED
         return UNDECIDED
 

@@ -293,7 +293,7 @@ class Catalog:
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
-        own = members(block.section[rows], [cloud for _, cloud in self._sets], self._geometry)
+        own = members(block.section[rows], [cloud for _, cloud in self._sets])
         for row, k in zip(rows[own >= 0], own[own >= 0].tolist(), strict=True):
             numbers[row] = self._sets[k][0].number
 
@@ -378,6 +378,7 @@ class Catalog:
     def _point(self, cells: xr.Dataset) -> _WholePoint:
         return _WholePoint(
             cells,
+            {},
             split_dims(cells["status"])[1],
             self.place.frequency,
             self._packed,

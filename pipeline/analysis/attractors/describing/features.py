@@ -13,19 +13,21 @@ image is its own partner. If the symmetry is approximate (a duty cycle of 0.4927
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from magpend_core.defaults import MOST_STEPS
 from magpend_core.models.model import Mirror, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
 from magpend_core.sampling import Drive, sample
-from magpend_core.trajectory import trajectory
+from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
-from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
+from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
@@ -35,6 +37,9 @@ ENERGY = "energy"
 
 SAMPLES = 256
 """Times per drive period or return at which a polished orbit is sampled for its ranges; even."""
+
+MOST_SAMPLES = 2**20
+"""Most states of orbits that are held at once."""
 
 
 @dataclass
@@ -175,25 +180,53 @@ def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameter
     return np.where(np.isfinite(section).all(axis=(1, 2)), code, UNKNOWN).astype(np.int64)
 
 
-def follow_orbit(found: Features, parameters: Parameters, frequency: float, geometry: Geometry) -> None:
-    """Integrate a periodic orbit over its period, and store its ranges, exact rotation, energy range and mirror image
-    in `found`.
+def follow_orbits(orbits: Sequence[tuple[Features, Parameters, float]], geometry: Geometry) -> None:
+    """Integrate periodic orbits over their periods, and store their ranges, exact rotations, energy ranges and mirror
+    images.
 
-    `frequency` is the drive frequency, or the mean frequency of the returns [Hz].
+    Parameters
+    ----------
+    orbits
+        Features of each orbit, its parameters, and the drive frequency or the mean frequency of the returns [Hz].
+    geometry
+        Geometry of the states.
     """
-    p, flow = found.orbit_period, of_flow(parameters)
-    times = np.arange(p * SAMPLES + 1) / (SAMPLES * frequency)
-    states = trajectory(flow, frequency, found.points[0], times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL)
+    by_period = rows_by_number(np.array([found.orbit_period for found, _, _ in orbits], np.int64))
+    for period, rows in by_period.items():
+        n = max(1, MOST_SAMPLES // (period * SAMPLES))
+        for begin in range(0, len(rows), n):
+            _follow([orbits[row] for row in rows[begin : begin + n]], period, geometry)
+
+
+def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry) -> None:
+    flows = [of_flow(parameters) for _, parameters, _ in orbits]
+    times = [np.arange(period * SAMPLES + 1) / (SAMPLES * frequency) for _, _, frequency in orbits]
+    paths = sample(
+        flows[0].model.system,
+        np.array([flow.pack() for flow in flows]),
+        np.array([found.points[0] for found, _, _ in orbits]),
+        times,
+        drives=[Drive(np.full(period, 1.0 / frequency)) for _, _, frequency in orbits],
+        rtol=PORTRAIT_RTOL,
+        atol=PORTRAIT_RTOL,
+        max_steps_per_interval=MOST_STEPS,
+        limits_first_step=False,
+    )
+    if (paths.status != Status.BOUNDED).any():
+        raise ArithmeticError(f"An orbit ended early: {Status(paths.status.max()).sentence}.")
     angles = np.flatnonzero(geometry.is_angle)
-    turns = np.round((states[-1] - states[0])[angles] / TWO_PI)
-    found.rotation = turns / p + 0.0  # no -0.0
-    found.state_min, found.state_max = states.min(axis=0), states.max(axis=0)
-    found.state_min[angles[turns != 0]], found.state_max[angles[turns != 0]] = -np.pi, np.pi
-    _fill_energy(found, times, states, flow, frequency)
-    mirror = parameters.model.mirror
-    if mirror is not None:
-        first = SAMPLES // 2 if mirror.half_period else 0
-        found.image = states[first : p * SAMPLES : SAMPLES] * np.array(mirror.signs)
+    turns = np.round((paths.states[:, -1] - paths.states[:, 0])[:, angles] / TWO_PI)
+    low, high = paths.states.min(axis=1), paths.states.max(axis=1)
+    for row, (found, parameters, frequency) in enumerate(orbits):
+        found.rotation = turns[row] / period + 0.0  # no -0.0
+        found.state_min, found.state_max = low[row], high[row]
+        rotating = angles[turns[row] != 0]
+        found.state_min[rotating], found.state_max[rotating] = -np.pi, np.pi
+        _fill_energy(found, times[row], paths.states[row], flows[row], frequency)
+        mirror = parameters.model.mirror
+        if mirror is not None:
+            first = SAMPLES // 2 if mirror.half_period else 0
+            found.image = paths.states[row, first : period * SAMPLES : SAMPLES] * np.array(mirror.signs)
 
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:

@@ -123,6 +123,26 @@ def _is_elsewhere(point: Point) -> np.ndarray:
     return found
 
 
+def follow(found: Mapping[tuple[int, ...], Found], points: Mapping[tuple[int, ...], Point], search: Search) -> None:
+    """Add the features of all orbits that need their motion over the whole period, and pair mirror images."""
+    orbits = [
+        (x, point.parameters, point.frequency)
+        for one, point in zip(found.values(), (points[index] for index in found), strict=True)
+        for x in one.features
+        if x.is_polished and x.orbit_period and point.parameters is not None
+    ]
+    returns = search.dynamics.is_flow
+    clocks = [x.orbit_period / x.period_s if returns else frequency for x, _, frequency in orbits]
+    feature.follow_orbits([(x, p, clock) for (x, p, _), clock in zip(orbits, clocks, strict=True)], search.geometry)
+    for x, parameters, frequency in orbits:
+        turns = np.round(x.rotation * x.orbit_period).astype(np.int64)
+        x.side = int(feature.sides_of(x.points[None], turns[None], frequency, parameters)[0])
+    model = search.dynamics.model
+    if model is not None and model.mirror is not None:
+        for one in found.values():
+            feature.pair_mirrors(one.features, model.mirror, search.options.mirror_threshold, search.geometry)
+
+
 # ---- conservative systems ----------------------------------------------------------------------
 
 
@@ -245,6 +265,8 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
     After a search by Newton's method there may be no orbit: beside the ghost of a fold, cells move too slowly to see.
     """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
+    if left.max(initial=-1) < 0:
+        return []
     best: dict[int, tuple[float, int, np.ndarray]] = {}
     for block in point.blocks():
         _representatives(block, left[block.cells], best, search.geometry)
@@ -269,7 +291,7 @@ def _label_sets(
     for block in point.blocks():
         free = (labels.label[block.cells] < 0) & (labels.decision[block.cells] != DIVERGES)
         rows = np.flatnonzero(block.is_bounded & free & ~elsewhere[block.cells])
-        own = members(block.section[rows], clouds, search.geometry)
+        own = members(block.section[rows], clouds)
         labels.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
 
 
@@ -322,9 +344,6 @@ def _describe(
     numbers = list(features)
     order = [numbers[i] for i in order_by_points([features[n].points for n in numbers], search.geometry)]
     ranked = [features[n] for n in order]
-    model = search.dynamics.model
-    if model is not None and model.mirror is not None:
-        feature.pair_mirrors(ranked, model.mirror, search.options.mirror_threshold, search.geometry)
     table = np.full(max(numbers, default=0) + 2, -1, np.int32)
     table[order] = np.arange(len(order))
     _number_ends(ranked, order, sets, len(orbits), resting, table)
@@ -433,20 +452,14 @@ def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Featu
         cells.high,
         stability=orbit.stability,
     )
-    frequency, is_flow = point.frequency, search.dynamics.is_flow
     if point.parameters is not None:
-        found.side = cells.side(point.parameters, frequency)
+        found.side = cells.side(point.parameters, point.frequency)
     if orbit.is_polished:
-        frequency = orbit.period / orbit.seconds if is_flow else frequency
-        _fill_orbit(found, orbit, is_flow)
+        _fill_orbit(found, orbit, search.dynamics.is_flow)
     if point.parameters is None or not search.options.polish:
         return found
     if not found.is_polished:
         feature.follow_points(found, point.parameters, point.frequency)
-        return found
-    feature.follow_orbit(found, point.parameters, frequency, search.geometry)
-    turns = np.round(found.rotation * found.orbit_period).astype(np.int64)
-    found.side = int(feature.sides_of(orbit.points[None], turns[None], point.frequency, point.parameters)[0])
     return found
 
 

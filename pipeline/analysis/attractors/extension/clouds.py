@@ -16,21 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.analysis.sets import Geometry
+from magpend_core.neighbours import n_nearer
+from pipeline.analysis.sets import Geometry, nearest_distances
 
 SAME, OTHER = 0.25, 0.05
 """Share of neighbours in the other sample from which two samples are one set, and below which two sets."""
 
 MOST_POINTS = 4096
 """Most points per sample in a comparison."""
-
-PARTS = 8
-"""Parts in which points look for their neighbours: a share that is certain to be large enough ends the search."""
 
 INSIDE, REACHED = 0.9, 3.0
 """A cell is on a set if the share `INSIDE` of its points lies within `REACHED` times the set's spacing."""
@@ -75,21 +73,14 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0,
     n = min(len(a), len(b), MOST_POINTS) // 2
     if n < 2:
         return float("nan")
-    a, b = thinned(a, 2 * n), thinned(b, 2 * n)
+    a, b = (geometry.scaled(thinned(points, 2 * n)) for points in (a, b))
     return min(_crossing(a, b, n, geometry, least, enough), _crossing(b, a, n, geometry, least, enough))
 
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float, enough: float) -> float:
     # take points from the whole duration of the other sample
-    trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
-    later, crossed = geometry.scaled(own[n : 2 * n]), 0.0
-    for part in range(PARTS):
-        near = [np.maximum(tree.query(later[part::PARTS], p=np.inf)[0], least) for tree in trees]
-        # a point equally near to both counts half
-        crossed += float((near[1] < near[0]).sum() + 0.5 * (near[1] == near[0]).sum())
-        if crossed >= enough * n:
-            break
-    return crossed / n
+    points = own[:n], thinned(other, n), own[n : 2 * n]
+    return n_nearer(*points, geometry.circumference, least, enough * n) / n
 
 
 def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> bool:
@@ -139,6 +130,8 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
 
 def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
     each = max(4, MOST_POINTS // len(samples))
+    if len({len(sample) for sample in samples}) == 1:
+        return thinned(np.stack(samples, axis=1), each).reshape(-1, samples[0].shape[1])
     parts = [thinned(sample, each) for sample in samples]
     n = min(len(part) for part in parts)
     return np.stack([part[:n] for part in parts], axis=1).reshape(-1, parts[0].shape[1])
@@ -146,45 +139,55 @@ def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Section points of one set in a search tree, to test whether other trajectories lie on the same set.
+    """Section points of one set, to test whether other trajectories lie on the same set.
 
     Attributes
     ----------
-    tree : cKDTree
-        Tree of the scaled points.
-    spacing : float
-        Scaled distance within which nearly every point of the set finds another.
+    points : ndarray, (n, state)
+        Section points of its trajectories.
+    geometry : Geometry
+        Geometry of the states.
+    least : float
+        Smallest spacing of points to assume.
     """
 
-    tree: cKDTree
-    spacing: float
+    points: np.ndarray
+    geometry: Geometry
+    least: float
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
-        """Build the search tree of a set from section points of its trajectories. `least` is the smallest point spacing
-        to assume.
-        """
-        points = _pooled(samples)
-        # distances from one half to the other: a safe spacing, since the whole is twice as dense
-        order = np.random.default_rng(0).permutation(len(points))
-        half, rest = np.array_split(points[order], 2)
-        away = geometry.tree(half).query(geometry.scaled(rest), p=np.inf)[0] if len(rest) else np.zeros(1)
-        return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
+        """Pool the section points of a set's trajectories."""
+        return cls(_pooled(samples), geometry, least)
 
-    def distances(self, section: np.ndarray, geometry: Geometry, most: float = np.inf) -> np.ndarray:
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Search tree of the scaled points."""
+        return self.geometry.tree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Scaled distance within which nearly every point of the set finds another."""
+        # distances from one half to the other: a safe spacing, since the whole is twice as dense
+        order = np.random.default_rng(0).permutation(len(self.points))
+        half, rest = np.array_split(self.points[order], 2)
+        away = nearest_distances(rest, half, self.geometry) if len(rest) else np.zeros(1)
+        return max(float(np.quantile(away, 0.99)), self.least)
+
+    def distances(self, section: np.ndarray, most: float = np.inf) -> np.ndarray:
         """Return the distance of each section point (..., state) from the set, in units of the spacing of the set's
         points. A distance above `most` may be infinite, which ends the search for it sooner.
         """
         bound = 1.001 * most * self.spacing
-        away = self.tree.query(geometry.scaled(section), p=np.inf, distance_upper_bound=bound)[0]
+        away = self.tree.query(self.geometry.scaled(section), p=np.inf, distance_upper_bound=bound)[0]
         return np.asarray(away / self.spacing)
 
 
-def members(section: np.ndarray, clouds: Sequence[Cloud], geometry: Geometry) -> np.ndarray:
+def members(section: np.ndarray, clouds: Sequence[Cloud]) -> np.ndarray:
     """Return the index of the set (in `clouds`) on which each cell's section points lie; -1 for none."""
     if not clouds or not len(section):
         return np.full(len(section), -1, np.int64)
-    away = np.stack([cloud.distances(section, geometry, REACHED) for cloud in clouds])
+    away = np.stack([cloud.distances(section, REACHED) for cloud in clouds])
     inside = (away <= REACHED).mean(axis=2)
     middle = np.median(away, axis=2)
     best = np.where(inside >= INSIDE, middle, np.inf).argmin(axis=0)

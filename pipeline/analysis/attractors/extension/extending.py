@@ -115,7 +115,7 @@ def extend(
     work = _Extension(point, list(orbits), settings, budget)
     loose = np.flatnonzero(label < 0)
     for _ in range(ROUNDS):
-        chosen = work.sample(loose, n_sample)
+        chosen = work.sample(loose, n_sample) if len(loose) else []
         if not chosen:
             break
         work.courses += chosen
@@ -181,10 +181,8 @@ class _Extension:
         """Return the cells of `loose` whose end is still open: not integrated further, and on no set whose stability is
         decided.
         """
-        done = np.zeros(self.point.n_cells, bool)
-        done[self.told(loose)[0]] = True
-        done[[course.cell for course in self.courses]] = True
-        return np.asarray(loose[~done[loose]])
+        left = np.setdiff1d(loose, [course.cell for course in self.courses])
+        return np.setdiff1d(left, self.told(left)[0])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the cells of `loose` that lie on sets whose stability is decided, and the index of each cell's set."""
@@ -193,9 +191,9 @@ class _Extension:
         is_loose = np.zeros(self.point.n_cells, bool)
         is_loose[loose] = True
         cells, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-        for block in self.point.blocks() if final else ():
+        for block in self.point.blocks() if len(clouds) and len(loose) else ():
             rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
-            own = members(block.section[rows], clouds, self.geometry)
+            own = members(block.section[rows], clouds)
             cells.append(rows[own >= 0] + block.cells.start)
             numbers.append(np.array(final, np.int64)[own[own >= 0]])
         return np.concatenate(cells), np.concatenate(numbers)
@@ -276,7 +274,7 @@ class _Extension:
         """Record the newly integrated section points of each trajectory. Finish the trajectories that reached an orbit
         or an equilibrium.
         """
-        computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
+        computed = (leg.status == Status.PERIODIC) | (leg.status == Status.BOUNDED)
         for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
             course.state, course.step = state, float(step)
             if ok:

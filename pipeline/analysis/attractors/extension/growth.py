@@ -18,9 +18,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
 from scipy.special import ndtr, stdtrit
 
+from magpend_core.stretching import stretched
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
 
@@ -134,7 +134,8 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
     volumes
         Logarithm of the change of a volume per section, shape (cell, section); see `volumes_of`.
     """
-    steps, volumes = _logarithms(derivatives), np.maximum(volumes, GONE)
+    sizes, volumes = stretched(derivatives), np.maximum(volumes, GONE)
+    steps = np.log(sizes, out=np.full(sizes.shape, GONE), where=sizes > 1e-286)
     n = steps.shape[1]
     # drop the first quarter, in which the basis aligns with the growing directions
     steps = steps[:, n // 4 :]
@@ -217,22 +218,6 @@ def volumes_of(
     areas = np.linalg.slogdet(derivatives[:, kept][:, :, kept])[1] if kept else np.zeros(len(before))
     speeds = np.abs(np.stack([flow(before)[:, crossed], flow(after)[:, crossed]]))
     return np.asarray(areas + np.log(speeds[1] / speeds[0]))
-
-
-def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Compute by QR the logarithmic growth of orthonormal directions at each section point."""
-    n_states = derivatives.shape[-1]
-    sizes = np.empty(derivatives.shape[:-1])
-    for path, own in zip(derivatives, sizes, strict=True):
-        basis = np.eye(n_states)
-        for derivative, size in zip(path, own, strict=True):
-            # LAPACK itself: the matrices are so small that a layer above it takes most of the time
-            factors, tau, _, _ = lapack.dgeqrf(derivative @ basis)
-            size[:] = np.diagonal(factors)
-            basis = lapack.dorgqr(factors, tau)[0]
-    sizes = np.abs(sizes)
-    grown = np.log(sizes, out=np.full(sizes.shape, GONE), where=sizes > 1e-286)
-    return grown
 
 
 def _weighted(values: np.ndarray) -> np.ndarray:

@@ -16,6 +16,9 @@ from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import LOOSE_SHARE, REACH, STRICT
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
+MOST_PAIRS = 2**18
+"""Most distances between cells and points of orbits that are held at once."""
+
 
 @dataclass(frozen=True)
 class _Metric:
@@ -90,15 +93,20 @@ def decide(
     """
     label = np.full(len(block.status), -1, np.int64)
     decision = np.zeros(len(block.status), np.int8)
+    if not orbits:
+        return label, decision
     stable = [i for i, orbit in enumerate(orbits) if orbit.is_stable]
-    unstable = [i for i in range(len(orbits)) if i not in stable]
+    unstable = [i for i, orbit in enumerate(orbits) if not orbit.is_stable]
     within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance
-    for numbers in [stable] if tolerance > STRICT else [stable, unstable]:
+    both = [stable] if tolerance > STRICT else [stable, unstable]
+    for numbers in both if block.is_closed.any() else []:
         closed = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
         for cells, which, phase in _nearest(block.section, closed, [orbits[i] for i in numbers], geometry):
             number = numbers[which]
             own = cells[_on_orbit(block.section[cells], orbits[number], phase, within, geometry)]
             label[own], decision[own] = number, CLOSED
+    if not stable:
+        return label, decision
     rest = np.flatnonzero((block.is_closed | block.is_bounded) & (decision == UNDECIDED))
     for cells, which, phase in _nearest(block.section, rest, [orbits[i] for i in stable], geometry):
         code = _approach(block.section[cells], orbits[stable[which]], phase, tolerance, geometry)
@@ -115,9 +123,13 @@ def _nearest(
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
     phase = np.concatenate([np.arange(o.period) for o in orbits])
-    tree = geometry.tree(np.concatenate([o.points for o in orbits]))
-    _, near = tree.query(geometry.scaled(section[cells, -1]), p=np.inf, distance_upper_bound=REACH)
-    for i in np.unique(near[near < len(owner)]):
+    points = np.concatenate([o.points for o in orbits])
+    near = np.full(len(cells), -1)
+    for rows in np.array_split(np.arange(len(cells)), -(-len(cells) * len(points) // MOST_PAIRS)):
+        away = geometry.distance(section[cells[rows], None, -1], points)
+        nearest = away.argmin(axis=1)
+        near[rows] = np.where(away[np.arange(len(rows)), nearest] < REACH, nearest, -1)
+    for i in np.unique(near[near >= 0]).tolist():
         yield cells[near == i], int(owner[i]), int(phase[i])
 
 

@@ -60,13 +60,13 @@ class Block:
         """Whether each cell is on a periodic orbit: its section points repeat, or its period was inferred from
         neighbouring cells.
         """
-        closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
+        closed = (self.status == Status.PERIODIC) | (self.status == Status.INFERRED)
         return np.asarray(closed & (self.orbit_period > 0) & self._finite)
 
     @cached_property
     def is_bounded(self) -> np.ndarray:
         """Whether each cell was integrated to the end without closing on a periodic orbit."""
-        computed = np.isin(self.status, (Status.PERIODIC, Status.BOUNDED))
+        computed = (self.status == Status.PERIODIC) | (self.status == Status.BOUNDED)
         return np.asarray(computed & self._finite & ~self.is_closed)
 
     @cached_property

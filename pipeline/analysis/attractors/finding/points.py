@@ -109,6 +109,8 @@ class Point:
 
     Attributes
     ----------
+    cube, at : Dataset, Mapping
+        Cells of some parameter points, and the indices of this point among them.
     parameters : Parameters or None
         Parameters with the swept values of this point; None for a system without a model.
     packed : ndarray
@@ -133,9 +135,12 @@ class Point:
         Whether sections are crossings of a flow.
     can_rest : bool
         Whether equilibria are searched.
+    arrays : dict
+        Variables of all cells, shapes (cell, ...), if they fit the memory; else they are read from the cube.
     """
 
     cube: xr.Dataset
+    at: Mapping[str, int]
     start_dims: tuple[str, ...]
     frequency: float
     packed: np.ndarray
@@ -150,6 +155,7 @@ class Point:
     n_periods: int = 0
     is_flow: bool = False
     can_rest: bool = False
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
     _whole: Block | None = None
 
     @property
@@ -195,14 +201,13 @@ class Point:
         inner = self.n_cells // max(length, 1)
         step = max(1, self.block_cells // max(inner, 1))
         if step >= length:
-            self._whole = self._whole or self._read(self.cube, slice(0, self.n_cells), self.n_cells)
+            self._whole = self._whole or self._read(slice(0, length), slice(0, self.n_cells))
             yield self._known(self._whole)
             return
         for begin in range(0, length, step):
-            part = self.cube.isel({first: slice(begin, begin + step)})
-            n = min(step, length - begin) * inner
             report(PASSING, begin * inner, self.n_cells, UNTOLD)
-            yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
+            end = min(begin + step, length)
+            yield self._known(self._read(slice(begin, end), slice(begin * inner, end * inner)))
 
     def _known(self, block: Block) -> Block:
         """Set the status of cells at an equilibrium or on a limit cycle to ``NO_RETURN``, so that the search for orbits
@@ -214,21 +219,36 @@ class Point:
                 block = replace(block, status=status)
         return block
 
-    def _read(self, part: xr.Dataset, cells: slice, n: int) -> Block:
-        def values(name: str, *own: Any) -> np.ndarray:
-            array = part[name].transpose(*self.start_dims, *own)
-            return np.asarray(array.values).reshape(n, *array.shape[len(self.start_dims) :])
+    def _read(self, rows: slice, cells: slice) -> Block:
+        """Read the cells of some values of the first start dim."""
+        arrays = {name: array[cells] for name, array in self.arrays.items()}
+        if not arrays:
+            part = self.cube.isel({**self.at, **dict.fromkeys(self.start_dims[:1], rows)})
+            arrays = _arrays(part, (), self.start_dims)
+        n, n_keep = arrays["section"].shape[:2]
+        turns, seconds = arrays.get("turns"), arrays.get("return_time")
+        return Block(
+            cells,
+            arrays["section"],
+            arrays["status"],
+            arrays["orbit_period"],
+            np.zeros((n, self.n_angles), np.int64) if turns is None else turns,
+            arrays.get("rest_state"),
+            np.full((n, n_keep), 1.0 / self.frequency) if seconds is None else seconds,
+            arrays.get("step_size"),
+            arrays.get(_MARK),
+        )
 
-        section = values("section", "period_index", "state").astype(np.float64, copy=False)
-        turns = values("turns", ...) if "turns" in part else np.zeros((n, self.n_angles), np.int64)
-        rest = values("rest_state", "state") if "rest_state" in part else None
-        if "return_time" in part:
-            seconds = values("return_time", "period_index")
-        else:
-            seconds = np.full(section.shape[:2], 1.0 / self.frequency)
-        step = values("step_size") if "step_size" in part else None
-        marks = values(_MARK) if _MARK in part else None
-        return Block(cells, section, values("status"), values("orbit_period"), turns, rest, seconds, step, marks)
+
+def _arrays(part: xr.Dataset, dims: tuple[str, ...], start_dims: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Return the variables of some cells as arrays of shape (*dims, cell, ...), sections as float64."""
+    found, n = {}, math.prod(part.sizes[d] for d in start_dims)
+    for name, variable in part.data_vars.items():
+        own = [d for d in ("period_index", "state") if d in variable.dims]
+        values = variable.transpose(*dims, *start_dims, ..., *own).values
+        values = values.reshape(*values.shape[: len(dims)], n, *values.shape[len(dims) + len(start_dims) :])
+        found[str(name)] = values.astype(np.float64, copy=False) if name == "section" else values
+    return found
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
@@ -240,23 +260,26 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
     dims, start_dims = split_dims(ds["status"])
     shape = [ds.sizes[d] for d in dims]
     per_point = ds["section"].size * 8 // max(math.prod(shape), 1)
-    cell = 8 * math.prod(ds.sizes[d] for d in ("period_index", "state"))
+    block_cells = max(1, budget // (32 * math.prod(ds.sizes[d] for d in ("period_index", "state"))))
+    axes, fixed = {d: ds[d].values.tolist() for d in dims}, _fixed(ds)
     rows = max(1, budget // max(per_point * math.prod(shape[1:]), 1))
     for begin in range(0, shape[0] if dims else 1, rows):
         slab = cube.isel({dims[0]: slice(begin, begin + rows)}) if dims else cube
+        arrays = {}
         if slab["section"].size * 8 <= budget:
             slab = slab.load()
-            ordered = slab["section"].transpose(*dims, *start_dims, "period_index", "state")
-            flat = ordered.values.astype(np.float64, copy=False)
-            marks = marks_of(flat.reshape(-1, *flat.shape[-2:])).reshape(flat.shape[:-2])
-            slab = slab.assign({_MARK: ((*dims, *start_dims), marks)})
+            arrays = _arrays(slab, dims, start_dims)
+            section = arrays["section"]
+            arrays[_MARK] = marks_of(section.reshape(-1, *section.shape[-2:])).reshape(section.shape[:-2])
+        n_periods = slab["n_periods"].sum(start_dims).transpose(*dims).values if "n_periods" in slab else None
         points = {}
         for local in np.ndindex(*(slab.sizes[d] for d in dims)):
             index = (local[0] + begin, *local[1:]) if dims else ()
-            one = slab.isel(dict(zip(dims, local, strict=True)))
-            values = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
-            values = {**_fixed(ds), **values}
-            points[index] = _point(one, start_dims, values, dynamics, max(1, budget // (4 * cell)))
+            values = {**fixed, **{d: float(axes[d][i]) for d, i in zip(dims, index, strict=True)}}
+            at = dict(zip(dims, local, strict=True))
+            point = points[index] = _point(slab, at, start_dims, values, dynamics, block_cells)
+            point.n_periods = point.n_cells * ds.sizes["period_index"] if n_periods is None else int(n_periods[local])
+            point.arrays = {name: array[local] for name, array in arrays.items()}
         yield points
 
 
@@ -265,20 +288,20 @@ def _fixed(ds: xr.Dataset) -> dict[str, float]:
 
 
 def _point(
-    one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics, block_cells: int
+    cube: xr.Dataset,
+    at: Mapping[str, int],
+    start_dims: tuple[str, ...],
+    values: Mapping[str, float],
+    dynamics: Dynamics,
+    block_cells: int,
 ) -> Point:
     frequency, base = frequency_of(dynamics.model, values), dynamics.parameters
-    own: dict[str, Any] = {
-        "is_flow": dynamics.is_flow,
-        "can_rest": dynamics.can_rest,
-        "n_periods": int(one["n_periods"].sum())
-        if "n_periods" in one
-        else one["status"].size * one.sizes["period_index"],
-    }
+    own: dict[str, Any] = {"is_flow": dynamics.is_flow, "can_rest": dynamics.can_rest}
     if isinstance(base, Parameters):
         parameters = base.replace(**{name: value for name, value in values.items() if name in base})
         return Point(
-            one,
+            cube,
+            at,
             start_dims,
             frequency,
             parameters.pack(),
@@ -293,4 +316,4 @@ def _point(
     for name, value in values.items():
         if name in names:
             packed[names.index(name)] = value
-    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system, **own)
+    return Point(cube, at, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system, **own)

@@ -31,6 +31,10 @@ LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
 
 
+MOST_SLOPES = 16_384
+"""Most derivatives of the section map in one call of the engine."""
+
+
 @dataclass(frozen=True)
 class Leg:
     """Request to integrate trajectories over some more sections, from states (n, state) with step sizes (n,).
@@ -298,7 +302,12 @@ def _slopes(
         sizes = [len(request.point) for request in own.values()]
         packed, frequency, ends = _gathered(sizes, own, points)
         start = np.concatenate([request.point for request in own.values()])
-        ways = section_map(packed, frequency, start, 1, rtol=rtol, system=settings.system)
+        images, derivatives = np.empty_like(start), np.empty((*start.shape, start.shape[1]))
+        # some at a time: the map needs far more memory than its results
+        for begin in range(0, len(start), MOST_SLOPES):
+            some = slice(begin, begin + MOST_SLOPES)
+            ways = section_map(packed[some], frequency[some], start[some], 1, rtol=rtol, system=settings.system)
+            images[some], derivatives[some] = ways.images[:, -1], ways.derivatives
         for index, rows in _slices(own, sizes, ends):
-            found[index] = ways.images[rows, -1], ways.derivatives[rows]
+            found[index] = images[rows], derivatives[rows]
     return found

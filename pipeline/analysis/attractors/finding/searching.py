@@ -153,9 +153,13 @@ def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)
         rest = np.flatnonzero(label < 0)
+        if not len(rest):
+            continue
         closed.add(block.take(rest))
         loose = rest[block.is_bounded[rest]]
         near = near.joined(near_closed(block.section[loose], search.longest, search.geometry, block.marks[loose]))
+    if not len(closed.guesses.key) and not len(near.key):
+        return near
     keys, group = closed.close()
     own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
     if search.is_loose:

@@ -90,35 +90,46 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
     farthest, last = np.full((n, longest + 1), np.inf), np.full((n, longest + 1), np.inf)
     if longest:
         last[:, 1:] = geometry.distance(section[:, -1:], section[:, -2 : -2 - longest : -1])
-    for p in range(1, longest + 1):
-        # if the last section is not near, the farthest is not
-        rows = np.flatnonzero(last[:, p] <= NEAR)
-        if len(rows):
-            half = max((k - p) // 2, 1)
-            lag = geometry.distance(section[rows, k - half :], section[rows, k - half - p : k - p])
-            farthest[rows, p] = lag.max(axis=1)
+    # if the last section is not near, the farthest is not
+    is_near = last <= NEAR
+    for p in np.flatnonzero(is_near.any(axis=0)).tolist():
+        rows, half = np.flatnonzero(is_near[:, p]), max((k - p) // 2, 1)
+        lag = geometry.distance(section[rows, k - half :], section[rows, k - half - p : k - p])
+        farthest[rows, p] = lag.max(axis=1)
     near = farthest <= np.minimum(NEAR, SAME_LAG * farthest.min(axis=1))[:, None]
     period = near.argmax(axis=1)  # 0 where none is near
     return period, last[np.arange(n), period]
 
 
 def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
-    n, k, n_states = section.shape
+    n, k = section.shape[:2]
     period, centre = np.zeros(n, np.int64), section[:, -1].copy()
     # limit the periods: among many long ones, one would shrink by chance
     for p in range(1, min(max_period, CHEAP, k // (N_PARTS * PER_PHASE)) + 1):
         m = k // (N_PARTS * p)
         rest = np.flatnonzero(period == 0)
-        own = section[rest, k - N_PARTS * m * p :].reshape(len(rest), N_PARTS, m, p, n_states)
-        # measure from the last section, so that a circle of angles is cut on its far side
-        away = geometry.difference(own, own[:, -1:, -1:])
-        mean = away.mean(axis=2, keepdims=True)
-        spread = np.abs(away - mean).max(axis=(2, 3, 4))
+        # the last part alone rules out most
+        rest = rest[_scatter(section[rest, k - m * p :], 1, p, geometry)[1][:, 0] <= SPREAD]
+        if not len(rest):
+            continue
+        mean, spread = _scatter(section[rest, k - N_PARTS * m * p :], N_PARTS, p, geometry)
         falls = (spread[:, 1:] < spread[:, :-1]).all(axis=1)
         found = falls & (spread[:, -1] <= np.minimum(SPREAD, SHRINKS * spread[:, 0]))
         period[rest[found]] = p
-        centre[rest[found]] += mean[found, -1, 0, -1] * np.asarray(geometry.scales)
+        centre[rest[found]] += mean[found, -1, -1] * np.asarray(geometry.scales)
     return period, centre
+
+
+def _scatter(section: np.ndarray, n_parts: int, p: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of the sections of each part and phase, from the last section of the phase, and the largest
+    distance from the mean in each part.
+    """
+    n, k, n_states = section.shape
+    own = section.reshape(n, n_parts, k // (n_parts * p), p, n_states)
+    # measure from the last section, so that a circle of angles is cut on its far side
+    away = geometry.difference(own, own[:, -1:, -1:])
+    mean = away.mean(axis=2)
+    return mean, np.abs(away - mean[:, :, None]).max(axis=(2, 3, 4))
 
 
 def near_closed(
@@ -137,6 +148,8 @@ def near_closed(
     chaos that merely passes an orbit; others up to the period `CHEAP`, unless `closing_only`. `marks` are the
     hashes of the cells' sections, if they are known.
     """
+    if not len(section):
+        return Guesses.none(section.shape[2])
     found = Recurrence.of(section, max_period, geometry)
     closes = _closes_in(section, found, geometry)
     worth = (found.period > 0) & (closes if closing_only else closes | (found.period <= CHEAP))

@@ -22,6 +22,8 @@ points (`clouds.mixing`).
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from pipeline.layout.vocabulary import ATTRACTS, EVIDENCE, NEUTRAL, UNSTABLE
@@ -62,10 +64,14 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
     """
     if not np.isfinite(matrix).all():
         return float("nan")
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_TRIALS, *matrix.shape))
-    values = np.linalg.eigvals(np.concatenate([matrix[None], matrix + size * signs]))
+    values = np.linalg.eigvals(np.concatenate([matrix[None], matrix + size * _signs(matrix.shape)]))
     leading = (values.real if real else np.abs(values)).max(axis=1)
     return float(np.abs(leading[1:] - leading[0]).max())
+
+
+@cache
+def _signs(shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(0).choice([-1.0, 1.0], (_TRIALS, *shape))
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
