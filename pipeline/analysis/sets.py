@@ -16,8 +16,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from magpend_core import neighbours
-
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.models.model import Model
@@ -172,6 +170,8 @@ def groups(n: int, pairs: np.ndarray) -> np.ndarray:
 
 def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.ndarray:
     """Return the distance of each state of `a` from the nearest state of `b`."""
+    from magpend_core import neighbours  # figures need no compiler
+
     return neighbours.nearest_distances(geometry.scaled(b), geometry.scaled(a), geometry.circumference)
 
 
