@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -122,7 +123,9 @@ def test_stopping__beside_running_kernels(begin, tmp_path, scheduler, number):
 def busy(process):
     """Processor time of kernels: of the children, or of all threads but the first one [s]."""
     times = [t.user_time for t in process.threads() if t.id != process.pid]
-    times += [child.cpu_times().user for child in process.children()]
+    for child in process.children():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            times.append(child.cpu_times().user)
     return sum(times)
 
 
