@@ -9,7 +9,8 @@ at once:
   shorter steps where the test fails. The new orbit is linked, and followed further.
 * An orbit of even period that reaches the orbit of half its period, at a period doubling, continues as that orbit.
 
-An orbit ends where a branch turns back in the parameter (fold). The end is open if it could not be shown to be one.
+An orbit ends where a branch turns back in the parameter (fold). The end is open if it could not be shown to be one, or
+where the orbit is very unstable.
 Sheets are followed only as far as they can meet others: the smaller of two, and not where both have orbits at one
 point.
 """
@@ -53,11 +54,8 @@ HALVED = 0.2
 AGREED = 0.1
 """Largest difference between two estimates of where a fold is, as a share of its distance."""
 
-TOGETHER = 4
+TOGETHER = 8
 """Newton steps of all orbits on their way before others are sent."""
-
-FEW = 64
-"""Components of fewer orbits are followed together; larger ones only if no smaller one can meet others."""
 
 CORRECTIONS = 6
 """Most Newton steps at one point."""
@@ -200,16 +198,11 @@ class _Flood(Orbits):
             weight = np.where(has_work[own], rank[own], n)
             larger = len(own) - np.searchsorted(np.sort(weight), weight, side="right")
             shares = np.flatnonzero(period[first] == one)
-            active_here = has_work[own]
             local = np.full(n, -1)
             local[own] = np.arange(len(own))
             a, b = local[first[shares]], local[second[shares]]
             larger -= np.bincount(a[weight[b] > weight[a]], minlength=len(own))
-            active[own] |= active_here & (larger > 0)
-            size = np.bincount(component, minlength=n)
-            wanted = own[active[own]]
-            if len(wanted):
-                active[own] &= size[own] <= max(FEW, 2 * size[wanted].min())
+            active[own] |= has_work[own] & (larger > 0)
         return active
 
     def _sharing_a_point(self, chosen: Array) -> tuple[Array, Array]:

@@ -2,17 +2,19 @@
 
 Meaning of an id
 ----------------
-An id stands for an attractor that varies continuously with the parameters. It is a branch of closed orbits,
-stable where it is listed and possibly unstable in between. It includes the orbits of twice the period that
+An id stands for an attractor that varies continuously with the parameters. It is a branch of closed orbits (over
+several parameters a sheet), stable where it is listed and possibly unstable in between. It includes the orbits of twice the period that
 take over stability at a period doubling. So
 
 * orbits that continuation connects have one id, however long the unstable part between them is (for example a
   chaotic band inside a branch); at a fold the branch turns back, and the attractor beyond it is another one;
+* over two parameters a closed path around a cusp returns on another sheet. Both have one id each where they
+  coexist, and the id changes once on the way around, far from there (`connections.grouped`);
 * an orbit of twice the period keeps the id of the orbit that it branches from, unless both attract at one
   parameter point: attractors that coexist anywhere have different ids;
 * sets that no branch connects are matched by distance, and only with sets of the same kind: a bounded set
   never takes the id of an orbit. An orbit never takes the id of another orbit if no doubling relates their
-  periods, if their sides differ, or if following a branch to its end did not connect them.
+  periods, if their sides differ, or if following their branches to the ends did not connect them.
 
 `match_basis` states the evidence for every appearance's id, strongest first: a followed branch, a doubling,
 or distance alone.
