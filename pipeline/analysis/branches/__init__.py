@@ -10,7 +10,8 @@ pseudo-arclength continuation, whether it is stable or not. `problems` has the e
 evaluates many of them in one call of the engine, `arclength` traces, `bifurcations` notices and locates,
 `following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
 parameters. `equilibria` has the equations of equilibria and the normal form of Hopf points, `cycles` follows the
-cycles that leave them. `connecting` says which orbits found along an axis lie on one branch. Any
+cycles that leave them. `connecting` says which orbits of a grid of parameter points
+lie on one branch or sheet, which `sheets` keeps. Any
 `magpend_core.engine.system.System` will do; names, units and the class of a motion are the model's.
 
 Located bifurcations

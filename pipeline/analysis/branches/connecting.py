@@ -1,306 +1,400 @@
-"""Detect which periodic orbits at different parameter values lie on one branch, and link them.
+"""Detect which periodic orbits at different parameter points lie on one branch, or on one sheet over two parameters.
 
-Orbits are given at several values of one parameter. Each is followed from value to value, stable or not,
-until it meets another one, at which moment the two are linked:
+The parameter points form a grid. Orbits are followed from point to point along every axis, stable or not, all of them
+at once:
 
-* Neighbours are compared first. They are linked if a step along the tangent from each leads to the other,
-  within a tenth of the step's length: the continuation would accept this step.
-* An orbit without a linked neighbour is followed by pseudo-arclength continuation, also through unstable
-  parts, as long as it can meet other orbits. It ends at a fold, where the branch turns back in the parameter.
-  So a group of linked orbits has at most one orbit at each parameter value.
-* An orbit of even period that reaches the orbit of half its period, at a period doubling, continues as that
-  orbit.
+* Orbits at neighbouring points are compared first. They are linked if a step along the tangent from each leads to the
+  other, within a tenth of the step's length.
+* Where no neighbour is known, Newton's method finds it from the step along the tangent, under the same test and with
+  shorter steps where the test fails. The new orbit is linked, and followed further.
+* An orbit of even period that reaches the orbit of half its period, at a period doubling, continues as that orbit.
 
-The outcome is open if Newton's method failed or there were too many points. Orbits are apart if following
-ended at a fold, or passed all the orbits that it could have met.
+An orbit ends where a branch turns back in the parameter (fold). The end is open if it could not be shown to be one, or
+where the orbit is very unstable.
+Sheets are followed only as far as they can meet others: the smaller of two, and not where both have orbits at one
+point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
 
-from pipeline.analysis.branches.arclength import Point, Settings, correct, trace
-from pipeline.analysis.branches.following import first_point, half_orbit, has_halved, opposite
-from pipeline.analysis.branches.lockstep import Steps, run_together
-from pipeline.analysis.branches.problems import Family, OrbitProblem
-from pipeline.analysis.tolerances import CONNECT_RTOL, SAME_CONNECTED
+from pipeline.analysis.branches.sheets import (
+    ENDED,
+    GOING,
+    LINKED,
+    LONGEST,
+    NEAR,
+    OPEN,
+    UNTRIED,
+    Array,
+    Grid,
+    Orbits,
+    Values,
+)
+from pipeline.analysis.tolerances import SAME_CONNECTED
+from pipeline.products.reporting import report
 
-CONNECT = Settings(first_step=2e-3, longest_step=0.05, shortest_step=1e-6, max_points=300, tolerance=1e-9)
-"""Settings with longer steps than for a branch, since no bifurcations are located."""
+SHORTEST, LEAST_STEPS = 2.0**-13, 16
+"""Step at which following ends [ranges of the axis]; it is shorter where `LEAST_STEPS` of them exceed the way."""
 
-NEAR = 0.1
-"""Largest distance of a neighbour from the step along the tangent, as a share of the step's length."""
+BEFORE_FIRST = 1.0 / 64.0
+"""How much shorter the first step may be: two orbits are needed to tell a fold."""
 
-LONGEST = 0.1
-"""Longest step along a tangent that is compared with a neighbour."""
+COLLAPSED = 0.2
+"""A step is refused if it shrinks an orbit's distance from orbits of a part of its period to less than this share."""
 
-LINKED, APART, OPEN = "linked", "apart", "open"
+HALVED = 0.2
+"""Largest distance of the two halves of an orbit at a period doubling."""
+
+AGREED = 0.1
+"""Largest difference between two estimates of where a fold is, as a share of its distance."""
+
+TOGETHER = 8
+"""Newton steps of all orbits on their way before others are sent."""
+
+CORRECTIONS = 6
+"""Most Newton steps at one point."""
+
+_STEP, _SETTLE, _HALVE = range(3)
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A periodic orbit at one value of the parameter, to be linked with orbits at other values.
+class Web:
+    """Orbits with the links between them; the given orbits come first, in their order.
 
     Attributes
     ----------
-    number : int
-        The caller's number for it.
-    place : int
-        Index of the value on its axis.
-    family : Family
-        With the parameter free.
-    points : ndarray, (period, n_states)
-        Its section points in the order of time.
-    value : float
-        The parameter's value.
+    place : ndarray of int, (orbit,)
+        Parameter point of each.
+    links : ndarray of int, (link, 3)
+        Two orbits, and the number of period doublings between them.
+    ways : ndarray of int, (orbit, axis, 2)
+        State of the way up and down each axis, of `UNTRIED` to `GOING`.
     """
 
-    number: int
-    place: int
-    family: Family
-    points: np.ndarray
-    value: float
+    place: Array
+    links: Array
+    ways: Array
 
-    @property
-    def period(self) -> int:
-        """Period of the orbit [drive periods]."""
-        return self.family.period
 
-    def distance(self, u: np.ndarray) -> tuple[float, int]:
-        """Return the scaled distance from a branch point `u` to the nearest section point of this orbit, and the index
-        of that section point.
+def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:
+    """Link the orbits that lie on one branch or sheet.
+
+    Parameters
+    ----------
+    grid
+        Parameter points; it has an axis or more.
+    place
+        Parameter point of each orbit.
+    orbits
+        Section points (period, n_states) of each in the order of time.
+    """
+    scaled = [np.asarray(x) / np.asarray(grid.system.scales) for x in orbits]
+    # the result depends neither on the order of the orbits nor on where they begin
+    scaled = [np.roll(x, -int(np.lexsort(x.T[::-1])[0]), axis=0) for x in scaled]
+    firsts = np.array([x[0] for x in scaled])
+    order = np.lexsort((*firsts.T[::-1], [len(x) for x in scaled], place))
+    flood = _Flood(grid, place[order], [scaled[i] for i in order])
+    flood.run()
+    back = np.concatenate([order, np.arange(len(order), len(flood.nodes))])
+    inverse = np.argsort(back)
+    links = np.column_stack([back[flood.links[:, :2]], flood.links[:, 2]])
+    return Web(flood.nodes["place"][inverse], links, flood.nodes["ways"][inverse])
+
+
+class _Flood(Orbits):
+    """Orbits on a grid together with those that are on their way to another point (`walk`)."""
+
+    def __init__(self, grid: Grid, place: Array, orbits: list[Array]) -> None:
+        super().__init__(grid, place, orbits)
+        n = grid.system.n_states
+        walk: Any = [(k, "i8") for k in ("origin", "axis", "way", "period", "halvings", "stage", "tries")]
+        walk += [
+            (k, "f8")
+            for k in (
+                "u",
+                "end",
+                "h",
+                "shortest",
+                "det",
+                "det_before",
+                "u_before",
+                "gap",
+                "sign",
+                "limit",
+                "reach",
+                "end_at",
+            )
+        ]
+        walk += [
+            ("z", "f8", n),
+            ("slope", "f8", n),
+            ("half", "f8", n),
+            ("is_fold", "?"),
+            ("has_moved", "?"),
+            ("is_rough", "?"),
+            ("is_ending", "?"),
+        ]
+        self.walk: Any = np.zeros(0, walk)
+
+    def run(self) -> None:
+        """Follow all orbits as far as they can meet others."""
+        self._compare(np.arange(len(self.nodes)))
+        total = self.component.max() + 1
+        while True:
+            active = self._active()
+            report("connecting orbits", total - min(active.sum(), total), total)
+            leaves = ~active[self.component[self.walk["origin"]]]
+            self._mark(self.walk[leaves], UNTRIED)
+            self.walk = self.walk[~leaves]
+            self._start(active)
+            if not len(self.walk):
+                return
+            for _ in range(TOGETHER):
+                self._advance()
+
+    def _mark(self, walk: Any, state: int) -> None:
+        self.nodes["ways"][walk["origin"], walk["axis"], (walk["way"] < 0).astype(int)] = state
+
+    def _join(self) -> None:
+        super()._join()
+        ways = self.nodes["ways"][self.walk["origin"], self.walk["axis"], (self.walk["way"] < 0).astype(int)]
+        self.walk = self.walk[ways == GOING]
+
+    # ---- which to follow -----------------------------------------------------------------------
+
+    def _active(self) -> Array:
+        """Return for each component whether its orbits are to be followed further.
+
+        Of two components that may meet, the smaller is. Those that have orbits at one point stay apart, whether they
+        meet or not.
         """
-        away = [float(np.linalg.norm(self.family.mismatch(u, point))) for point in self.points]
-        nearest = int(np.argmin(away))
-        return away[nearest], nearest
+        n, component = int(self.component.max()) + 1, self.component
+        period = np.zeros(n, np.int64)
+        period[component] = self.nodes["period"]
+        ways = self.nodes["ways"].reshape(len(component), -1)
+        has_work, is_open = np.zeros(n, bool), np.zeros(n, bool)
+        has_work[component[((ways == UNTRIED) | (ways == GOING)).any(axis=1)]] = True
+        is_open[component[(ways == OPEN).any(axis=1)]] = True
+        is_open |= has_work
+        rank = np.empty(n, np.int64)
+        rank[np.lexsort((np.arange(n), np.bincount(component, minlength=n)))] = np.arange(n)
+        active = np.zeros(n, bool)
+        halved = np.zeros(n, bool)
+        halved[component[self.links[self.links[:, 2] > 0, 0]]] = True
+        present = set(period.tolist())
+        first, second = self._sharing_a_point(is_open)
+        for one in sorted(present):
+            own = np.flatnonzero((period == one) & is_open)
+            if any(one % 2**k == 0 and one // 2**k in present for k in range(1, one.bit_length())):
+                active[own] |= has_work[own] & ~halved[own]
+            if len(own) < 2:
+                continue
+            weight = np.where(has_work[own], rank[own], n)
+            larger = len(own) - np.searchsorted(np.sort(weight), weight, side="right")
+            shares = np.flatnonzero(period[first] == one)
+            local = np.full(n, -1)
+            local[own] = np.arange(len(own))
+            a, b = local[first[shares]], local[second[shares]]
+            larger -= np.bincount(a[weight[b] > weight[a]], minlength=len(own))
+            active[own] |= has_work[own] & (larger > 0)
+        return active
 
+    def _sharing_a_point(self, chosen: Array) -> tuple[Array, Array]:
+        """Return the pairs of chosen components that have orbits of one period at one point, in both orders."""
+        rows = np.flatnonzero(chosen[self.component])
+        column = np.unique(
+            self.nodes["period"][rows] * len(self.grid.packed) + self.nodes["place"][rows], return_inverse=True
+        )[1]
+        held = coo_array(
+            (np.ones(len(rows)), (self.component[rows], column)), shape=(len(chosen), column.max(initial=0) + 1)
+        )
+        held = held.tocsr()
+        first, second = (held @ held.T).nonzero()
+        return first, second
 
-@dataclass(frozen=True)
-class Link:
-    """Link between two orbits of one branch, with the number of period doublings between them."""
+    def _start(self, active: Array) -> None:
+        """Send orbits of active components to neighbouring points, one of each component to each point."""
+        new = []
+        for axis in range(len(self.grid.axes)):
+            for side, way in enumerate((1, -1)):
+                here = np.flatnonzero((self.nodes["ways"][:, axis, side] == UNTRIED) & active[self.component])
+                walk: Any = np.zeros(len(here), self.walk.dtype)
+                walk["origin"], walk["axis"], walk["way"] = here, axis, way
+                new.append(walk)
+        walk = np.concatenate([self.walk, *new])
+        key = self.component[walk["origin"]] * len(self.grid.packed) + self._targets(walk)
+        _, first = np.unique(key, return_index=True)
+        going = np.zeros(len(walk), bool)
+        going[first] = True
+        going[: len(self.walk)] = True
+        walk = walk[np.flatnonzero(going)[len(self.walk) :]]
+        nodes, rows = self.nodes[walk["origin"]], np.arange(len(walk))
+        for k in ("period", "det"):
+            walk[k] = nodes[k]
+        walk["z"], walk["slope"] = nodes["points"][:, 0], nodes["slopes"][rows, walk["axis"]]
+        images = np.concatenate([nodes["points"][:, 1:], nodes["points"][:, :1]], axis=1)
+        walk["gap"] = self._gap(walk["z"], images, walk["period"])
+        half = nodes["points"][rows, walk["period"] // 2]
+        walk["half"] = self._difference(half * self.scales, walk["z"] * self.scales)
+        for axis in range(len(self.grid.axes)):
+            on = np.flatnonzero(walk["axis"] == axis)
+            walk["u"][on] = self.grid.value(nodes["place"][on], axis)
+            walk["end"][on] = self.grid.value(self._targets(walk[on]), axis)
+        walk["h"] = whole = np.abs(walk["end"] - walk["u"])
+        reach = np.minimum(nodes["reach"][rows, walk["axis"]], _longest(walk["slope"]))
+        walk["h"] = np.minimum(whole, reach)
+        walk["shortest"] = np.minimum(SHORTEST, whole / LEAST_STEPS)
+        self._mark(walk, GOING)
+        self.walk = np.concatenate([self.walk, walk])
 
-    first: int
-    second: int
-    n_doublings: int = 0
-
-
-@dataclass(eq=False)
-class Links:
-    """Links between orbits along one parameter, and the reason why following each orbit ended.
-
-    Attributes
-    ----------
-    up, down : dict
-        Outcome by number: ``linked``, ``apart`` (followed to a fold, or past all orbits that it could meet)
-        or ``open`` (no answer); no entry if there was no orbit to meet.
-    """
-
-    links: list[Link] = field(default_factory=list)
-    up: dict[int, str] = field(default_factory=dict)
-    down: dict[int, str] = field(default_factory=dict)
-
-
-def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> list[Links]:
-    """Link the orbits that lie on one branch, separately for each line of parameter points.
-
-    Parameters
-    ----------
-    lines
-        Orbits along one parameter each, all others fixed; numbers are unique within a line.
-    settings
-        Settings of the trace; arclengths are in units of the families' scales.
-
-    Returns
-    -------
-    list of Links
-        Per line.
-    """
-    everyone = [one for line in lines for one in line]
-    points = run_together([_tangent(one, settings) for one in everyone], rtol=CONNECT_RTOL)
-    known = iter(points)
-    result: list[Links] = []
-    traces: list[tuple[Links, Found, int, Steps[tuple[str, Link | None]]]] = []
-    for line in lines:
-        start = {one.number: next(known) for one in line}
-        found = _neighbours([one for one in line if start[one.number] is not None], start)
-        result.append(found)
-        for one in line:
-            point = start[one.number]
+    def _targets(self, walk: Any) -> Array:
+        place, target = self.nodes["place"][walk["origin"]], np.full(len(walk), -1)
+        for axis in range(len(self.grid.axes)):
             for way in (1, -1):
-                targets = [] if point is None else _targets(one, line, way, found)
-                if point is not None and targets:
-                    traces.append((found, one, way, _follow(one, point, targets, way, settings)))
-    answers = run_together([steps for *_, steps in traces], "connecting orbits", rtol=CONNECT_RTOL)
-    for (found, one, way, _), (outcome, link) in zip(traces, answers, strict=True):
-        (found.up if way > 0 else found.down)[one.number] = outcome
-        if link is not None:
-            found.links.append(link)
-    return result
+                rows = np.flatnonzero((walk["axis"] == axis) & (walk["way"] == way))
+                target[rows] = self.grid.neighbour(place[rows], axis, way)
+        return target
+
+    # ---- steps ---------------------------------------------------------------------------------
+
+    def _advance(self) -> None:
+        """Make one Newton step of each orbit on its way; add those that arrive to the known ones."""
+        w, rows = self.walk, np.arange(len(self.walk))
+        h = np.where(w["stage"] == _STEP, w["h"], 0.0)
+        move = w["way"] * h
+        last = h >= np.abs(w["end"] - w["u"]) - 1e-12
+        u = np.where(last & (w["stage"] == _STEP), w["end"], w["u"] + move)
+        guess = w["z"] + w["slope"] * move[:, None]
+        place = self.nodes["place"][w["origin"]]
+        v = self._evaluated(place, w["axis"], u, guess, w["period"], w["stage"] == _SETTLE)
+        z, slope = guess + v.step, v.slopes[rows, w["axis"]]
+        size = np.linalg.norm(v.step, axis=1)
+        gap = self._gap(guess, v.images, w["period"])
+        half = self._difference(v.images[rows, np.maximum(w["period"] // 2 - 1, 0)] * self.scales, guess * self.scales)
+        length = np.hypot(np.linalg.norm(w["slope"], axis=1) * h, h)
+        back = np.linalg.norm(z - slope * move[:, None] - w["z"], axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            error = np.maximum(size, back) / length
+        is_step, converged = w["stage"] == _STEP, size <= SAME_CONNECTED
+        good = np.isfinite(v.det) & np.isfinite(slope).all(axis=1) & (gap >= COLLAPSED * w["gap"])
+        passed = is_step & good & (error <= NEAR)
+        # after a doubling det(1 + M) of the orbit of half the period must change its sign before long
+        same = passed & (w["sign"] == v.sign)
+        lost = same & ((u - w["limit"]) * w["way"] >= 0.0)
+        passed &= ~lost
+        fixed = ~is_step & np.isfinite(size) & (size < LONGEST) & (w["tries"] < CORRECTIONS)
+        settled = fixed & (w["stage"] == _SETTLE) & good & converged
+        arrived = settled & (w["u"] == w["end"])
+        self._take(w, passed, u, v.det)
+        for k, value in (("z", z), ("slope", slope), ("half", half), ("gap", gap)):
+            w[k][passed | fixed] = value[passed | fixed]
+        w["sign"][passed & ~same] = 0.0
+        w["tries"] += 1
+        # an orbit after one Newton step is good enough for a step as long, not for shorter ones
+        refused = is_step & ~passed & ~lost
+        w["stage"][(passed & last) | (refused & w["is_rough"])] = _SETTLE
+        w["tries"][is_step] = 0
+        w["is_ending"] = self._foresees_an_end(w, passed)
+        w["is_rough"][passed], w["is_rough"][settled] = ~converged[passed], False
+        w["stage"][settled], w["det"][settled] = _STEP, v.det[settled]
+        w["h"][passed] *= np.minimum(2.0, 0.7 * NEAR / np.maximum(error[passed], 1e-12))
+        w["h"][refused] *= np.clip(np.nan_to_num(0.7 * NEAR / error[refused], nan=0.25), 0.25, 0.5)
+        self._begin_half(w, fixed & (w["stage"] == _HALVE) & converged, v)
+        w["reach"][is_step] = w["h"][is_step]
+        w["h"] = np.minimum(w["h"], np.minimum(np.abs(w["end"] - w["u"]), _longest(w["slope"])))
+        self._finish(w, arrived, lost | (~is_step & ~fixed), refused, np.maximum(h, w["shortest"]), v)
+
+    def _take(self, w: Any, passed: Array, u: Array, det: Array) -> None:
+        for before, now, value in (("u_before", "u", u), ("det_before", "det", det)):
+            w[before][passed] = w[now][passed]
+            w[now][passed] = value[passed]
+        w["has_moved"][passed] = True
+
+    def _foresees_an_end(self, w: Any, passed: Array) -> Array:
+        """Return whether two steps foresee a fold or a doubling at one value before the next point."""
+        ahead, before = _distance_to_fold(w), w["end_at"].copy()
+        at = w["u"] + w["way"] * ahead
+        w["end_at"][passed] = at[passed]
+        near = (ahead > 0.0) & (ahead <= 4.0 * np.abs(w["u"] - w["u_before"]))
+        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & (np.abs(at - before) <= AGREED * ahead))
+
+    def _begin_half(self, w: Any, ready: Array, v: Values) -> None:
+        """Go on with orbits of half the period: the next step must pass a doubling of theirs."""
+        w["stage"][ready], w["sign"][ready], w["tries"][ready] = _STEP, v.sign[ready], 0
+        w["h"][ready] = np.abs(w["limit"] - w["u"])[ready]
+        w["halvings"][ready] += 1
+        w["det"][ready], w["has_moved"][ready] = v.det[ready], False
+
+    def _finish(self, w: Any, arrived: Array, lost: Array, refused: Array, tried: Array, v: Values) -> None:
+        """Take the orbits that arrived, halve those that reach a doubling, and end those that are stuck."""
+        short = np.minimum(w["shortest"] * np.where(w["has_moved"], 1.0, BEFORE_FIRST), np.abs(w["end"] - w["u"]))
+        stuck = ~arrived & (w["stage"] == _STEP) & ((w["h"] < short) | (w["h"] <= 1e-12) | w["is_ending"])
+        ahead = _distance_to_fold(w)
+        fold = w["has_moved"] & (ahead > 0.0) & (ahead < 10.0 * tried)
+        first = stuck & (w["halvings"] == 0)
+        w["is_fold"][first] = fold[first]
+        halves = stuck & (w["sign"] == 0.0) & (w["period"] % 2 == 0) & (np.linalg.norm(w["half"], axis=1) < HALVED)
+        w["z"][halves] += 0.5 * w["half"][halves]
+        w["period"][halves] //= 2
+        w["gap"][halves] = 0.0
+        beyond = 4.0 * np.maximum(np.where(fold, ahead, 0.0), tried)
+        beyond = np.minimum(beyond, np.abs(w["end"] - w["u"]))
+        w["limit"][halves] = (w["u"] + w["way"] * beyond)[halves]
+        w["stage"][halves], w["tries"][halves] = _HALVE, 0
+        ends = (stuck & ~halves) | lost
+        self._mark(w[ends & w["is_fold"]], ENDED)
+        self._mark(w[ends & ~w["is_fold"]], OPEN)
+        self.walk = w[~ends & ~arrived]
+        self._add(w[arrived], v, np.flatnonzero(arrived))
+
+    def _add(self, w: Any, v: Values, rows: Array) -> None:
+        """Add the orbits that arrived, unless they are known, and link them with those from which they came."""
+        if not len(w):
+            return
+        n = len(self.nodes)
+        new: Any = np.zeros(len(w), self.nodes.dtype)
+        new["place"], new["period"], new["slopes"], new["det"] = (
+            self._targets(w),
+            w["period"],
+            v.slopes[rows],
+            v.det[rows],
+        )
+        new["points"], new["reach"] = np.nan, np.inf
+        new["reach"][np.arange(len(w)), w["axis"]] = w["reach"]
+        width = v.images.shape[1]
+        new["points"][:, 1:width] = v.images[rows, : width - 1]
+        new["points"][:, 0] = w["z"]
+        new["points"][np.arange(new["points"].shape[1]) >= w["period"][:, None]] = np.nan
+        target = self._taken(new)
+        doubled = w["halvings"] > 0
+        self._mark(w[doubled], ENDED)
+        self.links = np.concatenate([self.links, np.column_stack([w["origin"], target, w["halvings"]])[doubled]])
+        self._mark(w[~doubled], OPEN)
+        for axis in range(len(self.grid.axes)):
+            own = np.flatnonzero(~doubled & (w["axis"] == axis))
+            up = w["way"][own] > 0
+            a, b = np.where(up, w["origin"][own], target[own]), np.where(up, target[own], w["origin"][own])
+            free = (self.nodes["ways"][a, axis, 0] != LINKED) & (self.nodes["ways"][b, axis, 1] != LINKED)
+            a, b = a[free], b[free]
+            _, one = np.unique(a, return_index=True)
+            a, b = a[one], b[one]
+            _, one = np.unique(b, return_index=True)
+            self._link(a[one], b[one], axis)
+        self._compare(np.arange(n, len(self.nodes)))
 
 
-def _tangent(one: Found, settings: Settings) -> Steps[Point | None]:
-    u = one.family.unknowns(one.points[0], [one.value])
-    found = yield from first_point(OrbitProblem(one.family), u, settings)
-    return found
+def _distance_to_fold(w: Any) -> Array:
+    """Return how far a fold is ahead: towards it det(1 - M) falls as the root of the distance."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.abs(w["u"] - w["u_before"]) * w["det"] ** 2 / (w["det_before"] ** 2 - w["det"] ** 2))
 
 
-# ---- neighbours --------------------------------------------------------------------------------
-
-
-def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
-    """Link orbits at adjacent parameter values if one step along the branch's tangent leads from one to the other."""
-    result = Links()
-    by_place: dict[tuple[int, int], list[Found]] = {}
-    for one in line:
-        by_place.setdefault((one.place, one.period), []).append(one)
-    for one in line:
-        others = by_place.get((one.place + 1, one.period), ())
-        near = [other for other in others if _is_one_step(one, other, start)]
-        if len(near) == 1 and near[0].number not in result.down:
-            result.links.append(Link(one.number, near[0].number))
-            result.up[one.number] = result.down[near[0].number] = LINKED
-    return result
-
-
-def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether each of two orbits is reached from the other by one step along the tangent."""
-    phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
-    return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
-
-
-def _leads_to(point: Point | None, other: Found) -> int | None:
-    """Return the index of the section point of another orbit that a step along the tangent reaches; None if it misses
-    them all.
-    """
-    if point is None or point.tangent[-1] == 0.0:
-        return None
-    change = other.value / other.family.scales[0] - point.u[-1]
-    step = change / point.tangent[-1] * point.tangent
-    length = float(np.linalg.norm(step))
-    away, phase = other.distance(point.u + step)
-    return phase if length <= LONGEST and away <= NEAR * length else None
-
-
-# ---- following ---------------------------------------------------------------------------------
-
-
-def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Return the orbits that a branch can reach: orbits of half, a quarter, ... of its period and, going up, of the
-    same period.
-    """
-    if one.number in (known.up if way > 0 else known.down):
-        return []
-    halves = {one.period // 2**k for k in range(1, one.period.bit_length()) if one.period % 2**k == 0}
-
-    def can_be_met(other: Found) -> bool:
-        if other.period in halves:
-            return True
-        return way > 0 and other.period == one.period and other.number not in known.down
-
-    return [other for other in line if (other.value - one.value) * way > 0.0 and can_be_met(other)]
-
-
-@dataclass(eq=False)
-class _Meeting:
-    """Detector that looks after each step of a branch whether the branch has reached one of given orbits."""
-
-    family: Family
-    targets: Sequence[Found]
-    way: int
-    settings: Settings
-    met: Found | None = None
-
-    def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Record the target orbit, if any, that the branch reached during the last step; always accept the step."""
-        chord = b.u - a.u
-        for target in self.targets:
-            value = target.value / self.family.scales[0]
-            passed = (value - a.u[-1]) * self.way > 0.0 >= (value - b.u[-1]) * self.way
-            if target.period != self.family.period or not passed:
-                continue
-            guess = a.u + (value - a.u[-1]) / chord[-1] * chord
-            if target.distance(guess)[0] > 2.0 * float(np.linalg.norm(chord)):
-                continue
-            normal = np.zeros(len(guess))
-            normal[-1] = 1.0
-            there = yield from correct(OrbitProblem(self.family), guess, normal, self.settings)
-            if there is not None and target.distance(there.u)[0] <= SAME_CONNECTED:
-                self.met = target
-                break
-        return True
-
-    def stop(self, points: list[Point]) -> str:
-        """Return the reason to stop following the branch; an empty text to continue."""
-        here = points[-1]
-        if self.met is not None:
-            return LINKED
-        if has_halved(self.family, points):
-            return "period_halving"
-        if here.tangent[-1] * self.way <= 0.0:
-            return APART
-        value = float(self.family.values(here.u)[0])
-        return APART if all((value - t.value) * self.way > 0.0 for t in self.targets) else ""
-
-
-def _follow(
-    one: Found, point: Point, targets: Sequence[Found], way: int, settings: Settings
-) -> Steps[tuple[str, Link | None]]:
-    """Follow an orbit up or down in the parameter until its branch reaches a target orbit. Halve the period at period
-    doublings.
-    """
-    family, here = one.family, point
-    for n_doublings in range(one.period.bit_length()):
-        meeting = _Meeting(family, targets, way, settings)
-        if here.tangent[-1] * way < 0.0:
-            here = opposite(here)
-        found = yield from trace(OrbitProblem(family), here, settings, meeting.stop, meeting.between)
-        if meeting.met is not None:
-            return LINKED, Link(one.number, meeting.met.number, n_doublings)
-        if found.end != "period_halving":
-            return (APART if found.end == APART else OPEN), None
-        state, value = half_orbit(family, found.points[-1])
-        family = replace(family, period=family.period // 2)
-        next_point = yield from first_point(OrbitProblem(family), family.unknowns(state, [value]), settings)
-        if next_point is None:
-            return OPEN, None
-        here = next_point
-    return OPEN, None
-
-
-# ---- groups ------------------------------------------------------------------------------------
-
-
-def grouped(places: Sequence[Hashable], links: Iterable[Link]) -> tuple[np.ndarray, list[Link]]:
-    """Group linked orbits, with at most one orbit of each parameter point per group. Links without period doublings
-    count first.
-
-    Parameters
-    ----------
-    places
-        Place of each orbit.
-    links
-        Links between orbits, numbered by their index in `places`.
-
-    Returns
-    -------
-    group : ndarray
-        Least number of each orbit's group.
-    used : list of Link
-        Links between orbits of one group.
-    """
-    members = {i: [i] for i in range(len(places))}
-    taken = {i: {place} for i, place in enumerate(places)}
-    group = np.arange(len(places))
-    ordered = sorted(links, key=lambda x: (x.n_doublings, min(x.first, x.second), max(x.first, x.second)))
-    for link in ordered:
-        a, b = sorted((int(group[link.first]), int(group[link.second])))
-        if a == b or taken[a] & taken[b]:
-            continue
-        moved = members.pop(b)
-        group[moved] = a
-        members[a] += moved
-        taken[a] |= taken.pop(b)
-    return group, [link for link in ordered if group[link.first] == group[link.second]]
+def _longest(slope: Array) -> Array:
+    """Return the longest change of a parameter within the longest step."""
+    return np.asarray(0.999 * LONGEST / np.hypot(np.linalg.norm(slope, axis=1), 1.0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,11 +12,11 @@ from magpend_core import trajectory
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.matching.connections import grouped
 from pipeline.analysis.attractors.matching.matching import BASES
-from pipeline.analysis.branches import connecting, lockstep
-from pipeline.analysis.branches.arclength import Settings
-from pipeline.analysis.branches.connecting import Found, Link, connect, grouped
-from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches import connecting
+from pipeline.analysis.branches.connecting import Web, connect
+from pipeline.analysis.branches.sheets import BORDER, ENDED, LINKED, Axis, Grid
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
 from tests.pipeline.analysis.dense_sets import match
 
@@ -58,13 +60,14 @@ def other_well(amplitude, points):
     return closed(parameters, FREQUENCY, -end, len(points))
 
 
-def line(*orbits, scale=0.1, free="amplitude", parameters=TWIN_WELL, frequency=FREQUENCY):
-    """Orbits (place, value, points) along one parameter."""
-    system, packed = parameters.model.system, parameters.pack()
-    return [
-        Found(n, place, Family(system, len(x), frequency, packed, (free,), (scale,)), x, value)
-        for n, (place, value, x) in enumerate(orbits)
-    ]
+def line(*orbits, more=(), free="amplitude", parameters=TWIN_WELL, frequency=FREQUENCY):
+    """Link orbits (place, value, points) along one parameter, which has more values beyond."""
+    system, values = parameters.model.system, np.array(sorted({*(value for _, value, _ in orbits), *more}))
+    packed, frequencies = np.tile(parameters.pack(), (len(values), 1)), np.full(len(values), frequency)
+    column = -1 if free == "frequency" else system.parameter_names.index(free)
+    (packed[:, column] if column >= 0 else frequencies)[:] = values
+    grid = Grid(system, values.shape, packed, frequencies, (Axis(0, column, values),))
+    return connect(grid, np.array([place for place, *_ in orbits]), [x for *_, x in orbits])
 
 
 def test_connect__through_the_unstable_part(wells):
@@ -73,17 +76,17 @@ def test_connect__through_the_unstable_part(wells):
     for place, value in enumerate((0.2, 0.3)):
         own = wells(1, value)
         orbits += [(place, value, own), (place, value, other_well(value, own))]
-    (found,) = connect([line(*orbits)])
-    assert sorted((x.first, x.second, x.n_doublings) for x in found.links) == [(0, 2, 0), (1, 3, 0)]
-    assert found.up == {0: "linked", 1: "linked"}
+    found = line(*orbits)
+    assert sorted(found.links.tolist()) == [[0, 2, 0], [1, 3, 0]]
+    assert found.ways[:, 0].tolist() == 2 * [[LINKED, BORDER]] + 2 * [[BORDER, LINKED]]
 
 
 def test_connect__doublings(wells):
     """From the orbit of period 4 down to that of period 2, and from there to the single one."""
     orbits = [(0, 0.26, wells(1, 0.26)), (1, 0.28, wells(2, 0.28)), (2, 0.29, wells(4, 0.29))]
-    (found,) = connect([line(*orbits)])
-    assert sorted((x.first, x.second, x.n_doublings) for x in found.links) == [(1, 0, 1), (2, 1, 1)]
-    assert found.down == {1: "linked", 2: "linked"}
+    found = line(*orbits)
+    assert sorted(link for link in found.links.tolist() if max(link) < 3) == [[1, 0, 1], [2, 1, 1]]
+    assert found.ways[1:3, 0, 1].tolist() == [ENDED, ENDED]
 
 
 @pytest.fixture(scope="module")
@@ -96,42 +99,80 @@ def resonance(settled):
 
 def test_connect__beyond_a_fold_is_another_branch(resonance):
     low, high = resonance
-    orbits = line((0, 0.15, low), (1, 0.3, high), scale=0.15, free="frequency", parameters=HARDENING)
-    (found,) = connect([orbits])
-    assert not found.links
-    assert found.up == {0: "apart"}
-    # cut short, the trace says nothing
-    (found,) = connect([orbits], Settings(max_points=3))
-    assert found.up == {0: "open"}
+    found = line((0, 0.15, low), (1, 0.3, high), free="frequency", parameters=HARDENING)
+    assert not len(found.links)
+    assert found.ways[0, 0, 0] == ENDED
 
 
 def test_connect__neighbours_take_no_walk(wells, monkeypatch):
-    """Orbits near each other are held against each other's tangent: two evaluations at most for all."""
-    calls = []
-    evaluate = lockstep._evaluate
-    monkeypatch.setattr(lockstep, "_evaluate", lambda *asked: calls.append(1) or evaluate(*asked))
+    """Orbits near each other are held against each other's tangent: one evaluation for all."""
+    monkeypatch.setattr(connecting._Flood, "_advance", None)
     values = 0.2 + 0.002 * np.arange(6)
-    (found,) = connect([line(*((i, v, wells(1, v)) for i, v in enumerate(values)))])
-    assert found.links == [Link(i, i + 1) for i in range(5)]
-    assert len(calls) <= 2
+    found = line(*((i, v, wells(1, v)) for i, v in enumerate(values)), more=[0.3])
+    assert found.links.tolist() == [[i, i + 1, 0] for i in range(5)]
 
 
-def test_connect__a_near_orbit_of_another_branch_is_none(wells):
-    """Two orbits, of which the second is off the first one's tangent by more than a step allows for."""
+def test_connect__a_near_orbit_of_another_branch_is_none(wells, monkeypatch):
+    """The second orbit is off the first one's tangent by more than a step allows for."""
+    monkeypatch.setattr(connecting._Flood, "_advance", lambda flood: setattr(flood, "walk", flood.walk[:0]))
     a, b = wells(1, 0.2), wells(1, 0.202)
-    one, other = line((0, 0.2, a), (1, 0.202, b))
-    point = lockstep.run_alone(connecting._tangent(one, connecting.CONNECT))
-    assert connecting._leads_to(point, other) == 0
-    (shifted,) = line((1, 0.202, b + 1e-2))
-    assert connecting._leads_to(point, shifted) is None
+    assert len(line((0, 0.2, a), (1, 0.202, b), more=[0.3]).links) == 1
+    assert not len(line((0, 0.2, a), (1, 0.202, b + 1e-2), more=[0.3]).links)
 
 
 def test_grouped__no_two_of_one_place_together():
-    places = ["a", "b", "b", "c"]
-    links = [Link(0, 1), Link(2, 0, 1), Link(2, 3)]
-    group, used = grouped(places, links)
-    assert group.tolist() == [0, 0, 2, 2]
-    assert used == [Link(0, 1), Link(2, 3)]
+    places = np.array([0, 1, 1, 2])
+    web = Web(places, np.array([[0, 1, 0], [2, 0, 1], [2, 3, 0]]), np.zeros((4, 1, 2)))
+    group, branch = grouped(web, 4)
+    assert group.tolist() == branch.tolist() == [0, 0, 2, 2]
+
+
+# ---- two parameters ----------------------------------------------------------------------------
+
+CUSP = """
+name = "cusp"
+states = { x = {}, y = {} }
+parameters = { a = 0.0, b = 0.0 }
+equations = { x = "a + b*x - x^3", y = "-y + cos(2*pi*f*t)" }
+"""
+"""Two sheets and their fold over a and b, with a cusp at 0, beside a damped state that the drive moves."""
+
+
+Y = 1.0 / (1.0 + 4.0 * np.pi**2)
+
+
+def cusp(places):
+    """Grid over a and b, and the stable orbits at some of its points: places and states."""
+    system = load_model(tomllib.loads(CUSP)).system
+    a, b = np.linspace(-0.6, 0.6, 13), np.linspace(-0.4, 1.2, 9)
+    columns = [system.parameter_names.index(name) for name in "ab"]
+    packed = np.zeros((117, len(system.parameter_names)))
+    packed[:, columns] = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
+    axes = tuple(Axis(i, column, values) for i, (column, values) in enumerate(zip(columns, (a, b), strict=True)))
+    grid = Grid(system, (13, 9), packed, np.ones(117), axes)
+    roots = [(place, x) for place in places for x in np.roots([-1.0, 0.0, *packed[place, columns][::-1]])]
+    stable = [(p, x.real) for p, x in roots if abs(x.imag) < 1e-9 and packed[p, columns[1]] < 3.0 * x.real**2]
+    return grid, np.array([p for p, _ in stable]), np.array([x for _, x in stable])
+
+
+def test_connect__a_sheet_around_a_cusp():
+    """Both sheets at the far side are one around the cusp at a = b = 0; where they coexist each has its own id.
+
+    The points share hardly a row or a column: orbits are followed through all the others.
+    """
+    grid, place, x = cusp(sorted({*range(8, 117, 9), *range(1, 117, 10)}))
+    web = connect(grid, place, [[[one, Y]] for one in x])
+    n = len(place)
+    group, branch = (own[:n] for own in grouped(web, n))
+    assert np.array_equal(group, branch)
+    assert len(np.unique(group)) == 2
+    for sheet in (x > 0.9, x < -0.9):
+        assert len(np.unique(group[sheet])) == 1
+    assert len(np.unique(np.column_stack([group, place]), axis=0)) == n
+    # neither the order of the orbits nor that of the axes counts
+    order = np.random.default_rng(1).permutation(n)
+    again = grouped(connect(grid, place[order], [[[one, Y]] for one in x[order]]), n)[0][:n]
+    assert len(set(zip(group[order].tolist(), again.tolist(), strict=True))) == 2
 
 
 # ---- ids ---------------------------------------------------------------------------------------

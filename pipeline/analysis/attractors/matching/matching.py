@@ -2,17 +2,19 @@
 
 Meaning of an id
 ----------------
-An id stands for an attractor that varies continuously with the parameters. It is a branch of closed orbits,
-stable where it is listed and possibly unstable in between. It includes the orbits of twice the period that
+An id stands for an attractor that varies continuously with the parameters. It is a branch of closed orbits (over
+several parameters a sheet), stable where it is listed and possibly unstable in between. It includes the orbits of twice the period that
 take over stability at a period doubling. So
 
 * orbits that continuation connects have one id, however long the unstable part between them is (for example a
   chaotic band inside a branch); at a fold the branch turns back, and the attractor beyond it is another one;
+* over two parameters a closed path around a cusp returns on another sheet. Both have one id each where they
+  coexist, and the id changes once on the way around, far from there (`connections.grouped`);
 * an orbit of twice the period keeps the id of the orbit that it branches from, unless both attract at one
   parameter point: attractors that coexist anywhere have different ids;
 * sets that no branch connects are matched by distance, and only with sets of the same kind: a bounded set
   never takes the id of an orbit. An orbit never takes the id of another orbit if no doubling relates their
-  periods, if their sides differ, or if following a branch to its end did not connect them.
+  periods, if their sides differ, or if following their branches to the ends did not connect them.
 
 `match_basis` states the evidence for every appearance's id, strongest first: a followed branch, a doubling,
 or distance alone.
@@ -70,8 +72,7 @@ class Rule:
 
     def distance(self, axis: int, before: Seen, here: Seen) -> float:
         """Return the distance of an attractor from an earlier one along an axis; infinite if they may not match."""
-        ends = (before.number, before.period), (here.number, here.period)
-        return self.alike(before, here) if self.known.may_be_one(axis, *ends) else np.inf
+        return self.alike(before, here) if self.known.may_be_one(axis, before.number, here.number) else np.inf
 
     def alike(self, before: Seen, here: Seen) -> float:
         """Return the distance of two attractors at one parameter point; infinite if their kinds, periods or sides
@@ -141,7 +142,7 @@ def match(
     where = [index for index, own in rows.items() for _ in own]
     links = Connections.none(len(where))
     if connect:
-        links = _connections(attractors, where, appearances, parameters, system)
+        links = _connections(attractors, parameters, system)
     rule = Rule(threshold, geometry_of(attractors, system), neutral_sides(attractors), links)
     ids = _Ids(where, rule)
     seen: dict[tuple[int, ...], dict[int, Seen]] = {}
@@ -161,15 +162,10 @@ def match(
 
 
 def _connections(
-    attractors: xr.Dataset,
-    where: Sequence[tuple[int, ...]],
-    appearances: Sequence[Seen],
-    parameters: Parameters | np.ndarray | None,
-    system: System | None,
+    attractors: xr.Dataset, parameters: Parameters | np.ndarray | None, system: System | None
 ) -> Connections:
-    dims = dims_of(attractors)
-    if not dims or sum(followable(attractors)) < 2:
-        return Connections.none(len(where))
+    if not dims_of(attractors) or sum(followable(attractors)) < 2:
+        return Connections.none(attractors.sizes[SET])
     base = parameters_of(attractors) if parameters is None else parameters
     if isinstance(base, Parameters):
         system, packed = system or base.model.system, base.pack()
@@ -178,7 +174,7 @@ def _connections(
     assert system is not None
     model = base.model if isinstance(base, Parameters) else None
     fixed = frequency_of(model, {str(k): v for k, v in attractors.coords.items() if not v.ndim})
-    return connections(attractors, where, [one.points for one in appearances], packed, fixed, system)
+    return connections(attractors, packed, fixed, system)
 
 
 def geometry_of(attractors: xr.Dataset, system: System | None = None) -> Geometry:

@@ -1,0 +1,284 @@
+"""Keep periodic orbits at the points of a parameter grid, with their slopes and with links between neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from magpend_core.engine.system import System
+from magpend_core.orbits import section_map
+from pipeline.analysis.branches.problems import ONE_SIDED_STEP
+from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import CONNECT_RTOL, SAME_CONNECTED
+
+Array = np.ndarray
+
+NEAR = 0.1
+"""Largest distance of an orbit from the step along the tangent, as a share of the step's length."""
+
+LONGEST = 0.1
+"""Longest step, in units of the states' scales and the axes' ranges."""
+
+WILDEST = 1e2
+"""Largest det(1 - M) of an orbit that is followed further: beyond, Newton's method needs ever shorter steps."""
+
+MOST_ROWS = 8192
+"""Trajectories in one call of the engine, which bounds the memory."""
+
+UNTRIED, LINKED, ENDED, OPEN, BORDER, GOING = range(6)
+"""States of the way from an orbit to the next point: `ENDED` at a fold or a doubling, `BORDER` of the grid."""
+
+
+class Axis(NamedTuple):
+    """Axis of the grid: which dim it is, the column of its packed parameter (-1: drive frequency), rising values."""
+
+    dim: int
+    column: int
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Parameter points in C order of `shape`, with the axes along which orbits are followed.
+
+    `packed` (point, parameter) and `frequency_hz` (point) are the parameters of each.
+    """
+
+    system: System
+    shape: tuple[int, ...]
+    packed: Array
+    frequency_hz: Array
+    axes: tuple[Axis, ...]
+
+    def neighbour(self, place: Array, axis: int, way: int) -> Array:
+        """Return the next point along an axis, up (1) or down (-1); -1 beyond the border."""
+        at = list(np.unravel_index(place, self.shape))
+        at[self.axes[axis].dim] = at[self.axes[axis].dim] + way
+        inside = (at[self.axes[axis].dim] >= 0) & (at[self.axes[axis].dim] < self.shape[self.axes[axis].dim])
+        return np.where(inside, np.ravel_multi_index(tuple(at), self.shape, mode="clip"), -1)
+
+    def value(self, place: Array, axis: int) -> Array:
+        """Return the value of an axis at points, in units of the axis' range."""
+        own = self.axes[axis]
+        return np.asarray(own.values[np.unravel_index(place, self.shape)[own.dim]] / np.ptp(own.values))
+
+    def parameters(self, place: Array, axis: Array, value: Array) -> tuple[Array, Array]:
+        """Return packed parameters and frequencies, with another value on one axis of each row."""
+        packed, frequency = self.packed[place], self.frequency_hz[place]
+        for i, own in enumerate(self.axes):
+            rows = np.flatnonzero(axis == i)
+            column = packed[:, own.column] if own.column >= 0 else frequency
+            column[rows] = value[rows] * np.ptp(own.values)
+        return packed, frequency
+
+    def displaced(self, packed: Array, frequency: Array, axis: int) -> tuple[Array, Array]:
+        """Return parameters with a slightly larger value on an axis."""
+        packed, frequency, own = packed.copy(), frequency.copy(), self.axes[axis]
+        column = packed[:, own.column] if own.column >= 0 else frequency
+        column += ONE_SIDED_STEP * np.ptp(own.values)
+        return packed, frequency
+
+
+class Values(NamedTuple):
+    """Newton step, slope by each axis, images, det(1 - M) and the sign of det(1 + M) at states."""
+
+    step: Array
+    slopes: Array
+    images: Array
+    det: Array
+    sign: Array
+
+
+class Orbits:
+    """Orbits on a grid (`nodes`), the links between them, and the number of each orbit's component."""
+
+    def __init__(self, grid: Grid, place: Array, orbits: list[Array]) -> None:
+        self.grid, self.geometry = grid, Geometry.of(grid.system)
+        self.scales = np.asarray(grid.system.scales)
+        n, n_axes, longest = grid.system.n_states, len(grid.axes), max(map(len, orbits))
+        node: Any = [("place", "i8"), ("period", "i8"), ("points", "f8", (longest, n)), ("slopes", "f8", (n_axes, n))]
+        node += [("det", "f8"), ("ways", "i1", (n_axes, 2)), ("reach", "f8", n_axes)]
+        self._store: Any = np.zeros(2 * len(orbits), node)
+        self.nodes: Any = self._store[: len(orbits)]
+        self._order = np.zeros(0, np.int64)
+        self._joined: list[tuple[Array, Array]] = []
+        self.links, self.component = np.zeros((0, 3), np.int64), np.arange(len(orbits))
+        self.nodes["place"], self.nodes["period"] = place, [len(x) for x in orbits]
+        self.nodes["points"], self.nodes["reach"] = np.nan, np.inf
+        for own, x in zip(self.nodes["points"], orbits, strict=True):
+            own[: len(x)] = x
+        found = self._evaluated(
+            place,
+            np.full(len(place), -1),
+            np.zeros(len(place)),
+            self.nodes["points"][:, 0],
+            self.nodes["period"],
+            np.ones(len(place), bool),
+        )
+        self.nodes["slopes"], self.nodes["det"] = found.slopes, found.det
+        self._mark_borders(np.arange(len(place)))
+
+    # ---- equations -----------------------------------------------------------------------------
+
+    def _evaluated(self, place: Array, axis: Array, u: Array, z: Array, period: Array, whole: Array) -> Values:
+        """Evaluate the equations of orbits at states, with the value of one axis of each row changed.
+
+        Slopes are by this axis, in `whole` rows by each; the others are NaN.
+        """
+        m, n = z.shape
+        here = self.grid.parameters(place, axis, u)
+        wanted = [np.flatnonzero((axis == i) | whole) for i in range(len(self.grid.axes))]
+        beside = [self.grid.displaced(here[0][rows], here[1][rows], i) for i, rows in enumerate(wanted)]
+        packed, frequency = (np.concatenate([here[k], *(one[k] for one in beside)]) for k in (0, 1))
+        every = np.concatenate([np.arange(m), *wanted])
+        periods, states = period[every], z[every] * self.scales
+        last, derivatives = np.empty((len(states), n)), np.empty((len(states), n, n))
+        images = np.full((m, int(period.max(initial=1)), n), np.nan)
+        order = np.argsort(-periods, kind="stable")
+        for rows in np.split(order, range(MOST_ROWS, len(order), MOST_ROWS)):
+            ends = section_map(
+                packed[rows], frequency[rows], states[rows], periods[rows], rtol=CONNECT_RTOL, system=self.grid.system
+            )
+            last[rows] = ends.images[np.arange(len(rows)), periods[rows] - 1]
+            derivatives[rows] = ends.derivatives
+            own = rows < m
+            images[rows[own], : ends.images.shape[1]] = ends.images[own] / self.scales
+        one_minus = np.eye(n) - derivatives[:m] * self.scales / self.scales[:, None]
+        det, sign = np.linalg.det(one_minus), np.sign(np.linalg.det(2.0 * np.eye(n) - one_minus))
+        one_minus[det == 0.0] = np.nan
+        right = np.full((m, n, 1 + len(wanted)), np.nan)
+        right[:, :, 0] = self._difference(last[:m], states[:m])
+        for i, (rows, x) in enumerate(zip(wanted, np.split(last, np.cumsum([m, *map(len, wanted)]))[1:], strict=False)):
+            right[rows, :, 1 + i] = self._difference(x, last[rows]) / ONE_SIDED_STEP
+        solved = np.moveaxis(np.linalg.solve(one_minus, right), -1, 1)
+        return Values(solved[:, 0], solved[:, 1:], images, det, sign)
+
+    def _difference(self, a: Array, b: Array) -> Array:
+        return self.geometry.difference(a, b)
+
+    def _away(self, a: Array, b: Array) -> Array:
+        """Return the distance of scaled states."""
+        return np.asarray(np.linalg.norm(self._difference(a * self.scales, b * self.scales), axis=-1))
+
+    def _gap(self, z: Array, images: Array, period: Array) -> Array:
+        """Return the distance of orbits from orbits of a part of their period."""
+        gap = np.full(len(z), np.inf)
+        for part in range(1, images.shape[1] // 2 + 1):
+            rows = np.flatnonzero((period % part == 0) & (period > part))
+            gap[rows] = np.minimum(gap[rows], self._away(images[rows, part - 1], z[rows]))
+        return gap
+
+    # ---- known orbits --------------------------------------------------------------------------
+
+    def _mark_borders(self, own: Array) -> None:
+        for axis in range(len(self.grid.axes)):
+            for side, way in enumerate((1, -1)):
+                beyond = self.grid.neighbour(self.nodes["place"][own], axis, way) < 0
+                self.nodes["ways"][own, axis, side] = np.where(np.abs(self.nodes["det"][own]) > WILDEST, OPEN, UNTRIED)
+                self.nodes["ways"][own[beyond], axis, side] = BORDER
+
+    def _pairs(self, own: Array, place: Array) -> tuple[Array, Array]:
+        """Return pairs of given orbits and all those of their period at given points."""
+        n = len(self.grid.packed)
+        keys, wanted = self.nodes["period"] * n + self.nodes["place"], self.nodes["period"][own] * n + place
+        if len(self._order) != len(keys):
+            self._order = np.argsort(keys, kind="stable")
+        order = self._order
+        begin, end = (np.searchsorted(keys[order], wanted, side=side) for side in ("left", "right"))
+        count = np.where(place >= 0, end - begin, 0)
+        first = np.repeat(np.arange(len(own)), count)
+        offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return own[first], order[begin[first] + offset]
+
+    def _nearest(self, z: Array, others: Array) -> tuple[Array, Array]:
+        """Return the distance of states from the nearest section point of orbits, and the number of that point."""
+        away, phase = np.full(len(z), np.inf), np.zeros(len(z), np.int64)
+        for period in np.unique(self.nodes["period"][others]).tolist():
+            rows = np.flatnonzero(self.nodes["period"][others] == period)
+            each = self._away(self.nodes["points"][others[rows], :period], z[rows, None])
+            phase[rows] = each.argmin(axis=1)
+            away[rows] = each.min(axis=1)
+        return away, phase
+
+    def _compare(self, new: Any) -> None:
+        """Link new orbits with those at neighbouring points to which one step along the tangent leads."""
+        for axis in range(len(self.grid.axes)):
+            for way in (1, -1):
+                a, b = self._pairs(new, self.grid.neighbour(self.nodes["place"][new], axis, way))
+                if way < 0:
+                    a, b = b, a
+                free = (self.nodes["ways"][a, axis, 0] != LINKED) & (self.nodes["ways"][b, axis, 1] != LINKED)
+                a, b = a[free], b[free]
+                good = self._is_one_step(a, b, axis)
+                a, b = a[good], b[good]
+                only = (np.bincount(a, minlength=1)[a] == 1) & (np.bincount(b, minlength=1)[b] == 1)
+                self._link(a[only], b[only], axis)
+        self._join()
+
+    def _is_one_step(self, a: Array, b: Array, axis: int) -> Array:
+        """Return whether a step along the tangent from each of two orbits leads to the other, at one phase."""
+        change = self.grid.value(self.nodes["place"][b], axis) - self.grid.value(self.nodes["place"][a], axis)
+        good, phases = np.ones(len(a), bool), np.zeros(len(a), np.int64)
+        for one, other, step in ((a, b, change), (b, a, -change)):
+            move = self.nodes["slopes"][one, axis] * step[:, None]
+            away, phase = self._nearest(self.nodes["points"][one, 0] + move, other)
+            length = np.hypot(np.linalg.norm(move, axis=1), step)
+            good &= (length <= LONGEST) & (away <= NEAR * length)
+            phases += phase
+        return np.asarray(good & (phases % self.nodes["period"][a] == 0))
+
+    def _link(self, a: Array, b: Array, axis: int) -> None:
+        """Link orbits with those at the next points up an axis."""
+        self.nodes["ways"][a, axis, 0] = LINKED
+        self.nodes["ways"][b, axis, 1] = LINKED
+        self.links = np.concatenate([self.links, np.column_stack([a, b, np.zeros(len(a), np.int64)])])
+        self._joined.append((a, b))
+
+    def _join(self) -> None:
+        """Merge the components of all that was linked."""
+        a, b = (np.concatenate(x) for x in zip(*self._joined, strict=True))
+        self._joined.clear()
+        if not len(a):
+            return
+        self.component = _merged(self.component, a, b)
+
+    def _append(self, new: Any) -> None:
+        n = len(self.nodes)
+        if n + len(new) > len(self._store):
+            self._store = np.concatenate([self.nodes, np.zeros(n + len(new), new.dtype)])
+        self._store[n : n + len(new)], self._order = new, np.zeros(0, np.int64)
+        self.nodes = self._store[: n + len(new)]
+
+    def _taken(self, new: Any) -> Array:
+        """Add orbits unless they are known, and return the number of each."""
+        n = len(self.nodes)
+        self._append(new)
+        a, b = self._pairs(np.arange(n, len(self.nodes)), new["place"])
+        before = b < a
+        a, b = a[before], b[before]
+        same = self._nearest(self.nodes["points"][a, 0], b)[0] <= SAME_CONNECTED
+        known = np.arange(len(self.nodes))
+        np.minimum.at(known, a[same], b[same])
+        known = known[known]
+        kept = np.flatnonzero(known == np.arange(len(known)))
+        number = np.cumsum(known == np.arange(len(known))) - 1
+        self.nodes[n : len(kept)] = self.nodes[kept[n:]]
+        self.nodes, self._order = self._store[: len(kept)], np.zeros(0, np.int64)
+        self.component = np.append(self.component, self.component.max() + 1 + np.arange(len(kept) - n))
+        self._mark_borders(np.arange(n, len(kept)))
+        return np.asarray(number[known[n:]])
+
+
+def _merged(labels: Array, a: Array, b: Array) -> Array:
+    """Merge the components of linked pairs; components are numbered by their first members."""
+    n = int(labels.max()) + 1
+    graph = coo_array((np.ones(len(a)), (labels[a], labels[b])), shape=(n, n))
+    merged = connected_components(graph, directed=False)[1][labels]
+    first = np.unique(merged, return_index=True)[1]
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return np.asarray(rank[merged])
