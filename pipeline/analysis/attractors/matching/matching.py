@@ -3,8 +3,8 @@
 Meaning of an id
 ----------------
 An id stands for an attractor that varies continuously with the parameters. It is a branch of closed orbits (over
-several parameters a sheet), stable where it is listed and possibly unstable in between. It includes the orbits of twice the period that
-take over stability at a period doubling. So
+several parameters a sheet), stable where it is listed and possibly unstable in between. It includes the orbits of twice
+the period that take over stability at a period doubling. So
 
 * orbits that continuation connects have one id, however long the unstable part between them is (for example a
   chaotic band inside a branch); at a fold the branch turns back, and the attractor beyond it is another one;
