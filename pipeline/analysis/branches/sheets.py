@@ -175,11 +175,13 @@ class Orbits:
     # ---- known orbits --------------------------------------------------------------------------
 
     def _mark_borders(self, own: Array) -> None:
+        """Mark the ways of new orbits: an orbit that is very unstable, or at a bifurcation, is not followed."""
+        nodes = self.nodes[own]
+        can_follow = np.isfinite(nodes["slopes"]).all(axis=(1, 2)) & (np.abs(nodes["det"]) <= WILDEST)
         for axis in range(len(self.grid.axes)):
             for side, way in enumerate((1, -1)):
-                beyond = self.grid.neighbour(self.nodes["place"][own], axis, way) < 0
-                self.nodes["ways"][own, axis, side] = np.where(np.abs(self.nodes["det"][own]) > WILDEST, OPEN, UNTRIED)
-                self.nodes["ways"][own[beyond], axis, side] = BORDER
+                beyond = self.grid.neighbour(nodes["place"], axis, way) < 0
+                self.nodes["ways"][own, axis, side] = np.where(beyond, BORDER, np.where(can_follow, UNTRIED, OPEN))
 
     def _pairs(self, own: Array, place: Array) -> tuple[Array, Array]:
         """Return pairs of given orbits and all those of their period at given points."""
