@@ -186,7 +186,8 @@ class _Flood(Orbits):
         rank[np.lexsort((np.arange(n), np.bincount(component, minlength=n)))] = np.arange(n)
         active = np.zeros(n, bool)
         halved = np.zeros(n, bool)
-        halved[component[self.links[self.links[:, 2] > 0, 0]]] = True
+        links = self.links
+        halved[component[links[links[:, 2] > 0, 0]]] = True
         present = set(period.tolist())
         first, second = self._sharing_a_point(is_open)
         for one in sorted(present):
@@ -374,7 +375,7 @@ class _Flood(Orbits):
         target = self._taken(new)
         doubled = w["halvings"] > 0
         self._mark(w[doubled], ENDED)
-        self.links = np.concatenate([self.links, np.column_stack([w["origin"], target, w["halvings"]])[doubled]])
+        self._links.append(np.column_stack([w["origin"], target, w["halvings"]])[doubled])
         self._mark(w[~doubled], OPEN)
         for axis in range(len(self.grid.axes)):
             own = np.flatnonzero(~doubled & (w["axis"] == axis))

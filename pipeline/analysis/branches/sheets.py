@@ -104,13 +104,16 @@ class Orbits:
         node += [("det", "f8"), ("ways", "i1", (n_axes, 2)), ("reach", "f8", n_axes)]
         self._store: Any = np.zeros(2 * len(orbits), node)
         self.nodes: Any = self._store[: len(orbits)]
-        self._order = np.zeros(0, np.int64)
+        self._links: list[Array] = [np.zeros((0, 3), np.int64)]
         self._joined: list[tuple[Array, Array]] = []
-        self.links, self.component = np.zeros((0, 3), np.int64), np.arange(len(orbits))
+        self.component = np.arange(len(orbits))
         self.nodes["place"], self.nodes["period"] = place, [len(x) for x in orbits]
         self.nodes["points"], self.nodes["reach"] = np.nan, np.inf
         for own, x in zip(self.nodes["points"], orbits, strict=True):
             own[: len(x)] = x
+        keys = self._key(self.nodes["period"], self.nodes["place"])
+        self._order = np.argsort(keys, kind="stable")
+        self._keys = keys[self._order]
         found = self._evaluated(
             place,
             np.full(len(place), -1),
@@ -174,6 +177,15 @@ class Orbits:
 
     # ---- known orbits --------------------------------------------------------------------------
 
+    @property
+    def links(self) -> Array:
+        """Pairs of linked orbits, with the number of period doublings between them."""
+        self._links = [np.concatenate(self._links)]
+        return self._links[0]
+
+    def _key(self, period: Array, place: Array) -> Array:
+        return np.asarray(period * len(self.grid.packed) + place)
+
     def _mark_borders(self, own: Array) -> None:
         """Mark the ways of new orbits: an orbit that is very unstable, or at a bifurcation, is not followed."""
         nodes = self.nodes[own]
@@ -185,16 +197,12 @@ class Orbits:
 
     def _pairs(self, own: Array, place: Array) -> tuple[Array, Array]:
         """Return pairs of given orbits and all those of their period at given points."""
-        n = len(self.grid.packed)
-        keys, wanted = self.nodes["period"] * n + self.nodes["place"], self.nodes["period"][own] * n + place
-        if len(self._order) != len(keys):
-            self._order = np.argsort(keys, kind="stable")
-        order = self._order
-        begin, end = (np.searchsorted(keys[order], wanted, side=side) for side in ("left", "right"))
+        wanted = self._key(self.nodes["period"][own], place)
+        begin, end = (np.searchsorted(self._keys, wanted, side=side) for side in ("left", "right"))
         count = np.where(place >= 0, end - begin, 0)
         first = np.repeat(np.arange(len(own)), count)
         offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return own[first], order[begin[first] + offset]
+        return own[first], self._order[begin[first] + offset]
 
     def _nearest(self, z: Array, others: Array) -> tuple[Array, Array]:
         """Return the distance of states from the nearest section point of orbits, and the number of that point."""
@@ -237,7 +245,7 @@ class Orbits:
         """Link orbits with those at the next points up an axis."""
         self.nodes["ways"][a, axis, 0] = LINKED
         self.nodes["ways"][b, axis, 1] = LINKED
-        self.links = np.concatenate([self.links, np.column_stack([a, b, np.zeros(len(a), np.int64)])])
+        self._links.append(np.column_stack([a, b, np.zeros(len(a), np.int64)]))
         self._joined.append((a, b))
 
     def _join(self) -> None:
@@ -248,39 +256,45 @@ class Orbits:
             return
         self.component = _merged(self.component, a, b)
 
-    def _append(self, new: Any) -> None:
-        n = len(self.nodes)
-        if n + len(new) > len(self._store):
-            self._store = np.concatenate([self.nodes, np.zeros(n + len(new), new.dtype)])
-        self._store[n : n + len(new)], self._order = new, np.zeros(0, np.int64)
-        self.nodes = self._store[: n + len(new)]
-
     def _taken(self, new: Any) -> Array:
         """Add orbits unless they are known, and return the number of each."""
-        n = len(self.nodes)
-        self._append(new)
-        a, b = self._pairs(np.arange(n, len(self.nodes)), new["place"])
-        before = b < a
-        a, b = a[before], b[before]
+        n, m = len(self.nodes), len(new)
+        if n + m > len(self._store):
+            self._store = np.empty(2 * (n + m), new.dtype)
+            self._store[:n] = self.nodes
+        self._store[n : n + m], self.nodes = new, self._store[: n + m]
+        a, b = self._pairs(np.arange(n, n + m), new["place"])
+        keys = self._key(new["period"], new["place"])
+        own, other = np.nonzero((keys[:, None] == keys) & (np.arange(m)[:, None] > np.arange(m)))
+        a, b = np.concatenate([a, n + own]), np.concatenate([b, n + other])
         same = self._nearest(self.nodes["points"][a, 0], b)[0] <= SAME_CONNECTED
-        known = np.arange(len(self.nodes))
-        np.minimum.at(known, a[same], b[same])
-        known = known[known]
-        kept = np.flatnonzero(known == np.arange(len(known)))
-        number = np.cumsum(known == np.arange(len(known))) - 1
-        self.nodes[n : len(kept)] = self.nodes[kept[n:]]
-        self.nodes, self._order = self._store[: len(kept)], np.zeros(0, np.int64)
-        self.component = np.append(self.component, self.component.max() + 1 + np.arange(len(kept) - n))
-        self._mark_borders(np.arange(n, len(kept)))
-        return np.asarray(number[known[n:]])
+        known = np.arange(n, n + m)
+        np.minimum.at(known, a[same] - n, b[same])
+        among = known >= n
+        known[among] = known[known[among] - n]
+        kept = np.flatnonzero(known == np.arange(n, n + m))
+        number = known.copy()
+        among = known >= n
+        number[among] = n + np.searchsorted(kept, known[among] - n)
+        self._store[n : n + len(kept)] = new[kept]
+        self.nodes = self._store[: n + len(kept)]
+        self.component = np.append(self.component, self.component.max() + 1 + np.arange(len(kept)))
+        order = np.argsort(keys[kept], kind="stable")
+        at = np.searchsorted(self._keys, keys[kept][order], side="right")
+        self._keys, self._order = np.insert(self._keys, at, keys[kept][order]), np.insert(self._order, at, n + order)
+        self._mark_borders(np.arange(n, n + len(kept)))
+        return number
 
 
 def _merged(labels: Array, a: Array, b: Array) -> Array:
     """Merge the components of linked pairs; components are numbered by their first members."""
-    n = int(labels.max()) + 1
-    graph = coo_array((np.ones(len(a)), (labels[a], labels[b])), shape=(n, n))
-    merged = connected_components(graph, directed=False)[1][labels]
-    first = np.unique(merged, return_index=True)[1]
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return np.asarray(rank[merged])
+    ends, local = np.unique(labels[np.concatenate([a, b])], return_inverse=True)
+    n, local = len(ends), local.reshape(2, -1)
+    graph = coo_array((np.ones(len(a)), (local[0], local[1])), shape=(n, n))
+    merged = connected_components(graph, directed=False)[1]
+    least = np.full(n, len(labels))
+    np.minimum.at(least, merged, ends)
+    into = np.arange(int(labels.max()) + 1)
+    into[ends] = least[merged]
+    rank = np.cumsum(into == np.arange(len(into))) - 1
+    return np.asarray(rank[into][labels])
