@@ -24,8 +24,8 @@ WIDTH = 120
 
 _ECHO = ("echo", "Callable[[str], None] | None = None", "Function that prints a line about each computation.")
 _PLACES = (
-    ("workers", "int | None = None", "Number of processes or threads that share the parameter points."),
-    ("scheduler", "str | None = None", "Where they run, as for `magpend.run`."),
+    ("workers", "int | None = None", "Number of processes or threads; 0: the calling thread alone."),
+    ("scheduler", "str | None = None", "Where blocks of parameter points are analysed, as for `magpend.run`."),
 )
 _AX = ("ax", "Axes | None = None", "Axes to draw into; for a figure of one panel.")
 _FIGURE = (

@@ -96,9 +96,9 @@ class Analyses(AnalysingRun):
         connect
             Matching: follow closed orbits along the axes by integration; otherwise match by distance.
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -195,9 +195,9 @@ class Analyses(AnalysingRun):
         seed
             Seed of the bootstraps (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -265,9 +265,9 @@ class Analyses(AnalysingRun):
         connect
             Matching: follow closed orbits along the axes by integration; otherwise match by distance.
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -338,9 +338,9 @@ class Analyses(AnalysingRun):
         connect
             Matching: follow closed orbits along the axes by integration; otherwise match by distance.
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -429,9 +429,9 @@ class Analyses(AnalysingRun):
         n_max
             Most section points for the correlation dimension; 0 computes none (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -514,9 +514,9 @@ class Analyses(AnalysingRun):
         floor
             Smallest resolved distance, in units of the states' scales (above 0).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -566,9 +566,9 @@ class Analyses(AnalysingRun):
         recurrences
             Also start from orbits up to this period, near close recurrences of bounded cells (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -628,9 +628,9 @@ class Analyses(AnalysingRun):
         digest
             Digest of the file of draws; found by itself.
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -691,9 +691,9 @@ class Analyses(AnalysingRun):
         curve_period
             Longest orbit period; 0 takes all periods of the branches [drive periods or returns] (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -739,9 +739,9 @@ class Analyses(AnalysingRun):
         seed
             Seed of the random starts (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -809,9 +809,9 @@ class Analyses(AnalysingRun):
         at
             Value of a further axis of the run: the row on which tongues are searched.
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -866,9 +866,9 @@ class Analyses(AnalysingRun):
         most
             Most points of each side (10 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -928,9 +928,9 @@ class Analyses(AnalysingRun):
         chord
             Longest chord, in units of the states' scales (above 0).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -977,9 +977,9 @@ class Analyses(AnalysingRun):
         brackets
             Most critical values that are bisected (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1023,9 +1023,9 @@ class Analyses(AnalysingRun):
         static
             Value of the bifurcation at a parameter that does not move [SI].
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1111,9 +1111,9 @@ class Analyses(AnalysingRun):
         confidence
             Level of the intervals (above 0, below 1).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1224,9 +1224,9 @@ class Analyses(AnalysingRun):
         seed
             Seed of directions, random shocks and timed initial states (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1322,9 +1322,9 @@ class Analyses(AnalysingRun):
         seed
             Seed that chooses the pairs (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1376,9 +1376,9 @@ class Analyses(AnalysingRun):
         confidence
             Level of all intervals (above 0, below 1).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1423,9 +1423,9 @@ class Analyses(AnalysingRun):
         skip
             Sections at the begin of the record that are not counted (0 or more).
         workers
-            Number of processes or threads that share the parameter points.
+            Number of processes or threads; 0: the calling thread alone.
         scheduler
-            Where they run, as for `magpend.run`.
+            Where blocks of parameter points are analysed, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
