@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from types import MethodType
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, ParamSpec,
 
 import numpy as np
 
-from pipeline.products.product import Figure, Options, bounds_of
+from pipeline.products.product import Analysis, Figure, Options, bounds_of
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.store.run import Run as StoredRun
@@ -131,39 +131,32 @@ def _bound(function: Callable[..., Any], instance: object) -> Any:
     return function if instance is None else MethodType(function, instance)
 
 
-Place = tuple[str, str, str]
-"""Name, type and help of a keyword that is no option."""
-_ECHO: Place = ("echo", "Callable[[str], None] | None", "Function that prints a line about each computation.")
-_WHERE: tuple[Place, ...] = (
-    ("workers", "int | None", "Number of processes or threads that share the parameter points."),
-    ("scheduler", "str | None", "Where they run, as for `magpend.run`."),
-    _ECHO,
-)
-_INTO: tuple[Place, ...] = (
-    ("ax", "Axes | None", "Axes to draw into; for a figure of one panel."),
-    (
-        "figure",
-        "Figure | SubFigure | None",
-        "Empty figure or subfigure to draw into. By default pyplot makes a figure.",
-    ),
-    _ECHO,
-)
+Keywords = Mapping[str, tuple[str, str]]
+"""Type and help of keywords that are no options."""
+_ECHO: Keywords = {"echo": ("Callable[[str], None] | None", "Function that prints a line about each computation.")}
+_WHERE: Keywords = {
+    "workers": ("int | None", "Number of processes or threads that share the parameter points."),
+    "scheduler": ("str | None", "Where they run, as for `magpend.run`."),
+    **_ECHO,
+}
+_INTO: Keywords = {
+    "ax": ("Axes | None", "Axes to draw into; for a figure of one panel."),
+    "figure": ("Figure | SubFigure | None", "Empty figure or subfigure to draw into; by default pyplot makes one."),
+    **_ECHO,
+}
 
 
 @cache
 def analysis(name: str) -> Callable[..., xr.Dataset]:
-    """Return the function of an analysis, which takes a run or its directory and keywords."""
+    """Return the function of an analysis, which takes a run or its directory, and keywords."""
 
-    def analyse(source: str | Path | StoredRun, options: dict[str, Any], **places: Any) -> xr.Dataset:
+    def analyse(source: str | Path | StoredRun, options: dict[str, Any], **where: Any) -> xr.Dataset:
         from pipeline.runs.derive import derive
 
-        return derive(source, name, options, **places)
+        return derive(source, name, options, **where)
 
-    returned = (
-        "Dataset\n    Result, which is also kept in the run directory; its ``.magpend.table()`` is a pandas table."
-    )
-    product = ANALYSES[name]
-    return _function(name, analyse, "str | Path | Run", product.help, product.options, _WHERE, returned)
+    about = "Result, which is also kept in the run directory; its ``.magpend.table()`` is a pandas table."
+    return _function(analyse, "str | Path | Run", ANALYSES[name], _WHERE, "Dataset", about)
 
 
 @cache
@@ -171,86 +164,72 @@ def figure(name: str) -> Callable[..., Any]:
     """Return the function of a figure, which takes `Plots` and keywords."""
     product = FIGURES[name]
 
-    def draw(plots: Any, options: dict[str, Any], **places: Any) -> Any:
+    def draw(plots: Any, options: dict[str, Any], **into: Any) -> Any:
         from pipeline.runs.drawing import draw_panels
 
-        drawn = draw_panels(plots._source, name, options, **places)
+        drawn = draw_panels(plots._source, name, options, **into)
         if len(drawn) == 1 and (product.panels != "several" or product.unless is not None):
             return drawn[0]
         panels = np.empty(len(drawn), object)
         panels[:] = drawn
         return panels
 
-    return _function(name, draw, "Plots", product.help, product.options, _INTO, _panels(product))
-
-
-def _panels(product: Figure) -> str:
-    text = {
-        "one": "Axes\n    The axes drawn into.",
-        "several": "ndarray\n    Array of the panels' axes, without colour bars.",
-        "either": "Axes or ndarray\n    The axes; an array of axes if there are several panels.",
+    kind, about = {
+        "one": ("Axes", "The axes drawn into."),
+        "several": ("ndarray", "Array of the panels' axes, without colour bars."),
+        "either": ("Axes | ndarray", "The axes; an array of axes if there are several panels."),
     }[product.panels]
-    if product.unless is None:
-        return text
-    other = "an array of axes" if product.panels == "one" else "the axes of the one panel"
-    return f"{text} With ``{product.unless[0]}={product.unless[1]!r}``: {other}."
+    if product.unless is not None:
+        other = "an array of axes" if product.panels == "one" else "the axes of the one panel"
+        kind, about = "Axes | ndarray", f"{about} With ``{product.unless[0]}={product.unless[1]!r}``: {other}."
+    return _function(draw, "Plots", product, _INTO, kind, about)
 
 
 def _function(
-    name: str,
-    call: Callable[..., Any],
-    source: str,
-    help: str,
-    options: type[Options],
-    places: tuple[Place, ...],
-    returned: str,
+    call: Callable[..., Any], source: str, product: Analysis | Figure, more: Keywords, returned: str, about: str
 ) -> Callable[..., Any]:
     """Return a function of a source and of keywords, with the signature and the docstring that the options give."""
     from pipeline.runs.arguments import options_in_errors
 
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    fields = {key: info for key, info in options.model_fields.items() if key not in ("out", "format")}
-    parameters = [
-        inspect.Parameter(
-            key,
-            keyword,
-            annotation=info.annotation,
-            default=inspect.Parameter.empty if info.is_required() else info.get_default(call_default_factory=True),
-        )
-        for key, info in sorted(fields.items(), key=lambda field: not field[1].is_required())
-    ]
-    parameters += [inspect.Parameter(key, keyword, annotation=kind, default=None) for key, kind, _ in places]
-    known, aside = [parameter.name for parameter in parameters], {key for key, _, _ in places}
+    fields = {name: info for name, info in product.options.model_fields.items() if name not in ("out", "format")}
+    required = {name: info for name, info in fields.items() if info.is_required()}
+    fields = {**required, **fields}
+    Parameter = inspect.Parameter
+    parameters = [Parameter("source", Parameter.POSITIONAL_OR_KEYWORD, annotation=source)]
+    for name, info in fields.items():
+        default = Parameter.empty if name in required else info.get_default(call_default_factory=True)
+        parameters.append(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=info.annotation))
+    for name, (kind, _) in more.items():
+        parameters.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=kind))
+    known = [*fields, *more]
 
     def function(source: Any, **given: Any) -> Any:
-        if unknown := [unknown_name("option", key, known) for key in given if key not in known]:
+        if unknown := [unknown_name("option", name, known) for name in given if name not in known]:
             raise SpecError(unknown)
-        with options_in_errors(options):
-            chosen = {key: value for key, value in given.items() if key not in aside}
-            return call(source, chosen, **{key: value for key, value in given.items() if key in aside})
+        aside = {name: given.pop(name) for name in more if name in given}
+        with options_in_errors(product.options):
+            return call(source, given, **aside)
 
     made: Any = function
-    first = inspect.Parameter("source", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=source)
-    made.__name__ = made.__qualname__ = name
     made.__module__ = "magpend"
-    made.__signature__ = inspect.Signature([first, *parameters], return_annotation=returned.partition("\n")[0])
-    told = [(p.name, _help(fields[p.name], options)) for p in parameters if p.name in fields]
-    made.__doc__ = _docstring(help, options, [*told, *((key, text) for key, _, text in places)], returned)
+    made.__name__ = made.__qualname__ = product.name
+    made.__signature__ = inspect.Signature(parameters, return_annotation=returned)
+    helps = {name: _help(info, product.options) for name, info in fields.items()}
+    helps |= {name: text for name, (_, text) in more.items()}
+    made.__doc__ = _docstring(_in_python(product.help, product.options), helps, returned, about)
     return made  # type: ignore[no-any-return]
 
 
 # ---- docstrings ---------------------------------------------------------------------------------
 
 
-def _docstring(help: str, options: type[Options], parameters: list[tuple[str, str]], returned: str) -> str:
+def _docstring(summary: str, helps: Mapping[str, str], returned: str, about: str) -> str:
     # what a command prints is nothing to a method
-    text = re.sub(r"Prints [^.]*\.\s*", "", _in_python(help, options))
-    lines = [line for part in text.split("\n\n") for line in (*_wrapped(part), "")]
+    parts = re.sub(r"Prints [^.]*\.\s*", "", summary).split("\n\n")
+    lines = [line for part in parts for line in (*_wrapped(part), "")]
     lines += ["Parameters", "----------"]
-    for name, about in parameters:
-        lines += [name, *_wrapped(about, "    ")]
-    kind, _, about = returned.partition("\n")
-    lines += ["", "Returns", "-------", kind, *_wrapped(about, "    "), "", "Raises", "------", "SpecError"]
+    lines += [line for name, text in helps.items() for line in (name, *_wrapped(text, "    "))]
+    lines += ["", "Returns", "-------", returned, *_wrapped(about, "    "), "", "Raises", "------", "SpecError"]
     lines += ["    If an option is unknown or out of bounds, or if the run does not suit; before anything is computed."]
     return "\n".join(lines)
 
