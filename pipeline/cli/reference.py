@@ -399,10 +399,9 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def stale() -> dict[Path, str]:
     """Return the new texts of the pages and modules that are out of date, by path."""
-    from pipeline.cli import reference_spec, signatures
+    from pipeline.cli import reference_spec
 
     texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
-    texts |= {path: text() for path, text in signatures.generated().items()}
     texts[reference_spec.MODULE] = reference_spec.module()
     return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
 
