@@ -122,6 +122,7 @@ def joined(parts: Sequence[xr.Dataset], blocks: Sequence[Mapping[str, slice]], s
         Size of each parameter dim.
     """
     first = parts[0]
+    of_rows = {SET, SAMPLE, TRANSITION} if is_ragged(first) else set()
     n_rows = np.cumsum([0, *(part.sizes.get(SET, 0) for part in parts)])
     variables: dict[str, Any] = {}
     for name, variable in first.variables.items():
@@ -129,7 +130,7 @@ def joined(parts: Sequence[xr.Dataset], blocks: Sequence[Mapping[str, slice]], s
         dims = set(map(str, variable.dims))
         if name == "from_set":
             own = [one.copy(data=one.values + n) for one, n in zip(own, n_rows[:-1], strict=True)]
-        if dims & {SET, SAMPLE, TRANSITION}:
+        if dims & of_rows:
             values = np.concatenate([one.values for one in own])
             variables[str(name)] = xr.Variable(variable.dims, values, variable.attrs)
         elif dims & sizes.keys():
@@ -164,14 +165,14 @@ def dense(ds: xr.Dataset, names: Collection[str] = (), *, points: bool = False) 
     Returns
     -------
     Dataset
-        Where a point lacks a set, numbers are NaN, counts, codes and shares 0, and ``mirror_partner`` -1.
+        Where a point lacks a set, numbers are NaN, counts, codes and shares 0, and ids of other sets -1.
     """
     if not is_ragged(ds):
         return ds
     dims, ids, at = dims_of(ds), int(ds.attrs[N_IDS]), (*index_of_rows(ds), ds["attractor"].values)
     found: dict[str, Any] = {}
     for name, variable in ds.data_vars.items():
-        if SET in variable.dims and name != N_POINTS and (name in names or not names):
+        if SET in variable.dims and not (name == N_POINTS and SAMPLE in ds.dims) and (name in names or not names):
             own = variable.transpose(SET, ...)
             found[str(name)] = (own.dims[1:], own.values, variable.attrs)
     if points and "attractor_points" in ds:
@@ -185,7 +186,7 @@ def dense(ds: xr.Dataset, names: Collection[str] = (), *, points: bool = False) 
 
 
 def _fill(name: str, dtype: np.dtype[Any]) -> float:
-    if name == "mirror_partner":
+    if name == "mirror_partner" or name.endswith("_to"):
         return -1
     return 0 if dtype.kind in "iu" or name == "share" else np.nan
 

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from pipeline.analysis.ragged import SET, dims_of, is_ragged
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
@@ -37,10 +38,11 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ValueError
         If there is more than one set, or nothing to draw.
     """
-    ds = _of_one_attractor(ds)
-    several = [str(d) for d in ds["correlation_dimension"].dims if ds.sizes[d] > 1]
+    dims = dims_of(ds) if is_ragged(ds) else ds["correlation_dimension"].dims
+    several = [str(d) for d in dims if ds.sizes[d] > 1]
     if several:
         raise ValueError(f"a correlation sum is drawn of one set, and {', '.join(several)} has several")
+    ds = _of_one_attractor(ds)
     data = _correlation(ds)
     fig = style.new_figure(5.2, data, frame)
     grid = fig.add_gridspec(2, 1, height_ratios=[1.5, 1.0])
@@ -86,13 +88,12 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
 
 def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
     """Select the attractor with the most cells, among those that have a correlation sum."""
-    if "attractor" not in ds["correlation_dimension"].dims:
+    if not is_ragged(ds):
         return ds
-    others = [d for d in ds["n_points"].dims if d != "attractor"]
-    cells = ds["n_cells"].where(ds["n_points"] > 0, 0).sum(others)
-    if not int(cells.max() if cells.size else 0):
+    cells = np.where(ds["n_points"].values > 0, ds["n_cells"].values, 0)
+    if not cells.max(initial=0):
         raise ValueError("there is no correlation sum to draw: no attractor at this point is without a period")
-    return ds.isel(attractor=int(cells.values.argmax()))
+    return ds.isel({SET: int(cells.argmax())})
 
 
 def _scales(ds: xr.Dataset) -> str:

@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from pipeline.analysis.ragged import dense, dims_of, isel
 from pipeline.analysis.selection import place
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import periods_of
@@ -80,13 +81,13 @@ def plot_resilience(
 
 def _selected(ds: xr.Dataset, at: Mapping[str, float]) -> tuple[xr.Dataset, str]:
     """Return the part of a result at the given values, and the one swept parameter that is left (empty: none)."""
-    dims = [str(d) for d in ds["stability"].dims if d != "attractor"]
+    dims = dims_of(ds)
     for name, value in at.items():
         if name in dims and ds.sizes[name] > 1:
-            ds = ds.isel({name: place(ds[name], value)})
+            ds = isel(ds, {name: place(ds[name], value)})
     left = [d for d in dims if d in ds.dims and ds.sizes[d] > 1]
     _check_axes(ds, left)
-    return ds.squeeze([d for d in dims if d in ds.dims and d not in left]), left[0] if left else ""
+    return dense(isel(ds, {d: 0 for d in dims if d in ds.dims and d not in left})), left[0] if left else ""
 
 
 def _check_axes(ds: xr.Dataset, left: list[str]) -> None:

@@ -58,4 +58,5 @@ DIMENSION = Analysis(
     settle=f"{_ROOM}:settle_dimension",
     builds_on=("attractors",),
     figure="dimension",
+    by_point=True,
 )

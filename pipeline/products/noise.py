@@ -45,6 +45,8 @@ ESCAPES = Analysis(
     needs=f"{_ROOM}.escapes:needs_set",
     figure="escapes",
     noisy=True,
+    by_point=True,
+    finish=f"{_ROOM}.escapes:finish_escapes",
 )
 
 DENSITY = Analysis(

@@ -203,6 +203,9 @@ class Analysis:
     by_point : bool
         Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
         results `pipeline.analysis.ragged.joined` joins.
+    finish : str
+        ``"module:function"`` or empty: ``finish(ds, options)`` completes the result of all parameter points by what
+        needs them all.
     """
 
     name: str
@@ -218,6 +221,7 @@ class Analysis:
     for_drift: bool = False
     noisy: bool = False
     by_point: bool = False
+    finish: str = ""
 
 
 class FigureOptions(Options):

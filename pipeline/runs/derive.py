@@ -74,9 +74,10 @@ class AnalysedRun(Run):
     echo : callable
         Function that prints a line.
     workers : int, optional
-        Number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`.
+        Number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`;
+        of threads of the engine for an analysis without blocks.
     where : Where, optional
-        Place of that computation.
+        Place of the computation of blocks.
     """
 
     echo: Echo = _silent
@@ -117,8 +118,11 @@ def derive(
         Options that differ from the defaults.
     echo
         Function that prints a line about each computation and its reason.
-    workers, scheduler
-        Where blocks of parameter points are computed, see `pipeline.compute.execute.run_tasks`.
+    workers
+        Number of threads or processes, see `pipeline.compute.execute.run_tasks`; of threads for an analysis that is
+        not computed in blocks.
+    scheduler
+        Where blocks of parameter points are computed.
 
     Returns
     -------
@@ -375,15 +379,19 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 
 def _compute(run: AnalysedRun, analysis: Analysis, options: Options, place: Files | None) -> xr.Dataset:
-    """Compute a result, in blocks if they can be kept beside its place."""
+    """Compute a result, in blocks if they can be kept beside its place, otherwise on threads of the engine."""
+    from magpend_core.engine.threads import using_threads
     from pipeline.runs.blocks import in_blocks
 
     started = time.perf_counter()
-    with refused(run.name):
+    threads = contextlib.nullcontext() if run.workers is None else using_threads(max(run.workers, 1))
+    with refused(run.name), threads:
         if analysis.by_point and place is not None and not getattr(options, "at", None):
             result = in_blocks(run, analysis, options, place)
         else:
             result = function_of(analysis.compute)(run, options)
+        if analysis.finish:
+            result = function_of(analysis.finish)(result, options)
     run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
     return result
 

@@ -29,10 +29,10 @@ from pipeline.analysis.attractors.finding.points import Dynamics, Point
 from pipeline.analysis.attractors.finding.requests import LEG, Settings, answer_all
 from pipeline.analysis.attractors.finding.spirals import keys_of
 from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import dense, isel
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import CLOSURE
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT, START
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT, START, split_dims
 from pipeline.products.attractors import IdentifyOptions
 
 UNDECIDED, ELSEWHERE = -1, -3
@@ -78,7 +78,7 @@ class Destinations:
     """
 
     def __init__(self, point: Point, here: xr.Dataset, settings: Settings, options: IdentifyOptions) -> None:
-        self.point, self.settings, self.options = point, settings, options
+        self.point, self.here, self.settings, self.options = point, here, settings, options
         self.geometry: Geometry = settings.geometry
         self.orbits: list[Orbit] = []
         self.orbit_ids: list[int] = []
@@ -353,8 +353,7 @@ def destinations_at(
         longest=options.max_orbit_period,
         residual=options.residual,
     )
-    attractors = dense(attractors, points=True)
-    dims = [str(d) for d in attractors["kind"].dims if d != "attractor"]
+    dims, _ = split_dims(attractors["attractor_id"])
     for index, point in points.items():
-        here = attractors.isel(dict(zip(dims, index, strict=True)))
+        here = dense(isel(attractors, dict(zip(dims, index, strict=True))), points=True)
         yield index, Destinations(point, here, settings, options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,14 @@ import xarray as xr
 from pipeline.analysis.chaos.dimensions import correlation_dimension
 from pipeline.analysis.chaos.per_attractor import pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.analysis.selection import select_points
 from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, split_dims
 from pipeline.products.chaos import DimensionOptions
 
-REASONS = ("has_dimension", "absent", "closed", "does_not_attract", "too_few_points")
-HAS_DIMENSION, ABSENT, CLOSED, NO_ATTRACTOR, TOO_FEW = range(len(REASONS))
+REASONS = ("absent", "has_dimension", "closed", "does_not_attract", "too_few_points")
+ABSENT, HAS_DIMENSION, CLOSED, NO_ATTRACTOR, TOO_FEW = range(len(REASONS))
 """Values of `reason`."""
 
 
@@ -43,7 +44,7 @@ def section_dimension(
     Returns
     -------
     Dataset
-        On the parameter dims and `attractor` (the attractors present in the selection): the variables of
+        Rows of sets, see `pipeline.analysis.ragged`: the variables of
         `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, the
         reason why there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left`, `lifetime_low` of
         `identify`.
@@ -56,21 +57,17 @@ def section_dimension(
     """
     options = options or DimensionOptions(**changes)
     part = select_points(ds, options.at)
-    dims, starts = split_dims(part["status"])
-    found = dense(attractors).sel({d: part[d].values for d in dims})
-    present = (found["kind"] > 0).any([d for d in found["kind"].dims if d != "attractor"])
-    found = found.isel(attractor=np.flatnonzero(present.values))
+    whole = select_points(attractors, options.at)
+    _, starts = split_dims(part["status"])
+    found = whole[[ROW_SIZE, "n_cells", "share", "kind", "stability", "n_sampled", "n_left", "lifetime_low"]]
+    ids = whole["attractor_id"].transpose(*dims_of(found), *starts).values
     section = part[["section", "status"]].load().assign_attrs(ds.attrs)
-    ids = found["attractor_id"].transpose(*dims, *starts).values
-    curves, reason = [], np.full(found["kind"].transpose(*dims, "attractor").shape, ABSENT, np.int8)
-    kind = found["kind"].transpose(*dims, "attractor").values
-    stability = found["stability"].transpose(*dims, "attractor").values
-    for index in np.ndindex(*reason.shape):
-        number = int(found["attractor"].values[index[-1]])
-        stays = kind[index] in APERIODIC and stability[index] == ATTRACTS
-        own = (ids[index[:-1]] == number).ravel() & stays
-        point = section.isel(dict(zip(dims, index[:-1], strict=True)))
-        curve = correlation_dimension(
+    kind, stability = found["kind"].values, found["stability"].values
+    stays = np.isin(kind, APERIODIC) & (stability == ATTRACTS)
+
+    def curve(index: tuple[int, ...], own: np.ndarray) -> xr.Dataset:
+        point = section.isel(dict(zip(dims_of(found), index, strict=True)))
+        return correlation_dimension(
             pooled(point, starts, own),
             pool=["cell"],
             theiler=options.theiler,
@@ -78,28 +75,33 @@ def section_dimension(
             floor=options.floor,
             geometry=geometry_of(ds),
         )
-        curves.append(curve)
-        reason[index] = _reason(int(kind[index]), stays, float(curve["correlation_dimension"]))
-    return _dataset(found, curves, reason, dims).assign_attrs(
-        {**ds.attrs, **{f"dimension_{k}": getattr(options, k) for k in ("theiler", "n_max", "floor")}}
-    )
+
+    nothing = curve((0,) * len(dims_of(found)), np.zeros(1, bool))
+    curves = [nothing] * found.sizes[SET]
+    for index, rows in rows_at(found).items():
+        for row in rows:
+            if stays[row]:
+                curves[row] = curve(index, ids[index].ravel() == found["attractor"].values[row])
+    about = {"units": "1", "long_name": "why there is no dimension", **code_flags(REASONS)}
+    reason = [
+        _reason(*one) for one in zip(kind, stays, (c["correlation_dimension"].item() for c in curves), strict=True)
+    ]
+    result = found.assign(_stacked(curves, nothing)).assign(reason=(SET, np.array(reason, np.int8), about))
+    plain = {f"dimension_{k}": getattr(options, k) for k in ("theiler", "n_max", "floor")}
+    return result.drop_attrs(deep=False).assign_attrs({**ds.attrs, **plain, N_IDS: found.attrs[N_IDS]})
 
 
 def _reason(kind: int, stays: bool, dimension: float) -> int:
     if kind not in APERIODIC:
-        return CLOSED if kind else ABSENT
+        return CLOSED
     if not stays:
         return NO_ATTRACTOR
     return HAS_DIMENSION if np.isfinite(dimension) else TOO_FEW
 
 
-def _dataset(found: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, dims: tuple[str, ...]) -> xr.Dataset:
-    own = (*dims, "attractor")
-    variables: dict[str, Any] = {}
-    for name in curves[0].data_vars if curves else ():
-        values = np.stack([one[name].values for one in curves])
-        tail = tuple(map(str, curves[0][name].dims))
-        variables[str(name)] = ((*own, *tail), values.reshape(*reason.shape, *values.shape[1:]), curves[0][name].attrs)
-    about = {"units": "1", "long_name": "why there is no dimension", **code_flags(REASONS)}
-    copied = ["n_cells", "share", "kind", "stability", "n_sampled", "n_left", "lifetime_low"]
-    return found[copied].transpose(*own).assign(variables).assign(reason=(own, reason, about))
+def _stacked(curves: Sequence[xr.Dataset], schema: xr.Dataset) -> dict[str, Any]:
+    """Return the variables of some curves on the rows; there may be no row."""
+    return {
+        str(name): ((SET, *one.dims), np.stack([c[name].values for c in (schema, *curves)])[1:], one.attrs)
+        for name, one in schema.data_vars.items()
+    }

@@ -2,7 +2,7 @@
 
 Schema
 ------
-Dims: the *parameter dims* and ``attractor`` as in `pipeline.analysis.attractors.attractors`; ``rank``, as
+Rows of sets on the dim ``set``, as in `pipeline.analysis.attractors.attractors` and in the same order; ``rank``, as
 many as there are states; ``multiplier``. Variables, beside the copies of ``kind``, ``orbit_period``,
 ``n_cells``, ``share``, ``multiplier_real``, ``multiplier_imag``, ``stability``, ``evidence``:
 
@@ -51,7 +51,7 @@ from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import (
     APERIODIC,
@@ -139,7 +139,7 @@ def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Datase
     options
         Criteria for the signs of exponents, and `n_max`, the most points of a correlation dimension.
     """
-    dims, starts = split_dims(cells["motion"])
+    _, starts = split_dims(cells["motion"])
     copied = [
         "kind",
         "stability",
@@ -155,28 +155,27 @@ def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Datase
         "lyapunov_high",
     ]
     copied += [name for name in ("eigenvalue_real", "eigenvalue_imag") if name in attractors]
-    own = dense(attractors)[copied].transpose(*dims, "attractor", ...)
-    shape, n_states = own["kind"].shape, ds.sizes["state"]
+    own, n_states = attractors[[ROW_SIZE, *copied]].load(), ds.sizes["state"]
     arrays = {
-        name: np.full((*shape, *((n_states,) if rank else ())), fill, dtype)
+        name: np.full((own.sizes[SET], *((n_states,) if rank else ())), fill, dtype)
         for name, (rank, dtype, fill, _, _) in _TABLE.items()
     }
     curves = _Curves(options)
-    for index in np.ndindex(*shape[:-1]):
-        at = dict(zip(dims, index, strict=True))
+    for index, rows in rows_at(own).items():
+        at = dict(zip(dims_of(own), index, strict=True))
         here = _Cells.of(cells.isel(at), starts)
-        point = own.isel(at).load()
-        for i in np.flatnonzero(point["kind"].values > 0):
-            found = _of_attractor(point.isel(attractor=i), here, int(i), n_states, options)
+        for row in rows:
+            number = int(own["attractor"].values[row])
+            found = _of_attractor(own.isel({SET: row}), here, number, n_states, options)
             if found["kind_is_bounded"] and Nature(found["nature"]).has_dimension:
-                found |= curves.of(ds.isel(at), starts, here, int(i))
+                found |= curves.of(ds.isel(at), starts, here, number)
             for name in arrays.keys() & found.keys():
-                arrays[name][(*index, i)] = found[name]
+                arrays[name][row] = found[name]
     variables = {
-        name: ((*dims, "attractor", *(("rank",) if rank else ())), arrays[name], {"units": units, "long_name": text})
+        name: ((SET, *(("rank",) if rank else ())), arrays[name], {"units": units, "long_name": text})
         for name, (rank, _, _, units, text) in _TABLE.items()
     }
-    result = cells.assign(own.data_vars).assign(variables)
+    result = cells.assign(own.data_vars).assign(variables).assign_attrs({N_IDS: own.attrs[N_IDS]})
     result["nature"].attrs |= code_flags([nature.name.lower() for nature in Nature])
     result["exponents_from"].attrs |= code_flags(_FROM)
     rank = ("rank", np.arange(1, n_states + 1), {"units": "1", "long_name": "exponents in falling order"})

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.chaos.per_attractor import Nature
+from pipeline.analysis.ragged import dims_of
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
@@ -174,7 +175,7 @@ def dimension_table(ds: xr.Dataset) -> Table:
     """Return the table of correlation dimensions per attractor and parameter point, with the reason where there is no
     dimension.
     """
-    dims = [str(d) for d in ds["reason"].dims if d != "attractor"]
+    dims = dims_of(ds)
     names = ("kind", "reason", "n_cells", "n_sampled", "n_left", "n_points", "lifetime_low", *_CURVE)
     found = sets_of(ds)
     rows = [{**where, "attractor_id": int(one["attractor"]), **values(one, *names)} for where, one in found]

@@ -47,7 +47,7 @@ def needs_set(run: Run, options: EscapeOptions) -> None:
 
 
 def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
-    """Compute rates of escape, exit places, last stretches and the fit of Kramers' law.
+    """Compute rates of escape, exit places and last stretches at each parameter point.
 
     Returns
     -------
@@ -55,18 +55,18 @@ def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
         Over the parameter points, and over ``set`` (in which cells begin): ``n_cells``, ``n_left``, ``n_to`` (by
         the set they go to), ``at_risk`` [intervals], ``rate``, ``rate_low``, ``rate_high`` and, of a box or a
         ball, ``rate_halved`` with halved steps [1/s], ``left_share`` with its interval, ``constant_p``,
-        ``exit_mean`` and ``exit_std`` of each state; ``path_mean`` and ``path_std`` by section before leaving; over
-        a strength ``barrier`` and so on, see `rates.KramersFit`. The ``interval`` at whose end exits are seen is a
-        step for a box or a ball, and a period for a class of motion.
+        ``exit_mean`` and ``exit_std`` of each state; ``path_mean`` and ``path_std`` by section before leaving.
+        `finish_escapes` adds, over a strength, ``barrier`` and so on, see `rates.KramersFit`. The ``interval`` at
+        whose end exits are seen is a step for a box or a ball, and a period for a class of motion.
     """
     cube, model = run.cube(), run.model
     dims = point_dims(cube)
-    words = _sets_of(model, options)
+    words, has_region = _sets_of(model, options), _has_region(options)
     shape = tuple(cube.sizes[d] for d in dims)
     tables = _empty(shape, len(words), options.stretch, model)
     for cells in cells_at_points(cube):
         index = tuple(cells.at[d] for d in dims)
-        if words == _IN_AND_OUT:
+        if has_region:
             _fill(tables, (*index, 0), cells, find_passages(run, cells, options), 0, options, model)
             again = find_passages(run, cells, options, halves=True)
             tables["rate_halved"][(*index, 0)] = _rate(again, again.counted, options)[0]
@@ -77,12 +77,26 @@ def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
         for k in range(len(words)):
             _fill(tables, (*index, k), cells, found, k, options, model)
     ds = _dataset(tables, cube, dims, words, options, model)
-    return _with_kramers(ds, dims, options).assign_attrs({**_attrs(cube), "confidence": options.confidence})
+    return ds.assign_attrs({**_attrs(cube), "confidence": options.confidence})
+
+
+def finish_escapes(ds: xr.Dataset, options: EscapeOptions) -> xr.Dataset:
+    """Drop the sets in which no cell of the run begins, and fit Kramers' law over all parameter points."""
+    dims = [str(d) for d in ds["rate"].dims if d != "set"]
+    begun = ds["n_cells"].sum(dims).values > 0
+    # cells that begin outside a box or a ball are not counted
+    kept = np.array([0]) if _has_region(options) else np.flatnonzero(begun)
+    return _with_kramers(ds.isel(set=kept), dims, options)
+
+
+def _has_region(options: EscapeOptions) -> bool:
+    """Return whether cells leave a box or a ball."""
+    return bool(options.low or options.high or options.radius is not None)
 
 
 def _sets_of(model: Model, options: EscapeOptions) -> tuple[str, ...]:
     """Return the names of the sets: of a box or a ball its inside and outside, else the classes of motion."""
-    if options.low or options.high or options.radius is not None:
+    if _has_region(options):
         return _IN_AND_OUT
     assert model.classifier is not None
     return model.classifier.words
@@ -210,10 +224,7 @@ def _dataset(
     coords |= {"set": np.arange(len(words)), "lag": np.arange(-options.stretch, 1), "state": list(model.state_names)}
     ds = xr.Dataset(variables, coords=coords)
     ds["set"].attrs = {"flag_values": list(range(len(words))), "flag_meanings": " ".join(words)}
-    if words == _IN_AND_OUT:  # cells that begin outside are not counted
-        return ds.isel(set=slice(0, 1))
-    begun = ds["n_cells"].sum(dims).values > 0
-    return ds.isel(set=np.flatnonzero(begun))
+    return ds
 
 
 _FIT = ("barrier", "barrier_low", "barrier_high", "log_factor", "n_fitted", "misfit_p")

@@ -14,7 +14,7 @@ from magpend_core.status import Status
 from pipeline.analysis.noise.cells import PointCells
 from pipeline.analysis.noise.exits import NOT_LEFT, Exits
 from pipeline.analysis.run import Run
-from pipeline.layout.cells import CellMap, Inputs
+from pipeline.layout.cells import CellMap, Inputs, parameter_axes
 from pipeline.products.noise import EscapeOptions
 
 
@@ -117,8 +117,9 @@ def find_passages(run: Run, cells: PointCells, options: EscapeOptions, *, halves
 def _inputs_at(run: Run, cells: PointCells) -> Inputs:
     """Return the inputs of the cells of a parameter point."""
     layout = CellMap(run.spec)
-    block = tuple(
-        slice(cells.at[d], cells.at[d] + 1) if d in cells.at else slice(0, n)
-        for d, n in zip(layout.dims, layout.shape, strict=True)
-    )
-    return layout.inputs(block)
+    block = {d: slice(0, n) for d, n in zip(layout.dims, layout.shape, strict=True)}
+    for axis in parameter_axes(run.spec):
+        if axis.dim in cells.at:
+            i = int(np.flatnonzero(axis.values == cells.values[axis.dim])[0])
+            block[axis.dim] = slice(i, i + 1)
+    return layout.inputs(tuple(block.values()))

@@ -1,7 +1,7 @@
 """Measure the response of a run's attractors to shocks, as an analysis (`pipeline.products.resilience`).
 
-The Dataset has the parameter dims of the run, ``attractor`` and ``state``. Sizes are in units of the states'
-scales (coordinate ``state_scale``), jumps of states in their own units.
+The Dataset has a row for each set (`pipeline.analysis.ragged`), and the dim ``state``. Sizes are in units of the
+states' scales (coordinate ``state_scale``), jumps of states in their own units.
 
 ===============================  =============================================================================
 variable                         meaning
@@ -27,7 +27,6 @@ variable                         meaning
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -36,10 +35,9 @@ import xarray as xr
 from pipeline.analysis.attractors.destinations import Destinations, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.basins import check_starts
-from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, rows_at
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer, bases_of
 from pipeline.analysis.resilience.shocks import Found, Settings, ShockSearch, Trials
 from pipeline.analysis.run import Run
@@ -83,16 +81,17 @@ def _chosen(run: Run, options: ResilienceOptions) -> list[str]:
 def resilience(run: Run, options: ResilienceOptions) -> xr.Dataset:
     """Measure the response of the attractors at each parameter point to shocks."""
     whole = run.derive("attractors", **options.part(AttractorOptions))
-    cube, attractors = select_points(run.cube(), options.at), dense(select_points(whole, options.at), points=True)
+    cube, attractors = select_points(run.cube(), options.at), select_points(whole, options.at)
     dims, starts = split_dims(attractors["attractor_id"])
     result = _Result(run, options, attractors)
     labels = outcomes(attractors).transpose(*dims, *starts).values
     states = start_states(cube, starts)
     for points in slabs(cube, Dynamics.of(cube), BUDGET):
         for index, there in destinations_at(cube, attractors, points, options):
-            work = _Point(there, attractors.isel(dict(zip(dims, index, strict=True))), options, run)
+            work, own = _Point(there, options, run), labels[index].ravel()
+            result.count(index, own)
             result.time(index, *work.times(states))
-            result.shocks(index, work.shocks(states, labels[index].ravel()))
+            result.shocks(index, work.shocks(states, own))
     return result.dataset()
 
 
@@ -110,8 +109,8 @@ def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> np.ndarray:
 class _Point:
     """The attractors of one parameter point, with what is asked of them."""
 
-    def __init__(self, there: Destinations, here: xr.Dataset, options: ResilienceOptions, run: Run) -> None:
-        self._there, self._here, self._options = there, here, options
+    def __init__(self, there: Destinations, options: ResilienceOptions, run: Run) -> None:
+        self._there, self._options = there, options
         names = list(run.model.state_names)
         self._which = np.array([names.index(name) for name in _chosen(run, options)])
         self._scales = np.asarray(there.geometry.scales)
@@ -132,7 +131,7 @@ class _Point:
         parameters, frequency = self._there.point.parameters, self._there.point.frequency
         assert parameters is not None
         for number in sorted(self._there.told):
-            bases = bases_of(self._here.isel(attractor=number), parameters, frequency, self._options.phases)
+            bases = bases_of(self._there.here.isel(attractor=number), parameters, frequency, self._options.phases)
             asked[f"{number} shock"] = self._search(number, bases, self._which)
             at_section = bases.sections
             seeds = self._seeds(number, at_section, states, labels)
@@ -182,8 +181,9 @@ class _Result:
 
     def __init__(self, run: Run, options: ResilienceOptions, attractors: xr.Dataset) -> None:
         self._run, self._options, self._attractors = run, options, attractors
-        self._dims, self._starts = split_dims(attractors["attractor_id"])
-        self._shape = tuple(attractors.sizes[d] for d in (*self._dims, "attractor"))
+        number = attractors["attractor"].values.tolist()
+        self._rows = {at: {number[row]: row for row in rows} for at, rows in rows_at(attractors).items()}
+        self._attracts = attractors["stability"].values == ATTRACTS
         self._n_states = attractors.sizes["state"]
         self.arrays: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
         for what, text in (("shock", "smallest critical shock"), ("distance", "shortest way out of the basin")):
@@ -200,28 +200,35 @@ class _Result:
         self._new("mean_time_stderr", "float64", np.nan, "standard error of the mean time")
         self._new("n_timed", "int64", 0, "timed initial states that end on it")
         for end in ("", "_low", "_high"):
+            self._new(f"basin_stability{end}", "float64", np.nan, "share of the cells that end on it")
             self._new(f"arrived{end}", "float64", np.nan, "share of initial states that have arrived in time")
 
     def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
-        values = np.full((*self._shape, *(self._n_states for _ in own)), fill, dtype)
-        self.arrays[name] = ((*self._dims, "attractor", *own), values, {"units": units, "long_name": text})
+        values = np.full((self._attractors.sizes[SET], *(self._n_states for _ in own)), fill, dtype)
+        self.arrays[name] = ((SET, *own), values, {"units": units, "long_name": text})
 
-    def _put(self, name: str, at: tuple[int, ...], value: Any) -> None:
+    def _put(self, name: str, at: Any, value: Any) -> None:
         self.arrays[name][1][at] = value
+
+    def _share(self, name: str, at: int, count: int, n: int) -> None:
+        low, high = binomial_interval(count, n, confidence=self._options.confidence, method=self._options.interval)
+        self._put(name, at, count / n if n else np.nan)
+        self._put(f"{name}_low", at, low)
+        self._put(f"{name}_high", at, high)
+
+    def count(self, index: tuple[int, ...], labels: np.ndarray) -> None:
+        """Fill in the shares of the cells that end on each attractor of a parameter point."""
+        for number, row in self._rows[index].items():
+            if self._attracts[row]:
+                self._share("basin_stability", row, int((labels == number).sum()), int((labels != -1).sum()))
 
     def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray) -> None:
         """Fill in the arrival times of initial states, by attractor."""
         counted = int((label != -1).sum())
         for i in np.unique(label[label >= 0]).tolist():
-            own, at = entered[(label == i) & np.isfinite(entered)], (*index, i)
-            in_time = int((own <= self._options.within).sum())
-            ends = binomial_interval(
-                in_time, counted, confidence=self._options.confidence, method=self._options.interval
-            )
+            own, at = entered[(label == i) & np.isfinite(entered)], self._rows[index][i]
             self._put("n_timed", at, len(own))
-            self._put("arrived", at, in_time / counted)
-            for end, value in zip(("_low", "_high"), ends, strict=True):
-                self._put(f"arrived{end}", at, float(value))
+            self._share("arrived", at, int((own <= self._options.within).sum()), counted)
             if len(own):
                 self._put("mean_time", at, own.mean())
                 self._put("longest_time", at, own.max())
@@ -234,7 +241,7 @@ class _Result:
         names = list(self._run.model.state_names)
         which = [names.index(name) for name in _chosen(self._run, self._options)]
         for (number, what), (one, bases) in found.items():
-            at = (*index, number)
+            at = self._rows[index][number]
             if what not in ("shock", "any"):
                 self._along(at, int(what), one, scales)
                 continue
@@ -248,55 +255,28 @@ class _Result:
             self._put(f"{name}_phase", at, bases.phase[one.base])
             self._put(f"{name}_from", at, bases.states[one.base])
 
-    def _searched(self, name: str, at: tuple[int, ...], one: Found) -> None:
+    def _searched(self, name: str, at: int, one: Found) -> None:
         values = {"low": one.low, "high": one.high, "to": one.leads_to, "safe": one.safe}
         for key, value in {**values, "n_below": one.n_below, "n_undecided": one.n_undecided}.items():
             self._put(f"{name}_{key}", at, value)
 
-    def _along(self, at: tuple[int, ...], state: int, one: Found, scales: np.ndarray) -> None:
+    def _along(self, at: int, state: int, one: Found, scales: np.ndarray) -> None:
         values = {"low": one.low, "high": one.high, "to": one.leads_to, "n_undecided": one.n_undecided}
         for key, value in values.items():
-            self._put(f"along_{key}", (*at, state), value)
-        self._put("along", (*at, state), one.shock[0] * scales[state])
+            self._put(f"along_{key}", (at, state), value)
+        self._put("along", (at, state), one.shock[0] * scales[state])
 
     def dataset(self) -> xr.Dataset:
-        """Return all arrays, with basin stability and the attractors' features."""
-        found, options = self._attractors, self._options
-        fractions = basin_fractions(
-            outcomes(found),
-            dims=self._starts,
-            ids=found["attractor"].values.tolist(),
-            confidence=options.confidence,
-            method=options.interval,
-        ).sel(label=found["attractor"].values)
-        attracts = found["stability"] == ATTRACTS
-        result = xr.Dataset(self.arrays)
-        for name, theirs in (("", "fraction"), ("_low", "low"), ("_high", "high")):
-            own = fractions[theirs].rename(label="attractor").drop_vars("attractor", errors="ignore")
-            values = own.transpose(*self._dims, "attractor").where(attracts.drop_vars("attractor"))
-            result[f"basin_stability{name}"] = values.variable.copy()
-            result[f"basin_stability{name}"].attrs = {"units": "1", "long_name": "share of the cells that end on it"}
-        keep = ("kind", "stability", "orbit_period", "n_cells", "side")
-        result = result.assign({name: found[name].variable for name in keep if name in found})
-        coords = {
-            name: found[name].variable
-            for name in (*self._dims, "attractor", "state", "state_units")
-            if name in found.coords
-        }
-        scalars = {str(k): v.variable for k, v in found.coords.items() if not v.ndim}
-        result = result.assign_coords({**coords, **scalars})
+        """Return all arrays, with the attractors' features."""
+        kept = [name for name in ("kind", "stability", "orbit_period", "n_cells", "side") if name in self._attractors]
+        found, options = self._attractors[[ROW_SIZE, *kept]], self._options
         scales = ("state", np.asarray(self._run.model.scales), {"long_name": "size that counts as 1"})
         attrs = {**told_by(found.attrs), **section_attributes(self._run.model.crossing), "title": "resilience"}
         plain = {
             k: v for k, v in options.plain().items() if k in ("phases", "largest", "norm", "within", "near", "timed")
         }
         attrs |= {f"resilience_{k}": v for k, v in plain.items()}
-        attrs["resilience_states"] = ", ".join(_chosen(self._run, options))
-        return result.assign_coords(state_scale=scales).assign_attrs(attrs)
-
-
-def points_of_result(ds: xr.Dataset) -> Iterator[tuple[tuple[int, ...], int]]:
-    """Yield the parameter point and the id of each attractor in a result."""
-    dims = [str(d) for d in ds["stability"].dims if d != "attractor"]
-    for *index, number in np.argwhere(ds["stability"].transpose(*dims, "attractor").values == ATTRACTS).tolist():
-        yield tuple(index), number
+        attrs |= {"resilience_states": ", ".join(_chosen(self._run, options)), N_IDS: found.attrs[N_IDS]}
+        states = {k: v.variable for k, v in self._attractors.coords.items() if k in ("state", "state_units")}
+        result = found.assign(self.arrays).assign_coords({**states, "state_scale": scales})
+        return result.drop_attrs(deep=False).assign_attrs(attrs)

@@ -8,7 +8,19 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.tabular import FEW_POINTS, Row, Words, number, point_table, points_of, ranges, summary, values
+from pipeline.analysis.ragged import dims_of
+from pipeline.analysis.tabular import (
+    FEW_POINTS,
+    Row,
+    Words,
+    number,
+    point_table,
+    points_of,
+    ranges,
+    sets_of,
+    summary,
+    values,
+)
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import ATTRACTS, model_of
@@ -40,8 +52,8 @@ def end_of(label: int) -> str:
 
 def resilience_table(ds: xr.Dataset) -> Table:
     """Return a row per attractor and parameter point; of more than a few points, print a line per attractor."""
-    dims = [str(d) for d in ds["stability"].dims if d != "attractor"]
-    rows = _rows(ds, dims)
+    dims = dims_of(ds)
+    rows = _rows(ds)
     lines = [_head(ds)]
     if int(np.prod([ds.sizes[d] for d in dims])) > FEW_POINTS:
         lines += summary(ds, rows, dims, _label_summary, "attractor_id")
@@ -68,26 +80,21 @@ def _head(ds: xr.Dataset) -> str:
     )
 
 
-def _rows(ds: xr.Dataset, dims: Sequence[str]) -> list[Row]:
+def _rows(ds: xr.Dataset) -> list[Row]:
     rows = []
     names = [str(name) for name in ds["state"].values]
-    for at, where in points_of(ds, dims):
-        here = ds.isel(at)
-        for i in np.flatnonzero(here["stability"].values == ATTRACTS).tolist():
-            one = here.isel(attractor=i)
-            row: Row = {**where, "attractor_id": i, "letter": letter(i), **values(one, *_PLAIN)}
-            for what in ("shock", "distance"):
-                row |= values(one, *(f"{what}_{name}" for name in _SEARCHED))
-                row[f"{what}_leads_to"] = end_of(int(one[f"{what}_to"]))
-                row |= {f"{what}_{name}": float(one[what][k]) for k, name in enumerate(names)}
-                row |= {f"{what}_from_{name}": float(one[f"{what}_from"][k]) for k, name in enumerate(names)}
-            for k, name in enumerate(names):
-                row |= {f"along_{name}_{end}": float(one[f"along_{end}"][k]) for end in ("low", "high")}
-                row |= {
-                    f"along_{name}": float(one["along"][k]),
-                    f"along_{name}_leads_to": end_of(int(one["along_to"][k])),
-                }
-            rows.append(row)
+    for where, one in sets_of(ds, ds["stability"].values == ATTRACTS):
+        i = int(one["attractor"])
+        row: Row = {**where, "attractor_id": i, "letter": letter(i), **values(one, *_PLAIN)}
+        for what in ("shock", "distance"):
+            row |= values(one, *(f"{what}_{name}" for name in _SEARCHED))
+            row[f"{what}_leads_to"] = end_of(int(one[f"{what}_to"]))
+            row |= {f"{what}_{name}": float(one[what][k]) for k, name in enumerate(names)}
+            row |= {f"{what}_from_{name}": float(one[f"{what}_from"][k]) for k, name in enumerate(names)}
+        for k, name in enumerate(names):
+            row |= {f"along_{name}_{end}": float(one[f"along_{end}"][k]) for end in ("low", "high")}
+            row |= {f"along_{name}": float(one["along"][k]), f"along_{name}_leads_to": end_of(int(one["along_to"][k]))}
+        rows.append(row)
     return rows
 
 

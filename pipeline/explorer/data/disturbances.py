@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.ragged import isel
 from pipeline.analysis.resilience.table import end_of
+from pipeline.analysis.tabular import sets_of
 from pipeline.explorer.data.clicked_orbit import finite
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.overlays import MOST_SECTION, SAME_VALUE
@@ -73,7 +75,7 @@ def _here(run: ExploredRun, name: str, place: Mapping[str, int]) -> Iterator[xr.
         own = options_of(one.attrs)
         index = _index(run, one, place)
         if index is not None and all(own.get(key) == value for key, value in wanted.items()):
-            yield one.isel(index).load()
+            yield isel(one, index).load()
 
 
 def _index(run: ExploredRun, found: xr.Dataset, place: Mapping[str, int]) -> dict[str, int] | None:
@@ -94,8 +96,8 @@ def _index(run: ExploredRun, found: xr.Dataset, place: Mapping[str, int]) -> dic
 def _shocks(run: ExploredRun, found: xr.Dataset) -> Iterator[dict[str, Any]]:
     """Yield the critical shocks of each attractor."""
     largest = float(found.attrs["resilience_largest"])
-    for number in np.flatnonzero(found["stability"].values == ATTRACTS).tolist():
-        one = found.isel(attractor=number)
+    for _, one in sets_of(found, found["stability"].values == ATTRACTS):
+        number = int(one["attractor"])
         yield {
             "attractor": number,
             "letter": letter(number),

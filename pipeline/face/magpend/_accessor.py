@@ -85,19 +85,20 @@ class DatasetAccessor:
         return table(self._ds)
 
     def sets(self) -> xr.Dataset:
-        """Return the sets of a result of `magpend.attractors`, one row for each set at each parameter point.
+        """Return the sets of a result that has one row for each set at each parameter point.
 
         Returns
         -------
         Dataset
-            Variables on the dim ``set``, with ``attractor_id`` and the swept parameters as coordinates along it. The
-            section points of the first row are the first ``n_points`` of ``attractor_points`` on the dim ``sample``,
-            those of the next row follow (a contiguous ragged array of the CF conventions).
+            Variables on the dim ``set``, with ``attractor_id`` and the swept parameters as coordinates along it. In a
+            result of `magpend.attractors` the section points of the first row are the first ``n_points`` of
+            ``attractor_points`` on the dim ``sample``, those of the next row follow (a contiguous ragged array of the
+            CF conventions).
 
         Raises
         ------
         ValueError
-            If the Dataset is no result of `magpend.attractors`.
+            If the Dataset has no rows: `magpend.attractors`, `chaos`, `dimension` and `resilience` give them.
 
         Examples
         --------
@@ -108,7 +109,7 @@ class DatasetAccessor:
         return sets(self._rows("sets"))
 
     def dense(self) -> xr.Dataset:
-        """Return a result of `magpend.attractors` with its sets on the swept parameters and the dim ``attractor``.
+        """Return a result that has rows of sets with these on the swept parameters and the dim ``attractor``.
 
         It has room for each attractor at each parameter point, so that it is large where there are many of both.
 
@@ -121,7 +122,7 @@ class DatasetAccessor:
         Raises
         ------
         ValueError
-            If the Dataset is no result of `magpend.attractors`.
+            If the Dataset has no rows: `magpend.attractors`, `chaos`, `dimension` and `resilience` give them.
 
         Examples
         --------
@@ -213,7 +214,10 @@ class DatasetAccessor:
 
         if not is_ragged(self._known()):
             what = self._ds.attrs.get("derived_product", "a cube")
-            raise ValueError(f"ds.magpend.{name}: needs a result of magpend.attractors, and this is {what}.")
+            raise ValueError(
+                f"ds.magpend.{name}: needs a result with rows of sets, of magpend.attractors, chaos, dimension or "
+                f"resilience, and this is {what}."
+            )
         return self._ds
 
     def _cube(self, name: str) -> xr.Dataset:

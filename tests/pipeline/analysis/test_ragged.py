@@ -93,7 +93,7 @@ def test_sets__are_rows_for_xarray_and_pandas(found):
     assert frame["attractor_id"].tolist() == [0, 0, 2, 1]
     assert "status" not in rows
     assert found.magpend.sets().identical(rows)
-    with pytest.raises(ValueError, match=r"needs a result of magpend\.attractors"):
+    with pytest.raises(ValueError, match="needs a result with rows of sets"):
         dense(found).magpend.sets()
 
 

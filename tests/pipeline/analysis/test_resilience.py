@@ -149,7 +149,7 @@ def separates(well_at, well):
 def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
     """No smaller multiple of .004 leads away at any phase; the shock found does, a slightly smaller one does not."""
     for well in (0, 1):
-        one = found.isel(attractor=well)
+        one = found.isel(set=well)
         size, phase = float(one["shock_high"]), float(one["shock_phase"])
         assert exhaustive[well].min() - 0.004 <= size <= exhaustive[well].min()
         assert exhaustive[well, round(8 * phase)] == exhaustive[well].min()
@@ -171,7 +171,7 @@ def test_resilience__distances_of_duffing(found):
     turns = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
     circle = np.column_stack([np.cos(turns), np.sin(turns)])
     for well, point in enumerate(WELL_POINTS):
-        one = found.isel(attractor=well)
+        one = found.isel(set=well)
         size = float(one["distance_high"])
         assert np.hypot(*one["distance"].values) == pytest.approx(size)
         inside = np.concatenate([share * size * circle for share in (0.7, 0.99)])
@@ -195,7 +195,7 @@ def test_resilience__basin_stability_and_table(found, wells):
     table = resilience_table(found)
     assert [row["letter"] for row in table.rows] == ["A", "B"]
     assert [row["shock_leads_to"] for row in table.rows] == ["B", "A"]
-    assert table.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(attractor=0, state=1)))
+    assert table.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(set=0, state=1)))
     json.dumps([dict(row) for row in table.rows])
     assert f"{float(found['shock_high'][0]):.5g}" in "\n".join(table.lines)
     figure = plot_resilience(found, dense(wells.derive("attractors"), points=True))
@@ -215,7 +215,7 @@ def linear(duffing):
 @pytest.mark.slow
 def test_resilience__of_a_linear_oscillator(linear):
     """No shock leads away; arrivals follow the matrix exponential (validation.md, 1)."""
-    one = linear.derive("resilience", within=7, largest=3.0).isel(attractor=0)
+    one = linear.derive("resilience", within=7, largest=3.0).isel(set=0)
     assert float(one["shock_low"]) == 3.0
     assert np.isinf(one["shock_high"])
     assert int(one["shock_to"]) == UNDECIDED

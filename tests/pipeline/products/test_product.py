@@ -24,7 +24,7 @@ def test_registry__names_are_the_products_own():
 
 @pytest.mark.parametrize("product", ALL, ids=NAMES)
 def test_product__its_functions_are_there(product):
-    for role in ("compute", "table", "needs", "settle", "draw"):
+    for role in ("compute", "table", "needs", "settle", "finish", "draw"):
         name = getattr(product, role, "")
         if isinstance(name, str) and name:
             wanted = {"table": 1}.get(role, 2)

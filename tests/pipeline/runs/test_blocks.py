@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
-import xarray as xr
 
+from magpend_core.engine.threads import number_of_threads
+from pipeline.analysis.attractors import product
 from pipeline.compute import execute
+from pipeline.products.registry import ANALYSES
 from pipeline.runs import blocks
 from pipeline.runs.derive import AnalysedRun, analyses_in, derive, prune
 from pipeline.runs.stopping import InterruptedRunError
@@ -39,8 +42,8 @@ EACH_POINT, A_ROW = (8, 8), (24, 24)
 def copy(computed, tmp_path):
     """Copies of the run, without results."""
 
-    def make(name: str) -> AnalysedRun:
-        shutil.copytree(computed(MAP), tmp_path / name, ignore=shutil.ignore_patterns("derived"))
+    def make(name: str, text: str = MAP) -> AnalysedRun:
+        shutil.copytree(computed(text), tmp_path / name, ignore=shutil.ignore_patterns("derived"))
         return AnalysedRun.of(tmp_path / name)
 
     return make
@@ -116,13 +119,68 @@ def test_in_blocks__processes_compute_the_same_by_default(copy, sizes, whole, mo
     assert files_of(run, "identified") == files_of(whole, "identified")
 
 
+CHAOTIC = f"""{MAP.replace("twin-well-periodic", "twin-well").replace("n_keep = 32", "n_keep = 256")}
+[products]
+lyapunov = {{ n_transient = 20, n_periods = 64 }}
+"""
+NOISY = """
+kind = "sweep"
+[model]
+name = "well"
+states.x.meaning = "position"
+equations.x = "x - x**3"
+classifier = { meaning = "side", words = { beyond = "x > 9", right = "x > 0.5", left = "x < -0.5" } }
+[noise]
+strengths = { x = 0.5 }
+seed = 1
+steps_per_period = 8
+[parameters]
+frequency_hz = 5.0
+[axes]
+noise_x = { values = [0.45, 0.55, 0.7] }
+realization = { start = 0, stop = 19, step = 1 }
+[initial_conditions]
+kind = "list"
+points = [[-1.0]]
+[integration]
+n_transient = 0
+n_keep = 200
+"""
+OPTIONS = {
+    "resilience": [{"directions": 8, "confirmations": 8, "phases": 2, "timed": 8}],
+    "escapes": [{"high": {"x": 0.8}}, {}],
+}
+BY_POINT = [(name, given) for name, one in ANALYSES.items() if one.by_point for given in OPTIONS.get(name, [{}])]
+NUMBERS = {"chaos": "attractor_lyapunov", "dimension": "correlation_dimension", "escapes": "barrier"}
+"""A number of each result that is known only if the analysis has work to do."""
+
+
 @pytest.mark.slow
-def test_in_blocks__other_analyses_of_points(copy, sizes):
-    one, other = copy("one"), copy("other")
-    first = {name: derive(one, name, workers=0) for name in ("chaos", "resilience")}
+@pytest.mark.parametrize(("name", "options"), BY_POINT)
+def test_in_blocks__every_analysis_of_points(name, options, copy, sizes):
+    text = NOISY if ANALYSES[name].noisy else CHAOTIC
+    one, other = copy("one", text), copy("other", text)
+    assert len(blocks.blocks_of(one)) == 1
+    found = derive(one, name, options, workers=0)
+    if name in NUMBERS:
+        assert np.isfinite(found[NUMBERS[name]].values).any()
     sizes(*A_ROW)
-    for name, ds in first.items():
-        xr.testing.assert_identical(derive(other, name, scheduler="none"), ds)
+    assert len(blocks.blocks_of(other)) > 2
+    derive(other, name, options, scheduler="none")
+    assert files_of(other, name) == files_of(one, name)
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(0, 1), (1, 1), (3, 3)])
+def test_derive__workers_are_threads_without_blocks(copy, monkeypatch, workers, threads):
+    seen, real = [], product.attractors
+
+    def attractors(*given):
+        seen.append(number_of_threads())
+        return real(*given)
+
+    monkeypatch.setattr(product, "attractors", attractors)
+    derive(copy("run"), "attractors", workers=workers)
+    assert seen == [threads]
 
 
 def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkeypatch):
