@@ -53,7 +53,7 @@ def commands() -> str:
     return table(("command", "does"), rows)
 
 
-SHARED = ("plot fractions", "analyse attractors", "analyse branches")
+SHARED = ("plot fractions", "analyse branches", "analyse hysteresis")
 """Commands whose options other commands have, too. The options are listed only with these commands."""
 
 
@@ -64,7 +64,7 @@ def options() -> str:
     for name, command in found.items():
         own, also = dict(_options(command)), list[str]()
         for other in SHARED:
-            if other != name and listed[other].items() <= own.items() and not _covered(other, also):
+            if other != name and listed[other].items() <= own.items():
                 also.append(f"`magpend {other}`")
                 own = {flag: text for flag, text in own.items() if flag not in listed[other]}
         paragraphs = "\n\n".join(" ".join(p.split()) for p in (command.help or "").split("\n\n"))
@@ -72,10 +72,6 @@ def options() -> str:
         part += f"\n\nTakes the options of {' and '.join(also)}{', and:' if own else '.'}" if also else ""
         parts.append(part + (f"\n\n{table(('option', 'meaning'), own.items())}" if own else ""))
     return "\n\n".join(parts)
-
-
-def _covered(name: str, others: list[str]) -> bool:
-    return name == "analyse attractors" and "`magpend plot fractions`" in others
 
 
 def _options(command: Any) -> list[tuple[str, str]]:

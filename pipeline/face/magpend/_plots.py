@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from magpend._methods import AnyPanels, Bifurcation, OnePanel, SeveralPanels
 from pipeline.products import figures as options
+from pipeline.products.product import FigureOptions, StateOptions
 from pipeline.products.registry import FIGURES
 from pipeline.store.run import Run as StoredRun
 
@@ -24,10 +25,10 @@ class Plots:
 
     bifurcation = Bifurcation(options.BifurcationOptions)
     section = OnePanel(options.SectionOptions)
-    attractors = OnePanel(options.CoexistingOptions)
-    gallery = SeveralPanels(options.AttractorFigureOptions)
+    attractors = OnePanel(StateOptions)
+    gallery = SeveralPanels(FigureOptions)
     basins = OnePanel(options.BasinFigureOptions)
-    fractions = OnePanel(options.AttractorFigureOptions)
+    fractions = OnePanel(FigureOptions)
     regimes = AnyPanels(options.RegimeOptions)
     lyapunov = AnyPanels(options.LyapunovFigureOptions)
     convergence = SeveralPanels(options.ConvergenceOptions)

@@ -14,6 +14,7 @@ from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions,
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
+from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
@@ -62,8 +63,8 @@ class Run(StoredRun):
 
     attractors = AnalysisMethod(AttractorOptions)
     basins = AnalysisMethod(BasinOptions)
-    hysteresis = AnalysisMethod(AttractorOptions)
-    settling = AnalysisMethod(AttractorOptions)
+    hysteresis = AnalysisMethod(Options)
+    settling = AnalysisMethod(Options)
     chaos = AnalysisMethod(ChaosOptions)
     dimension = AnalysisMethod(DimensionOptions)
     branches = AnalysisMethod(BranchOptions)
