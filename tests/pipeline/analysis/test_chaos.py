@@ -364,6 +364,17 @@ def test_section_dimension__nothing_to_measure():
     assert "none: too few points" in dimension_table(few).lines[2]
 
 
+def test_rows__of_no_set_have_the_variables_of_others():
+    """A block of parameter points may have no set; it is joined with others."""
+    cube = made_up([0.3, 0.3], n_keep=50)
+    nothing = attractors_of(cube, [-1, -1], [ABSENT])
+    for analyse, table in ((chaos, chaos_table), (section_dimension, dimension_table)):
+        none, one = analyse(cube, nothing), analyse(cube, one_set(cube))
+        assert (none.sizes["set"], one.sizes["set"]) == (0, 1)
+        assert {k: (v.dims, v.dtype) for k, v in none.items()} == {k: (v.dims, v.dtype) for k, v in one.items()}
+        assert table(none).rows == []
+
+
 def artists(fig, gid):
     return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
 
