@@ -1,4 +1,4 @@
-"""Write the tables of README and docs, and typed methods of the Python package, from the code.
+"""Write the tables of README and docs, and the methods of `magpend.Spec`, from the code.
 
 The command is ``python -m pipeline.cli.reference``.
 
