@@ -95,7 +95,7 @@ def test_plots__have_each_figure_with_the_defaults_of_its_options(name):
 def test_methods__complete_and_refuse_as_written_ones_do(run):
     assert set(COMMANDS) <= set(dir(run))
     assert set(FIGURES) <= set(dir(run.plot))
-    assert next(iter(inspect.signature(run.basins).parameters)) == "tolerance"
+    assert next(iter(inspect.signature(run.basins).parameters)) == "interval"
     assert "Measure the basins" in pydoc.render_doc(magpend.Run.basins)
     assert pickle.loads(pickle.dumps(magpend.basins)) is magpend.basins
     for call, nearest in (
@@ -208,7 +208,8 @@ def test_attractors__options_reach_the_command_and_the_method_alike(run, command
     assert found.identical(magpend.attractors(run, connect=False, threshold=0.01))
     pd.testing.assert_frame_equal(found.magpend.table(), table)
     # such a threshold tears the branches apart, so that it makes a difference
-    assert found.attrs["n_ids"] > run.attractors().attrs["n_ids"]
+    assert found.identical(run.attractors())  # they are the run's from now on
+    assert found.attrs["n_ids"] > run.attractors(connect=True).attrs["n_ids"]
     with pytest.raises(SpecError, match="threshold = -1"):
         run.attractors(threshold=-1.0)
     with pytest.raises(SpecError, match="unknown analysis 'atractors'"):
@@ -394,7 +395,7 @@ def test_accessor__refuses_wrong_datasets_in_a_sentence(run):
 def test_open_run__tree_has_what_is_kept_and_names_what_is_stale(run, tmp_path):
     shutil.copytree(run.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("derived"))
     copy = magpend.Run.open(tmp_path / "copy")
-    first, second = copy.attractors(), copy.attractors(threshold=0.01)
+    second, first = copy.attractors(threshold=0.01), copy.attractors(threshold=0.3)
     copy.hysteresis()
     tree = magpend.open_run(copy, tree=True)
     other = Path(second.encoding["source"]).stem

@@ -90,7 +90,7 @@ SETTLING = Analysis(
     "settling",
     """List each set that does not close: whether its cells stay or leave, and where they go.
 
-    A larger sample is integrated for longer by magpend analyse attractors DIR --budget N.
+    The option budget of the attractors says for how long a sample of their cells is integrated.
     Transient lifetimes are in drive periods or returns.""",
     Options,
     compute="pipeline.analysis.attractors.settling_product:settling",
