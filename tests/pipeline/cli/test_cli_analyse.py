@@ -92,7 +92,6 @@ def test_hysteresis__loops_and_jumps(main, walk, tmp_path):
     code, out, err = main("analyse", "hysteresis", "run", "--csv", "h.csv")
     assert code == 0, err
     ds = derive(walk, "hysteresis")
-    assert ds.attrs["identify_polish"] == 0
     assert f"jumps of the branches: {int(ds['jump_count'].sum()) or 'none'}" in out
     assert re.search(rf"^{ds.sizes['loop'] or 'no'} loop", out, re.MULTILINE)
     with (tmp_path / "h.csv").open() as file:
