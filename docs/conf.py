@@ -142,7 +142,8 @@ def _navigation(text: str) -> str:
     for heading, body in re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE):
         pages = re.findall(r"^- \[([^\]]+)\]\(([\w/-]+)\.md\)", body, re.MULTILINE)
         rows = "\n".join(f"{title} <{page}>" for title, page in pages)
-        trees.append(f"```{{toctree}}\n:hidden:\n:caption: {heading}\n\n{rows}\n```\n")
+        if rows:
+            trees.append(f"```{{toctree}}\n:hidden:\n:caption: {heading}\n\n{rows}\n```\n")
     return "\n".join(trees)
 
 

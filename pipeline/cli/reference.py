@@ -160,7 +160,7 @@ def specification() -> str:
         (
             "[drive]",
             recorded_drive.DriveTable,
-            'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
+            'For `kind = "sweep"` alone: see [Recorded drives](../recorded-drives.md).',
         ),
         (
             "[drift.NAME]",
