@@ -116,14 +116,13 @@ def grouped() -> dict[str, list[str]]:
     return found
 
 
-_MEMBERS = dict.fromkeys(("Run", "Spec"), "   :members:\n")
-"""Options of classes whose methods are shown; those of analyses are shown as functions."""
-
-
 def _docstrings() -> str:
     """Directives that show the docstrings, as MyST takes them."""
     import magpend
+    from pipeline.products.registry import COMMANDS
 
+    # methods for analyses are shown as functions
+    shown = {"Run": f"   :members:\n   :exclude-members: {', '.join(COMMANDS)}\n", "Spec": "   :members:\n"}
     parts = []
     for group, names in grouped().items():
         parts.append(f"## {group}\n")
@@ -131,8 +130,8 @@ def _docstrings() -> str:
             thing = getattr(magpend, name)
             kind = "exception" if isinstance(thing, type) and issubclass(thing, BaseException) else "class"
             kind = kind if isinstance(thing, type) else "function"
-            parts.append(f"```{{eval-rst}}\n.. auto{kind}:: magpend.{name}\n{_MEMBERS.get(name, '')}```\n")
-    parts.append("## Figures of a run\n\n```{eval-rst}\n.. autoclass:: magpend._figures.Plots\n   :members:\n```\n")
+            parts.append(f"```{{eval-rst}}\n.. auto{kind}:: magpend.{name}\n{shown.get(name, '')}```\n")
+    parts.append("## Figures of a run\n\n```{eval-rst}\n.. autoclass:: magpend._plots.Plots\n   :members:\n```\n")
     parts.append("## Datasets\n\n```{eval-rst}\n.. autoclass:: magpend._accessor.DatasetAccessor\n   :members:\n```\n")
     return "\n".join(parts)
 
@@ -143,7 +142,8 @@ def _navigation(text: str) -> str:
     for heading, body in re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE):
         pages = re.findall(r"^- \[([^\]]+)\]\(([\w/-]+)\.md\)", body, re.MULTILINE)
         rows = "\n".join(f"{title} <{page}>" for title, page in pages)
-        trees.append(f"```{{toctree}}\n:hidden:\n:caption: {heading}\n\n{rows}\n```\n")
+        if rows:
+            trees.append(f"```{{toctree}}\n:hidden:\n:caption: {heading}\n\n{rows}\n```\n")
     return "\n".join(trees)
 
 

@@ -1,6 +1,6 @@
 """Do what pages say: ``python docs/run_tutorials.py [--pictures | --check] [PAGE...]``.
 
-Pages are the tutorials, the page on Python and all others with a mark of a picture; without a name all are followed.
+Pages are the tutorials, those of `FOLLOWED`, and all with a mark of a picture; without a name all are followed.
 
 Each page is executed in a folder of its own, in this process but for what runs in the background. Marks in
 comments, which no reader sees, stand before blocks:
@@ -39,7 +39,9 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
-PAGES = {p.stem: p for p in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "rig.md", DOCS / "python.md")}
+FOLLOWED = ("rig", "recorded-drives", "python")
+"""Pages that are followed like tutorials."""
+PAGES = {p.stem: p for p in (*sorted((DOCS / "tutorials").glob("*.md")), *(DOCS / f"{name}.md" for name in FOLLOWED))}
 GALLERY = DOCS / "gallery"
 COLOURS = 128
 """Colours in a picture of the gallery."""

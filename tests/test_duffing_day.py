@@ -80,7 +80,7 @@ ANALYSES = {
     "attractors": "sweep",
     "basins": "sweep --box 2 --resamples 20",
     "hysteresis": "walk",
-    "settling": "sweep --n-sample 4",
+    "settling": "sweep",
     "chaos": "sweep",
     "dimension": f"sweep {POINT} --n-max 2000",
     "branches": "walk --period 1",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import pickle
+import pydoc
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -16,7 +18,7 @@ from matplotlib import pyplot as plt
 from matplotlib.legend import Legend
 
 import magpend
-from magpend._figures import Plots
+from magpend._plots import Plots
 from pipeline.cli import reference
 from pipeline.plots import pixels, style
 from pipeline.plots.style import TARGET, Target
@@ -74,18 +76,39 @@ def defaults_of(method, aside: set[str]) -> dict[str, object]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_run__has_each_analysis_with_the_defaults_of_its_options(name):
-    method = getattr(magpend.Run, name)
-    assert defaults_of(method, {"echo", "workers", "scheduler"}) == declared(ANALYSES[name].options)
-    lines = {line.strip() for line in (inspect.getdoc(method) or "").splitlines()}
-    assert set(ANALYSES[name].options.model_fields) <= lines
-    names, own = (list(inspect.signature(one).parameters)[1:] for one in (getattr(magpend, name), method))
-    assert names == own
+    method, options = getattr(magpend.Run, name), ANALYSES[name].options
+    assert vars(magpend.Run)[name].options is options
+    assert defaults_of(method, {"echo", "workers", "scheduler"}) == declared(options)
+    headings = re.findall(r"^(\w+)\n    \w", inspect.getdoc(method), re.MULTILINE)
+    assert sorted(headings) == sorted([*options.model_fields, "echo", "workers", "scheduler", "Dataset", "SpecError"])
+    assert "--" not in re.sub("-{4,}", "", inspect.getdoc(method))
+    assert getattr(magpend, name) is method
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_plots__have_each_figure_with_the_defaults_of_its_options(name):
-    found = defaults_of(getattr(Plots, name), {"ax", "figure", "echo"})
-    assert found == declared(FIGURES[name].options, ("out", "format"))
+    options = FIGURES[name].options
+    assert vars(Plots)[name].options is options
+    assert defaults_of(getattr(Plots, name), {"ax", "figure", "echo"}) == declared(options, ("out", "format"))
+
+
+def test_methods__complete_and_refuse_as_written_ones_do(run):
+    assert set(COMMANDS) <= set(dir(run))
+    assert set(FIGURES) <= set(dir(run.plot))
+    assert next(iter(inspect.signature(run.basins).parameters)) == "interval"
+    assert "Measure the basins" in pydoc.render_doc(magpend.Run.basins)
+    assert pickle.loads(pickle.dumps(magpend.basins)) is magpend.basins
+    for call, nearest in (
+        (lambda: run.basins(confidense=0.9), "unknown option 'confidense'; did you mean confidence"),
+        (lambda: run.basins(worker=1), "unknown option 'worker'; did you mean workers"),
+        (lambda: magpend.basins(run, confidense=0.9), "unknown option 'confidense'; did you mean confidence"),
+        (lambda: run.table("basins", confidense=0.9), "unknown option 'confidense'; did you mean confidence"),
+        (lambda: run.plot.bifurcation(degres=True), "unknown option 'degres'; did you mean degrees"),
+        (lambda: run.plot.bifurcation(out="a.png"), "unknown option 'out'"),
+        (lambda: run.curves(), "second: missing"),
+    ):
+        with pytest.raises(SpecError, match=nearest):
+            call()
 
 
 @pytest.mark.slow
@@ -95,15 +118,13 @@ def test_generated__is_up_to_date():
 
 
 def test_reference__check_fails_for_stale_methods(monkeypatch, capsys):
-    """A default that has changed in the options makes the methods stale."""
+    """A default that has changed in the options makes the page of commands stale."""
     monkeypatch.setattr(sys, "argv", ["reference", "--check"])
-    monkeypatch.setattr(reference, "pages", lambda: [])
+    monkeypatch.setattr(reference, "pages", lambda: [reference.ROOT / "docs/reference/commands.md"])
     monkeypatch.setattr(ANALYSES["basins"].options.model_fields["box"], "default", 6)
     with pytest.raises(SystemExit, match="1"):
         reference.main()
-    printed = capsys.readouterr().out
-    assert "out of date: pipeline/face/magpend/_analyses.py" in printed
-    assert "out of date: pipeline/face/magpend/__init__.pyi" in printed
+    assert capsys.readouterr().out == "out of date: docs/reference/commands.md\n"
 
 
 @pytest.mark.slow
@@ -187,7 +208,8 @@ def test_attractors__options_reach_the_command_and_the_method_alike(run, command
     assert found.identical(magpend.attractors(run, connect=False, threshold=0.01))
     pd.testing.assert_frame_equal(found.magpend.table(), table)
     # such a threshold tears the branches apart, so that it makes a difference
-    assert found.attrs["n_ids"] > run.attractors().attrs["n_ids"]
+    assert found.identical(run.attractors())  # they are the run's from now on
+    assert found.attrs["n_ids"] > run.attractors(connect=True).attrs["n_ids"]
     with pytest.raises(SpecError, match="threshold = -1"):
         run.attractors(threshold=-1.0)
     with pytest.raises(SpecError, match="unknown analysis 'atractors'"):
@@ -373,7 +395,7 @@ def test_accessor__refuses_wrong_datasets_in_a_sentence(run):
 def test_open_run__tree_has_what_is_kept_and_names_what_is_stale(run, tmp_path):
     shutil.copytree(run.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("derived"))
     copy = magpend.Run.open(tmp_path / "copy")
-    first, second = copy.attractors(), copy.attractors(threshold=0.01)
+    second, first = copy.attractors(threshold=0.01), copy.attractors(threshold=0.3)
     copy.hysteresis()
     tree = magpend.open_run(copy, tree=True)
     other = Path(second.encoding["source"]).stem

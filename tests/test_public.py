@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 import magpend
-from pipeline.products.registry import ANALYSES, COMMANDS
+from pipeline.products.registry import COMMANDS
 from tests.programs import ROOT, fresh_python
 
 
@@ -23,8 +23,7 @@ def test_magpend__completes_and_refuses_as_modules_do():
     assert {"open_run", "run", "load_model", "sections", "trajectory", "plot_basins", *COMMANDS} <= set(names)
     with pytest.raises(AttributeError, match="no attribute 'atractors'"):
         magpend.atractors  # noqa: B018
-    assert "Options:" in magpend.basins.__doc__
-    assert ANALYSES["basins"].help in magpend.basins.__doc__
+    assert magpend.basins is magpend.Run.basins
 
 
 ACCESSOR = """\

@@ -39,11 +39,7 @@ KNOWS_A_PART = {
 }
 """Files, or folders of them, that may name one part of one model, and why."""
 
-LONG_MODULES = {
-    "magpend_core/engine/lanes.py": "the engine's template: one compiled unit",
-    "pipeline/face/magpend/_analyses.py": "generated: a method for every analysis, with its options",
-    "pipeline/face/magpend/_figures.py": "generated: a method for every figure, with its options",
-}
+LONG_MODULES = {"magpend_core/engine/lanes.py": "the engine's template: one compiled unit"}
 
 
 def name_of(path: Path) -> str:

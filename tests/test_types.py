@@ -20,16 +20,17 @@ run = magpend.Run.open("runs/first")
 reveal_type(magpend.run("quickstart"))
 reveal_type(run.plot.bifurcation())
 reveal_type(run.plot.bifurcation(layout="side"))
-reveal_type(run.plot.lyapunov(as_map=True))
-reveal_type(run.plot.lyapunov())
+reveal_type(run.plot.fractions(ax=None))
+reveal_type(run.plot.gallery())
 reveal_type(magpend.open_run("runs/first"))
 reveal_type(magpend.open_run("runs/first", tree=True))
+reveal_type(run.basins(confidence=0.9, workers=2))
 reveal_type(magpend.basins("runs/first", confidence=0.9))
 run.attractors(treshold=0.2)
 run.basins(interval="wald")
-run.curves(second="q")
-run.table("atractors")
+run.atractors()
 run.plot.bifurcation(degrees="yes")
+run.plot.regims()
 magpend.basins("runs/first", confidense=0.9)
 """
 SAID = """\
@@ -41,12 +42,13 @@ SAID = """\
 8: note: Revealed type is "xarray.core.dataset.Dataset"
 9: note: Revealed type is "xarray.core.datatree.DataTree"
 10: note: Revealed type is "xarray.core.dataset.Dataset"
-11: error: Unexpected keyword argument "treshold"
-12: error: Argument "interval" to "basins" of "Analyses" has incompatible type
-13: error: Missing named argument "second_low"
-14: error: Argument 1 to "table" of "Run" has incompatible type
-15: error: No overload variant of "bifurcation" of "Plots" matches
-16: error: Unexpected keyword argument "confidense" for "basins"
+11: note: Revealed type is "xarray.core.dataset.Dataset"
+12: error: No overload variant
+13: error: No overload variant
+14: error: "Run" has no attribute "atractors"
+15: error: No overload variant
+16: error: "Plots" has no attribute "regims"
+17: error: No overload variant
 """
 
 

@@ -126,22 +126,13 @@ def flag_of(model: type[Options], name: str) -> str:
 
 def help_of(info: FieldInfo) -> str:
     """Return the help text of a field: its description, its unit and its bounds."""
+    from pipeline.products.product import bounds_of
+
     extra: Any = info.json_schema_extra or {}
     text = (info.description or "").rstrip(".")
     unit = f" [{extra['unit']}]" if extra.get("unit") else ""
     limits = bounds_of(info)
     return f"{text}{unit}{'; ' if limits else ''}{limits}."
-
-
-def bounds_of(info: FieldInfo) -> str:
-    """Return the bounds of a field in words, such as ``above 0, at most 1``; an empty text if there are none."""
-    words = {"gt": "above {}", "ge": "{} or more", "lt": "below {}", "le": "at most {}"}
-    found = []
-    for bound in info.metadata:
-        for name, text in words.items():
-            if getattr(bound, name, None) is not None:
-                found.append(text.format(f"{getattr(bound, name):g}"))
-    return ", ".join(found)
 
 
 def kind_of(info: FieldInfo) -> Any:

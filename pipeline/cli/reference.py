@@ -1,4 +1,4 @@
-"""Write the tables of README and docs, and typed methods of the Python package, from the code.
+"""Write the tables of README and docs, and the methods of `magpend.Spec`, from the code.
 
 The command is ``python -m pipeline.cli.reference``.
 
@@ -53,7 +53,7 @@ def commands() -> str:
     return table(("command", "does"), rows)
 
 
-SHARED = ("plot fractions", "analyse attractors", "analyse branches")
+SHARED = ("plot fractions", "analyse branches", "analyse hysteresis")
 """Commands whose options other commands have, too. The options are listed only with these commands."""
 
 
@@ -64,7 +64,7 @@ def options() -> str:
     for name, command in found.items():
         own, also = dict(_options(command)), list[str]()
         for other in SHARED:
-            if other != name and listed[other].items() <= own.items() and not _covered(other, also):
+            if other != name and listed[other].items() <= own.items():
                 also.append(f"`magpend {other}`")
                 own = {flag: text for flag, text in own.items() if flag not in listed[other]}
         paragraphs = "\n\n".join(" ".join(p.split()) for p in (command.help or "").split("\n\n"))
@@ -72,10 +72,6 @@ def options() -> str:
         part += f"\n\nTakes the options of {' and '.join(also)}{', and:' if own else '.'}" if also else ""
         parts.append(part + (f"\n\n{table(('option', 'meaning'), own.items())}" if own else ""))
     return "\n\n".join(parts)
-
-
-def _covered(name: str, others: list[str]) -> bool:
-    return name == "analyse attractors" and "`magpend plot fractions`" in others
 
 
 def _options(command: Any) -> list[tuple[str, str]]:
@@ -164,7 +160,7 @@ def specification() -> str:
         (
             "[drive]",
             recorded_drive.DriveTable,
-            'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
+            'For `kind = "sweep"` alone: see [Recorded drives](../recorded-drives.md).',
         ),
         (
             "[drift.NAME]",
@@ -399,10 +395,9 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def stale() -> dict[Path, str]:
     """Return the new texts of the pages and modules that are out of date, by path."""
-    from pipeline.cli import reference_spec, signatures
+    from pipeline.cli import reference_spec
 
     texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
-    texts |= {path: text() for path, text in signatures.generated().items()}
     texts[reference_spec.MODULE] = reference_spec.module()
     return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
 

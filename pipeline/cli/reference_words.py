@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args, get_origin
 
-from pipeline.cli.options import bounds_of
+from pipeline.products.product import bounds_of
 
 
 def default_in_words(info: Any) -> str:

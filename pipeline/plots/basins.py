@@ -17,7 +17,7 @@ from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.figures import BasinFigureOptions
 
 _DARKEST = 0.62
@@ -257,7 +257,7 @@ def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Datase
 def draw(run: Run, options: BasinFigureOptions) -> style.DataFigure:
     """Draw the figure ``basins`` of a run."""
     at, notes = values_of(run, options)
-    found = attractors_of(run, options)
+    found = run.derive("attractors")
     times = run.cube()["n_periods"] if options.shade else None
     figure = plot_basins(found, at=at, degrees=options.degrees, n_periods=times, frame=frame_of(options))
     return noted(figure, notes)

@@ -16,10 +16,9 @@ from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.fractions import swept_parameter
-from pipeline.products.attractors import AttractorOptions
-from pipeline.products.figures import CoexistingOptions
+from pipeline.products.product import StateOptions
 
 _LEAST_PT, _GROWTH_PT = 1.1, 5.0
 _UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55
@@ -202,12 +201,12 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
     return entries
 
 
-def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
+def draw(run: Run, options: StateOptions) -> style.DataFigure:
     """Draw the figure ``attractors`` of a run, with hysteresis loops if it was continued in both directions."""
     at, notes = values_of(run, options)
-    found = attractors_of(run, options)
+    found = run.derive("attractors")
     both = "direction" in found.coords and {"up", "down"} == set(found["direction"].values.astype(str).tolist())
-    loops = run.derive("hysteresis", **options.part(AttractorOptions)) if both else None
+    loops = run.derive("hysteresis") if both else None
     figure = plot_coexisting(
         found, state=options.state, at=at, degrees=options.degrees, hysteresis=loops, frame=frame_of(options)
     )

@@ -9,10 +9,10 @@ from pipeline.layout.units import shown_unit
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, NAMES
 from pipeline.plots.curve_lines import DASHES, mark_points
-from pipeline.plots.figure import Run, attractors_of, frame_of
+from pipeline.plots.figure import Run, frame_of
 from pipeline.plots.regimes import plot_regimes
 from pipeline.products.branches import CurveOptions
-from pipeline.products.figures import CurveFigureOptions, RegimeOptions
+from pipeline.products.figures import CurveFigureOptions
 
 _COLOURS = dict(zip(KINDS[:4], (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE), strict=True))
 
@@ -69,5 +69,5 @@ def draw(run: Run, options: CurveFigureOptions) -> style.DataFigure:
     found = run.derive("curves", **options.part(CurveOptions))
     if not options.over:
         return plot_curves(found, frame=frame_of(options))
-    below = attractors_of(run.of(options.over), RegimeOptions())
+    below = run.of(options.over).derive("attractors")
     return plot_regimes(below, show=options.show, curves=found, frame=frame_of(options))

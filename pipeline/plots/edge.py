@@ -12,7 +12,7 @@ from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, is_grid_dim,
 from pipeline.plots import labels, style
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import with_diagram
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.figures import EdgeFigureOptions
 from pipeline.products.resilience import EdgeOptions
 
@@ -100,6 +100,6 @@ def draw(run: Run, options: EdgeFigureOptions) -> style.DataFigure:
     cube = run.cube()
     grid = [str(d) for d in cube["status"].dims if is_start_dim(str(d)) and is_grid_dim(str(d))]
     if len(grid) == 2:
-        below = plot_basins(attractors_of(run, options), at=at, degrees=options.degrees, frame=frame)
+        below = plot_basins(run.derive("attractors"), at=at, degrees=options.degrees, frame=frame)
         axes = (grid[0].removesuffix("_0"), grid[1].removesuffix("_0"))
     return noted(plot_edge(found, below, axes, degrees=options.degrees, frame=frame), notes)

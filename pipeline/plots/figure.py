@@ -134,10 +134,3 @@ def noted(figure: DataFigure, notes: list[str]) -> DataFigure:
     """Add notes for the user to a figure, and return the figure."""
     figure.notes.extend(notes)
     return figure
-
-
-def attractors_of(run: Run, options: Options) -> xr.Dataset:
-    """Return the attractors of a run, with ids that stay the same along its parameters."""
-    from pipeline.products.attractors import AttractorOptions
-
-    return run.derive("attractors", **options.part(AttractorOptions))

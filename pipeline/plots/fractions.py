@@ -16,8 +16,8 @@ from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.attractor_letters import letter
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
-from pipeline.products.figures import AttractorFigureOptions
+from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.products.product import FigureOptions
 
 MOST_BARS = 60
 """Most bars that are drawn: more would hide the bands."""
@@ -222,8 +222,8 @@ def _raster(
     return raster
 
 
-def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
+def draw(run: Run, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``fractions`` of a run."""
     at, notes = values_of(run, options)
-    found = attractors_of(run, options)
+    found = run.derive("attractors")
     return noted(plot_fractions(found, at=at, frame=frame_of(options)), notes)

@@ -18,9 +18,9 @@ from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import once
 from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
-from pipeline.products.figures import AttractorFigureOptions
+from pipeline.products.product import FigureOptions
 
 MAX_ROWS = 8
 LONE_MM = 110.0
@@ -216,11 +216,11 @@ def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
     return [] if drawing is None else fixed_handles(drawing, _parameters(data), shown)
 
 
-def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
+def draw(run: Run, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``gallery`` of a run; the motion on each attractor is integrated for it."""
     from pipeline.analysis.attractors.describing.portraits import portraits
 
     at, notes = values_of(run, options)
-    found = attractors_of(run, options)
+    found = run.derive("attractors")
     figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))
     return noted(figure, notes)

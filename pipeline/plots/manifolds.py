@@ -11,9 +11,8 @@ from pipeline.layout.vocabulary import is_start_dim
 from pipeline.plots import labels, style
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import fixed_of, with_diagram
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.selection import at_points
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.figures import ManifoldFigureOptions
 from pipeline.products.manifolds import ManifoldOptions
 
@@ -85,6 +84,6 @@ def draw(run: Run, options: ManifoldFigureOptions) -> style.DataFigure:
     frame, below = frame_of(options), None
     starts = [str(d) for d in run.cube()["status"].dims if is_start_dim(str(d))]
     if len(starts) == 2:
-        attractors = attractors_of(run, AttractorOptions())
+        attractors = run.derive("attractors")
         below = plot_basins(attractors, at=at, degrees=options.degrees, frame=frame)
     return noted(plot_manifolds(found, below, degrees=options.degrees, frame=frame), notes)

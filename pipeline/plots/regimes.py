@@ -23,7 +23,7 @@ from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, parameter_name
 from pipeline.plots import labels, palette, style
 from pipeline.plots.curve_lines import draw_over, line_note
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
 
 BESIDE = 0.85
@@ -318,7 +318,7 @@ def _rank(name: str) -> tuple[bool, list[tuple[float, str]]]:
 def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
     """Draw the figure ``regimes`` of a run."""
     at, notes = values_of(run, options)
-    found = attractors_of(run, options)
+    found = run.derive("attractors")
     curves = _curves_of(run.of(options.curves), found, at) if options.curves else None
     return noted(plot_regimes(found, show=options.show, at=at, curves=curves, frame=frame_of(options)), notes)
 

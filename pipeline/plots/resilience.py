@@ -17,7 +17,7 @@ from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import ATTRACTS, model_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import ResilienceFigureOptions
 from pipeline.products.resilience import ResilienceOptions
@@ -166,5 +166,5 @@ def draw(run: Run, options: ResilienceFigureOptions) -> style.DataFigure:
     cube = at_points(run.cube(), at)
     _check_axes(cube, [name for name in swept_parameters(cube) if cube.sizes[name] > 1])
     found = run.derive("resilience", **{**options.part(ResilienceOptions), "at": at})
-    figure = plot_resilience(found, attractors_of(run, options), at=at, frame=frame_of(options))
+    figure = plot_resilience(found, run.derive("attractors"), at=at, frame=frame_of(options))
     return noted(figure, notes)

@@ -16,7 +16,7 @@ from pipeline.layout.period_names import section_name
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import fixed_of
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.missing_cells import absent_handles, say_empty
 from pipeline.plots.motions import Motions
 from pipeline.plots.points import View, make_view, survey
@@ -171,7 +171,7 @@ def draw(run: Run, options: SectionOptions) -> style.DataFigure:
     """Draw the figure ``section`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)
-    found = attractors_of(run, options) if options.colour == "attractor" else None
+    found = run.derive("attractors") if options.colour == "attractor" else None
     model = model_of(cube)
     first, second = options.state, options.against or section_pair(model, options.state)[1]
     figure = plot_section(cube, found, states=(first, second), at=at, degrees=options.degrees, frame=frame_of(options))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pipeline.products.attractors import AttractorOptions
-from pipeline.products.product import option
+from pipeline.products.product import Options, option
 
 MOST_FRAMES = 5000
 """Most frames of a film; it takes some minutes to draw, and some hundred megabytes as GIF."""
 
 
-class AnimationOptions(AttractorOptions):
+class AnimationOptions(Options):
     """Options of an animation of a run."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point to show.")

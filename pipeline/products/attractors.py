@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Self
+from collections.abc import Mapping
+from typing import Any, Self
 
 from pipeline.products.product import Analysis, Options, option
 
@@ -34,19 +35,11 @@ class IdentifyOptions(Options):
     n_sample: int = option(24, "Number of cells in the first sample that is extended.", ge=1)
     lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
 
-    @property
-    def effort(self) -> tuple[float, int]:
-        """Return the limits for extending the integration of undecided cells: `budget` and `n_sample`; both 0 if turned
-        off.
-        """
-        return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
-
-    def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return the options with other values of `budget` and `n_sample`, given as from `effort`."""
-        budget, n_sample = effort
-        if not budget:
-            return self.model_copy(update={"extend": False})
-        return self.model_copy(update={"extend": True, "budget": budget, "n_sample": n_sample})
+    @classmethod
+    def from_attrs(cls, attrs: Mapping[Any, Any]) -> Self:
+        """Return the options in the attributes of a result; those that it lacks have their defaults."""
+        given = {name: (attrs.get(f"identify_{name}"), info.default) for name, info in cls.model_fields.items()}
+        return cls(**{name: type(default)(value) for name, (value, default) in given.items() if value is not None})
 
 
 class AttractorOptions(IdentifyOptions):
@@ -71,6 +64,7 @@ ATTRACTORS = Analysis(
     "attractors",
     """Find the attractors at every parameter point, show that they attract, and follow them along the axes.
 
+    Options that are given hold for the run from then on: all other analyses and figures show these attractors.
     Prints a table per parameter point, or with more than six points a line per attractor with the
     range in which it exists. Cells on no known orbit are integrated further, at most as long as in the
     run itself. Basin fractions are fractions of the cells that end on attractors, with 95 % intervals.""",
@@ -84,7 +78,7 @@ ATTRACTORS = Analysis(
 HYSTERESIS = Analysis(
     "hysteresis",
     "List where a continuation follows different attractors upwards and downwards, and where it jumps.",
-    AttractorOptions,
+    Options,
     compute="pipeline.analysis.attractors.hysteresis_product:hysteresis",
     table="pipeline.analysis.attractors.hysteresis_table:hysteresis_table",
     needs="pipeline.analysis.attractors.hysteresis_product:needs_directions",
@@ -96,10 +90,9 @@ SETTLING = Analysis(
     "settling",
     """List each set that does not close: whether its cells stay or leave, and where they go.
 
-    With --budget a larger sample is integrated for longer; the result then counts for all analyses of
-    the run.
+    The option budget of the attractors says for how long a sample of their cells is integrated.
     Transient lifetimes are in drive periods or returns.""",
-    AttractorOptions,
+    Options,
     compute="pipeline.analysis.attractors.settling_product:settling",
     table="pipeline.analysis.attractors.settling_table:settling_table",
     builds_on=("attractors",),

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipeline.products.attractors import AttractorOptions
-from pipeline.products.product import Analysis, option
+from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.basins.product"
 
 
-class BasinOptions(AttractorOptions):
+class BasinOptions(Options):
     """Options for measuring basins of attraction: fractions, basin entropy, uncertainty exponent."""
 
     interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pipeline.products.attractors import AttractorOptions
-from pipeline.products.product import Analysis, option
+from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.chaos.product"
 
 
-class ChaosOptions(AttractorOptions):
+class ChaosOptions(Options):
     """Options for telling regular from chaotic motion."""
 
     n_sigma: float = option(3.0, "Number of standard errors by which an exponent must differ from 0.", gt=0.0)
@@ -19,7 +18,7 @@ class ChaosOptions(AttractorOptions):
     n_max: int = option(2000, "Most section points for the correlation dimension; 0 computes none.", ge=0)
 
 
-class DimensionOptions(AttractorOptions):
+class DimensionOptions(Options):
     """Options for fitting a correlation dimension."""
 
     at: dict[str, float] = option({}, "Value of a swept parameter; by default all values.")
@@ -38,7 +37,6 @@ CHAOS = Analysis(
     ChaosOptions,
     compute=f"{_ROOM}:chaos",
     table="pipeline.analysis.chaos.table:chaos_table",
-    needs=f"{_ROOM}:needs_chaos",
     builds_on=("attractors",),
     figure="lyapunov",
     by_point=True,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
@@ -40,7 +39,7 @@ class BifurcationOptions(StateOptions):
         return super().label() if not self.quantity else _without(self, "state")
 
 
-class SectionOptions(AttractorOptions, StateOptions):
+class SectionOptions(StateOptions):
     """Options of a figure of section points at one parameter point."""
 
     against: str = option("", "State on the vertical axis; by default the other state's rate, or the next state.")
@@ -49,21 +48,13 @@ class SectionOptions(AttractorOptions, StateOptions):
     )
 
 
-class AttractorFigureOptions(AttractorOptions, FigureOptions):
-    """Options of a figure of the attractors at one parameter point."""
-
-
-class BasinFigureOptions(AttractorFigureOptions):
+class BasinFigureOptions(FigureOptions):
     """Options of a figure of basins of attraction."""
 
     shade: bool = option(False, "Darken cells that took longer to converge.")
 
 
-class CoexistingOptions(AttractorOptions, StateOptions):
-    """Options of a figure of all coexisting attractors over a parameter."""
-
-
-class RegimeOptions(AttractorFigureOptions):
+class RegimeOptions(FigureOptions):
     """Options of a regime map over two parameters."""
 
     show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
@@ -195,7 +186,7 @@ SECTION = Figure(
 ATTRACTORS = Figure(
     "attractors",
     "Draw all coexisting attractors over the swept parameter, with the hysteresis of a continuation.",
-    CoexistingOptions,
+    StateOptions,
     "pipeline.plots.coexisting:draw",
 )
 
@@ -204,7 +195,7 @@ GALLERY = Figure(
     """Draw the attractors of one parameter point: phase portraits, and the model's own drawing of the path.
 
     One period of each attractor is integrated for the portraits.""",
-    AttractorFigureOptions,
+    FigureOptions,
     "pipeline.plots.gallery:draw",
     panels="several",
 )
@@ -219,7 +210,7 @@ BASINS = Figure(
 FRACTIONS = Figure(
     "fractions",
     "Draw basin fractions over the swept parameter, as stacked bands.",
-    AttractorFigureOptions,
+    FigureOptions,
     "pipeline.plots.fractions:draw",
 )
 

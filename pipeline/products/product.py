@@ -76,6 +76,17 @@ def default_of(model: type[Options], name: str) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+def bounds_of(info: FieldInfo) -> str:
+    """Return the bounds of a field in words, such as ``above 0, at most 1``; an empty text if there are none."""
+    words = {"gt": "above {}", "ge": "{} or more", "lt": "below {}", "le": "at most {}"}
+    found = []
+    for bound in info.metadata:
+        for name, text in words.items():
+            if getattr(bound, name, None) is not None:
+                found.append(text.format(f"{getattr(bound, name):g}"))
+    return ", ".join(found)
+
+
 @dataclass(frozen=True)
 class Table:
     """Result of an analysis as a table: rows for CSV and JSON, and lines to print.

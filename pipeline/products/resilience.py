@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipeline.products.attractors import AttractorOptions
-from pipeline.products.product import Analysis, option
+from pipeline.products.product import Analysis, Options, option
 
 
-class ResilienceOptions(AttractorOptions):
+class ResilienceOptions(Options):
     """Options for measuring how attractors respond to shocks."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run; by default all parameter points.")
@@ -30,7 +29,7 @@ class ResilienceOptions(AttractorOptions):
     seed: int = option(0, "Seed of directions, random shocks and timed initial states.", ge=0)
 
 
-class EdgeOptions(AttractorOptions):
+class EdgeOptions(Options):
     """Options for tracking edge states between two attractors."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point.")

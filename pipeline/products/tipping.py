@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.tipping"
@@ -18,7 +17,7 @@ class TippingOptions(Options):
     brackets: int = option(64, "Most critical values that are bisected.", ge=0)
 
 
-class OverlapOptions(AttractorOptions):
+class OverlapOptions(Options):
     """Options for tipping probabilities from the overlaps of basins at two parameter values."""
 
     parameter: str = option("", "Swept parameter; by default the only axis.")

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.products.registry import ANALYSES
-from pipeline.runs.derive import is_outdone
-from pipeline.runs.versions import code_version
+from pipeline.runs.versions import current
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in, read_product_attrs
@@ -30,18 +29,13 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
     list of dict
         Options that differ from their defaults, those with the fewest first.
     """
-    found = []
+    found, wanted = [], current(run, name)
     for place in products_in(run.info.files.below(DERIVED)):
         try:
             attrs = read_product_attrs(place)
         except (DamagedError, FileNotFoundError):
             continue
-        if (
-            attrs.get("derived_product") == name
-            and attrs.get("cube_digest") == run.digest
-            and attrs.get("analysis_version") == code_version(name)
-            and not is_outdone(run, attrs)
-        ):
+        if all(attrs.get(key) == value for key, value in wanted.items()):
             found.append(settled_options(name, attrs))
     return sorted(found, key=lambda options: (len(options), json.dumps(options, sort_keys=True)))
 

@@ -31,7 +31,7 @@ from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import report
 from pipeline.runs.stopping import stoppable
-from pipeline.runs.versions import key_of
+from pipeline.runs.versions import current, key_of
 from pipeline.specification.parsing import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files
@@ -122,10 +122,10 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files
         result: xr.Dataset = function_of(analysis.compute)(run, options)
         return result
     for other in analysis.builds_on:  # once, before workers ask for it
-        run.derive(other, **options.part(ANALYSES[other].options))
+        run.derive(other)
     where = replace(_in_processes(run.where or Where()), place=run.info.files.place)
     clients.reach(where)
-    key, folder = key_of(run.digest, analysis, options), blocks_beside(place)
+    key, folder = key_of(current(run, analysis.name), analysis, options), blocks_beside(place)
     task = partial(
         compute_block, type(run).of, run.info.files.place, run.digest, options, key, blocks, origin=origin(run.model)
     )
@@ -167,7 +167,7 @@ def compute_block(
         import_model(*origin)
     run, known = _opened(opened, directory, digest)
     analysis = ANALYSES[key["derived_product"]]
-    if key_of(run.digest, analysis, options) != key:
+    if key_of(current(run, analysis.name), analysis, options) != key:
         raise RefusedError(
             f"{directory}: this worker's magpend would not compute the same {analysis.name}; install the same version "
             "everywhere."

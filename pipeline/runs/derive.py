@@ -10,8 +10,9 @@ The attribute ``derived_options`` holds the options as JSON. Labels (``state``, 
 the attribute ``words``. If two processes derive the same result at once, both compute it, and one of the equal
 results stays.
 
-A longer extension of cells counts for every later analysis: options that ask for less are raised to the
-largest budget of the kept attractors (`most_evidence`). Two results therefore never contradict each other.
+A run has one set of attractors, on which its other analyses and its figures rest. The options with which they were
+last sought are in ``derived/attractors.json`` (`pipeline.runs.versions.attractor_options`); results that rest on
+others are stale.
 
 To add an analysis see `pipeline.products.product`.
 """
@@ -28,12 +29,11 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.conventions import conventional
 from pipeline.layout.vocabulary import overrides_attribute
-from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
 from pipeline.runs import notebook
 from pipeline.runs.naming import named
-from pipeline.runs.versions import code_version, key_of
+from pipeline.runs.versions import OF_ATTRACTORS, attractor_options, current, key_of
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED, Files
@@ -152,13 +152,18 @@ def derive(
     run = AnalysedRun.of(source, echo, **places)
     _refuse_unsteady(run, analysis)
     _refuse_noise(run, analysis)
+    is_chosen = name == "attractors" and bool(wanted.model_fields_set)
+    if name == "attractors" and not is_chosen:
+        wanted = attractor_options(run)
     wanted = prepared(run, analysis, wanted)
-    key, told = key_of(run.digest, analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
+    key, told = key_of(current(run, name), analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
         ds = open_product(place)
         if all(ds.attrs.get(part) == value for part, value in key.items()):
             run.echo(f"{name}: taken from {place.name}")
+            if is_chosen:
+                _keep(run, wanted)
             return _placed(ds.assign_attrs(told), place)
     except FileNotFoundError:
         pass
@@ -169,7 +174,10 @@ def derive(
         run.echo(f"{problem}: the result of {name} is shown but not kept")
     with notebook.progress():
         computed = _compute(run, analysis, wanted, None if problem else place)
-        return _kept(run, place, computed.assign_attrs({**key, **told}))
+        result = _kept(run, place, computed.assign_attrs({**key, **told}))
+    if is_chosen:
+        _keep(run, wanted)
+    return result
 
 
 def analyses_in(text: str) -> list[str]:
@@ -225,12 +233,12 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
     places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
     if not places:  # saves the time to compute the code's version
         return
-    current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
+    wanted = current(run, name)
     found = []
     for place in places:
         with contextlib.suppress(DamagedError, FileNotFoundError):
             attrs = read_product_attrs(place)
-            if all(attrs.get(key) == value for key, value in current.items()) and not is_outdone(run, attrs):
+            if all(attrs.get(key) == value for key, value in wanted.items()):
                 found.append((_changed_options(run, name, attrs), place.name, place))
     for _, _, place in sorted(found, key=lambda entry: entry[:2]):
         try:
@@ -242,7 +250,8 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
 
 def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
     try:
-        options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
+        defaults = attractor_options(run) if name == "attractors" else validated(ANALYSES[name].options, {})
+        options = prepared(AnalysedRun.of(run), ANALYSES[name], defaults).plain()
     except SpecError:  # the run does not suit the defaults
         options = {}
     return sum(options.get(key) != value for key, value in options_of(attrs).items())
@@ -309,58 +318,12 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
             function_of(product.needs)(run, options)
         settle = getattr(product, "settle", "")
         options = function_of(settle)(run, options) if settle else options
-    return most_evidence(run, options)
+    return options
 
 
-def most_evidence(run: Run, options: Options) -> Options:
-    """Raise the effort in some options to the largest effort of a stored search for attractors with otherwise equal
-    options.
-
-    Options without an effort are returned unchanged.
-    """
-    if not isinstance(options, IdentifyOptions):
-        return options
-    own = IdentifyOptions(**options.part(IdentifyOptions))
-    kept = [effort for told, effort in _kept_efforts(run) if told == _aside(own)]
-    return options.with_effort(max([own.effort, *kept]))
-
-
-def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return the options of each valid stored search for attractors, split into its effort and all others."""
-    try:
-        kept_here = products_in(run.info.files.below(DERIVED))
-    except NotADirectoryError:
-        return []
-    places = [p for p in kept_here if p.name.rpartition("/")[2].startswith("identified-")]
-    if not places:
-        return []
-    current = {"cube_digest": run.digest, "analysis_version": code_version("identified")}
-    found = []
-    for place in places:
-        with contextlib.suppress(DamagedError, FileNotFoundError, ValueError):
-            attrs = read_product_attrs(place)
-            if all(attrs.get(key) == value for key, value in current.items()):
-                kept = IdentifyOptions.model_validate(options_of(attrs))
-                found.append((_aside(kept), kept.effort))
-    return found
-
-
-def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the options of a search for attractors except its effort, that is, how far it integrates."""
-    effort = ("extend", "budget", "n_sample")
-    return {name: value for name, value in options.plain().items() if name not in effort}
-
-
-def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether a stored search for attractors has integrated further than the search behind a given result."""
-    name, given = str(attrs.get("derived_product")), options_of(attrs)
-    if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
-        return False
-    try:
-        own = validated(IdentifyOptions, {k: given[k] for k in IdentifyOptions.model_fields if k in given})
-    except SpecError as error:
-        raise DamagedError(f"its options: {error.problems[0]}") from None
-    return bool(most_evidence(run, own) != own)
+def _keep(run: Run, options: Options) -> None:
+    with contextlib.suppress(OSError):  # a folder that is read alone keeps its attractors
+        run.info.files.below(DERIVED).write(OF_ATTRACTORS, json.dumps(options.plain()).encode())
 
 
 @contextlib.contextmanager
@@ -430,9 +393,7 @@ def _stale(run: Run) -> list[Files]:
         try:
             attrs = read_product_attrs(place)
             name = str(attrs.get("derived_product"))
-            if name not in ANALYSES or attrs.get("cube_digest") != run.digest:
-                return True
-            return bool(attrs.get("analysis_version") != code_version(name)) or is_outdone(run, attrs)
+            return name not in ANALYSES or any(attrs.get(k) != value for k, value in current(run, name).items())
         except DamagedError:
             return True
 

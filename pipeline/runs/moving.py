@@ -52,11 +52,11 @@ def of_attractors(
     from pipeline.analysis.selection import choose
     from pipeline.analysis.selection import start_dims as dims_of_starts
     from pipeline.plots import palette
-    from pipeline.plots.figure import attractors_of, values_of
+    from pipeline.plots.figure import values_of
 
     with refused(run.name):
         at, notes = values_of(run, options)
-        found = attractors_of(run, options)
+        found = run.derive("attractors")
         part = dense(
             choose(found, at, tuple(dims_of_starts(found)), "an animation shows one parameter point"), points=True
         )

@@ -1,16 +1,23 @@
-"""Compute the version of an analysis from the code that it uses, so that edits elsewhere keep its results valid."""
+"""Tell which stored results of analyses hold: the versions of their code, and the attractors that they rest on."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
 import json
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
 from magpend_core.source_digests import meaning_digest
+from pipeline.products.attractors import AttractorOptions
 from pipeline.products.product import Analysis, Options
 from pipeline.products.registry import ANALYSES
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import DERIVED
+from pipeline.store.run import Run
+
+OF_ATTRACTORS = "attractors.json"
 
 _ROOT = Path(__file__).parents[2]
 _COUNTED = ("pipeline.analysis", "pipeline.layout.vocabulary")
@@ -74,13 +81,39 @@ def _file(module: str) -> Path:
     raise FileNotFoundError(path)
 
 
-def key_of(digest: str, analysis: Analysis, options: Options) -> dict[str, str]:
-    """Return the attributes of a result that hold everything which decides its numbers, given the cells' digest."""
+def attractor_options(run: Run) -> AttractorOptions:
+    """Return the options of the run's attractors: those last given, or the defaults."""
+    try:
+        return AttractorOptions.model_validate_json(run.info.files.below(DERIVED).read(OF_ATTRACTORS))
+    except FileNotFoundError:
+        return AttractorOptions()
+    except ValueError:
+        raise DamagedError(f"{run.name}: {DERIVED}/{OF_ATTRACTORS} is damaged; remove it.") from None
+
+
+def current(run: Run, name: str) -> dict[str, str]:
+    """Return the attributes of those results of an analysis that hold for the present cells and attractors of a run."""
+    rests = rests_on_attractors(name)
+    options = json.dumps(attractor_options(run).changed(), sort_keys=True) if rests else ""
+    found = {"derived_product": name, "cube_digest": run.digest, "analysis_version": code_version(name)}
+    return {**found, "attractor_options": options}
+
+
+def rests_on_attractors(name: str) -> bool:
+    """Return whether an analysis takes the run's attractors as they are."""
+    return any(one == "attractors" or rests_on_attractors(one) for one in ANALYSES[name].builds_on)
+
+
+def key_of(current: Mapping[str, str], analysis: Analysis, options: Options) -> dict[str, str]:
+    """Return the attributes of a result that hold everything which decides its numbers.
+
+    Parameters
+    ----------
+    current
+        What holds for the present cells and attractors of the run, see `current`.
+    analysis, options
+        The analysis with its options.
+    """
     plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
-    parts = {
-        "derived_product": analysis.name,
-        "derived_options": json.dumps(plain, sort_keys=True),
-        "cube_digest": digest,
-        "analysis_version": code_version(analysis.name),
-    }
+    parts = {**current, "derived_options": json.dumps(plain, sort_keys=True)}
     return {**parts, "derived_key": hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}

@@ -341,10 +341,10 @@ def _legs(most: int) -> Iterator[int]:
 
 
 def destinations_at(
-    cube: xr.Dataset, attractors: xr.Dataset, points: dict[tuple[int, ...], Point], options: IdentifyOptions
+    cube: xr.Dataset, attractors: xr.Dataset, points: dict[tuple[int, ...], Point]
 ) -> Iterator[tuple[tuple[int, ...], Destinations]]:
     """Yield the known attractors of some parameter points, by index in the cube, as ends of trajectories."""
-    dynamics = Dynamics.of(cube)
+    dynamics, options = Dynamics.of(cube), IdentifyOptions.from_attrs(attractors.attrs)
     settings = Settings.of(
         cube,
         dynamics.system,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import xarray as xr
 
 from pipeline.analysis.run import Run
-from pipeline.products.attractors import AttractorOptions
+from pipeline.products.product import Options
 
 VARIABLES = (
     "kind",
@@ -33,7 +33,7 @@ VARIABLES = (
 """Variables of the attractors that the settling table shows."""
 
 
-def settling(run: Run, options: AttractorOptions) -> xr.Dataset:
+def settling(run: Run, options: Options) -> xr.Dataset:
     """Return the evidence on whether each non-periodic set attracts or is transient."""
-    found: xr.Dataset = run.derive("attractors", **options.plain())
+    found: xr.Dataset = run.derive("attractors")
     return found[list(VARIABLES)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import xarray as xr
 
 from pipeline.analysis.run import Run
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.basins import BasinOptions
 
 
@@ -22,5 +21,5 @@ def basins(run: Run, options: BasinOptions) -> xr.Dataset:
     """
     from pipeline.analysis.basins.basins import basins as compute
 
-    found = run.derive("attractors", **options.part(AttractorOptions))
+    found = run.derive("attractors")
     return compute(run.cube(), found, options)

@@ -50,6 +50,8 @@ def chaos(ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None =
     options = options or ChaosOptions(**changes)
     if attractors["attractor_id"].sizes != ds["status"].sizes:
         raise ValueError("attractors and ds have other cells; give what identify made of this cube.")
+    if len(missing := reasons(ds, options.stride)) == 2 and not attractors.attrs.get("identify_polish", 1):
+        raise ValueError("nothing to compute. " + ". ".join(missing))
     cells = chaotic_cells(ds, options)
     cells["attractor_id"] = attractors["attractor_id"].transpose(*cells["motion"].dims)
     found = chaos_per_attractor(ds, cells, attractors, options)
@@ -85,11 +87,9 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
     Raises
     ------
     ValueError
-        If an option is out of bounds, or the cube has neither exponents nor enough sections and orbits are
-        not polished.
+        If an option is out of bounds.
     """
     options = options or ChaosOptions(**changes)
-    check_chaos(ds, options)
     missing = reasons(ds, options.stride)
     cells = _of_exponents(ds, options) if "lyapunov" in ds else _without_exponents(ds)
     if not any(reason.startswith("0-1") for reason in missing):
@@ -100,18 +100,6 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
     return cells.assign_coords(coords).assign_attrs(
         ds.attrs, chaos_n_sigma=options.n_sigma, chaos_least=options.least, not_computed="\n".join(missing)
     )
-
-
-def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
-    """Raise ValueError if neither Lyapunov exponents nor the 0-1 test nor multipliers can be computed.
-
-    Raises
-    ------
-    ValueError
-        If neither holds; the message has all reasons.
-    """
-    if len(missing := reasons(ds, options.stride)) == 2 and not options.polish:
-        raise ValueError("nothing to compute. " + ". ".join(missing))
 
 
 def reasons(ds: xr.Dataset, stride: int = 1) -> list[str]:

@@ -5,22 +5,14 @@ from __future__ import annotations
 import xarray as xr
 
 from pipeline.analysis.run import Run
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
-
-
-def needs_chaos(run: Run, options: ChaosOptions) -> None:
-    """Raise ValueError if no indicator of chaos can be computed from the run."""
-    from pipeline.analysis.chaos.chaos import check_chaos
-
-    check_chaos(run.cube(), options)
 
 
 def chaos(run: Run, options: ChaosOptions) -> xr.Dataset:
     """Compute Lyapunov exponents, dimensions and the 0-1 test for the cells and for each attractor of a run."""
     from pipeline.analysis.chaos.chaos import chaos as compute
 
-    return compute(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)
+    return compute(run.cube(), run.derive("attractors"), options)
 
 
 def needs_dimension(run: Run, options: DimensionOptions) -> None:
@@ -44,4 +36,4 @@ def dimension(run: Run, options: DimensionOptions) -> xr.Dataset:
     """Compute the correlation dimension of each non-periodic attractor of a run."""
     from pipeline.analysis.chaos.correlation import section_dimension
 
-    return section_dimension(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)
+    return section_dimension(run.cube(), run.derive("attractors"), options)

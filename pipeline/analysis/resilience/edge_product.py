@@ -54,7 +54,6 @@ from pipeline.layout.vocabulary import (
     split_dims,
     told_by,
 )
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.resilience import EdgeOptions
 
 CANDIDATES = 4
@@ -91,21 +90,21 @@ def _letters(names: tuple[str, str]) -> list[str]:
 
 def edge(run: Run, options: EdgeOptions) -> xr.Dataset:
     """Track the edge states between two attractors at a parameter point."""
-    whole = run.derive("attractors", **options.part(AttractorOptions))
+    whole = run.derive("attractors")
     cube = select_points(run.cube(), options.at, purpose=PURPOSE)
     attractors = select_points(whole, options.at, purpose=PURPOSE)
     dims, starts = split_dims(attractors["attractor_id"])
     here = attractors.isel(dict.fromkeys(dims, 0))
     between = _ids_of(here, options.between)
     (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
-    ((_, there),) = destinations_at(cube, attractors, points, options)
+    ((_, there),) = destinations_at(cube, attractors, points)
     untold = [name for name, number in zip(options.between, between, strict=True) if number not in there.told]
     if untold:
         raise ValueError(f"trajectories cannot be told to end on attractor {untold[0]}; track between two others.")
     labels = outcomes(here).transpose(*starts).values.ravel()
     states = start_states(cube, starts)
     candidates = nearest_pairs(states, labels, between, CANDIDATES * options.pairs, there, options.seed)
-    limits = Limits(options.closest, options.farthest, options.returns, options.max_orbit_period)
+    limits = Limits(options.closest, options.farthest, options.returns, there.options.max_orbit_period)
     tracking = Tracking(there, between, limits)
     pairs = tracking.choose(candidates, options.pairs)
     initial = np.array([pair.start for pair in pairs]).reshape(len(pairs), 2, -1)

@@ -43,7 +43,6 @@ from pipeline.analysis.resilience.shocks import Found, Settings, ShockSearch, Tr
 from pipeline.analysis.run import Run
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import ATTRACTS, grid_dim, section_attributes, split_dims, told_by
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.resilience import ResilienceOptions
 
 PRECISION = 1e-6
@@ -80,14 +79,14 @@ def _chosen(run: Run, options: ResilienceOptions) -> list[str]:
 
 def resilience(run: Run, options: ResilienceOptions) -> xr.Dataset:
     """Measure the response of the attractors at each parameter point to shocks."""
-    whole = run.derive("attractors", **options.part(AttractorOptions))
+    whole = run.derive("attractors")
     cube, attractors = select_points(run.cube(), options.at), select_points(whole, options.at)
     dims, starts = split_dims(attractors["attractor_id"])
     result = _Result(run, options, attractors)
     labels = outcomes(attractors).transpose(*dims, *starts).values
     states = start_states(cube, starts)
     for points in slabs(cube, Dynamics.of(cube), BUDGET):
-        for index, there in destinations_at(cube, attractors, points, options):
+        for index, there in destinations_at(cube, attractors, points):
             work, own = _Point(there, options, run), labels[index].ravel()
             result.count(index, own)
             result.time(index, *work.times(states))

@@ -14,7 +14,6 @@ from pipeline.analysis.selection import choose, place
 from pipeline.analysis.tabular import Row, aligned, with_interval
 from pipeline.analysis.tipping.table import outcome_word
 from pipeline.layout.vocabulary import axis_name
-from pipeline.products.attractors import AttractorOptions
 from pipeline.products.product import Table
 from pipeline.products.tipping import OverlapOptions
 
@@ -69,7 +68,7 @@ def overlaps(run: Run, options: OverlapOptions) -> xr.Dataset:
     The definition is that of Kaszas, Feudel and Tel (Sci. Rep. 9, 8654, 2019): the overlap of two basins over the
     first one, with uniform weight on the starts of the run.
     """
-    found = dense(run.derive("attractors", **options.part(AttractorOptions)))
+    found = dense(run.derive("attractors"))
     axis = axis_name(options.parameter)
     labels = outcomes(found)
     whole = found.assign(outcome=labels)

@@ -18,8 +18,6 @@ from pipeline.explorer.data.overlays import MOST_SECTION, SAME_VALUE
 from pipeline.explorer.data.view import can_have
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, KINDS
-from pipeline.products.attractors import AttractorOptions
-from pipeline.runs.derive import options_of
 from pipeline.store.run import Run
 
 
@@ -66,15 +64,9 @@ def run_has_basins(run: ExploredRun) -> bool:
 
 def _here(run: ExploredRun, name: str, place: Mapping[str, int]) -> Iterator[xr.Dataset]:
     """Yield the stored results of an analysis at a parameter point that name the attractors as the page does."""
-    known = run.kept("attractors")
-    if known is None:
-        return
-    names = set(AttractorOptions.model_fields)
-    wanted = {key: value for key, value in options_of(known.attrs).items() if key in names}
     for one in run.kept_each(name):
-        own = options_of(one.attrs)
         index = _index(run, one, place)
-        if index is not None and all(own.get(key) == value for key, value in wanted.items()):
+        if index is not None:
             yield isel(one, index).load()
 
 

@@ -12,7 +12,6 @@ for each motion that the model's classifier tells, and are not settled.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,7 +125,7 @@ class Catalog:
         self._packed = place.parameters.pack()
         self._geometry = Geometry.of(self.model)
         here = known.here()
-        self.options = _options_of(here)
+        self.options = IdentifyOptions.from_attrs({} if here is None else here.attrs)
         self.tolerance = _tolerance_of(here, closure_tolerance)
         self._lock = threading.RLock()
         self.entries: list[Entry] = []
@@ -400,16 +399,6 @@ class _WholePoint(Point):
 
 def _finite(points: np.ndarray) -> np.ndarray:
     return np.asarray(points[np.isfinite(points).all(axis=-1)])
-
-
-def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
-    attrs: Mapping[Any, Any] = {} if here is None else here.attrs
-    given = {}
-    for name, field in IdentifyOptions.model_fields.items():
-        value = attrs.get(f"identify_{name}")
-        if value is not None:
-            given[name] = type(field.default)(value)
-    return IdentifyOptions(**given)
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:

@@ -19,80 +19,25 @@ Datasets have the accessor ``ds.magpend``.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from functools import cache
 from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
-_HOMES = {
-    "magpend_core.models": ("import_model", "load_preset", "model_names", "preset_names"),
-    "magpend_core.models.model": ("Model", "Parameters"),
-    "magpend_core.models.parameters": ("ParameterError",),
-    "magpend_core.models.preset_writing": ("write_preset",),
-    "magpend_core.sections": ("Sections", "run_branches", "sections"),
-    "magpend_core.trajectory": ("trajectory",),
-    "magpend_core.sampling": ("Drive",),
-    "magpend_core.recorded_drive": ("evaluate_recorded", "recorded_sections", "recorded_trajectory"),
-    "pipeline.specification.drive_files": ("load_drive",),
-    "magpend_core.orbits": ("PeriodicOrbits", "polish_orbits"),
-    "magpend_core.lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
-    "magpend_core.engine.system": ("System",),
-    "magpend_core.pointwise": ("evaluate", "jacobian", "rates"),
-    "magpend_core.status": ("Status",),
-    "pipeline.specification.problems": ("SpecError",),
-    "magpend._runs": ("Run", "open_run", "run"),
-    "pipeline.compute.simulate": ("simulate",),
-    "pipeline.runs.building": ("Spec",),
-    "pipeline.runs.python": ("table",),
-    "pipeline.specification.inputs": ("load_model", "model"),
-    "pipeline.runs.status": ("state",),
-    "pipeline.runs.verify": ("verify_run",),
-    "pipeline.runs.extend": ("extend",),
-    "pipeline.runs.zoom": ("zoom",),
-    "pipeline.runs.derive": ("derive", "prune"),
-    "pipeline.runs.drawing": ("figure",),
-    "pipeline.runs.filming": ("animation",),
-    "pipeline.plots.films": ("save_animation",),
-    "pipeline.explorer.notebook.showing": ("explorer",),
-    "pipeline.rig.identify.identification": ("identify",),
-    "pipeline.rig.recordings": ("findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording"),
-    "pipeline.rig.recordings.figure": ("plot_recording",),
-    "pipeline.analysis.chaos.dimensions": ("correlation_dimension", "kaplan_yorke_dimension"),
-    "pipeline.analysis.chaos.zero_one": ("zero_one_test",),
-    "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),
-}
-_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
+@cache
+def _homes() -> dict[str, str]:
+    """Return the place ``module:object`` of every public name, as the package's stub lists them."""
+    import ast
+    from pathlib import Path
 
-def _analysis(name: str) -> Callable[..., Any]:
-    """Make the public function for an analysis, with a docstring that lists its options."""
-    from magpend._analyses import Analyses
-    from pipeline.products.product import default_of
-    from pipeline.products.registry import ANALYSES
-    from pipeline.runs.arguments import options_in_errors
-    from pipeline.runs.derive import derive
-
-    analysis = ANALYSES[name]
-
-    def found(source: Any, *, echo: Any = None, workers: Any = None, scheduler: Any = None, **options: Any) -> Any:
-        with options_in_errors(analysis.options):
-            return derive(source, name, options, echo=echo, workers=workers, scheduler=scheduler)
-
-    model = analysis.options
-    lines = [f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()]
-    found.__name__ = found.__qualname__ = name
-    found.__signature__ = _with_source(getattr(Analyses, name))  # type: ignore[attr-defined]
-    found.__doc__ = "\n".join([analysis.help, "", "Options:", *lines])
-    return found
-
-
-def _with_source(method: Callable[..., Any]) -> Any:
-    """Return the signature of a method with ``source`` in the place of ``self``."""
-    import inspect
-
-    own = inspect.signature(method)
-    _, *options = own.parameters.values()
-    source = inspect.Parameter("source", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation="str | Path | Run")
-    return own.replace(parameters=[source, *options])
+    homes = {}
+    for node in ast.parse(Path(__file__).with_suffix(".pyi").read_text("utf-8")).body:
+        if isinstance(node, ast.ImportFrom):
+            homes |= {alias.name: f"{node.module}:{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Assign):  # the functions of analyses are methods of `Run`
+            homes[ast.unparse(node.targets[0])] = f"magpend._runs:{ast.unparse(node.value)}"
+    return homes
 
 
 def _naming_arguments(value: Any, home: str) -> Any:
@@ -108,37 +53,19 @@ def _naming_arguments(value: Any, home: str) -> Any:
     return wrapped
 
 
-def _analysis_names() -> tuple[str, ...]:
-    from pipeline.products.registry import COMMANDS
-
-    return COMMANDS
-
-
-def _plot_names() -> list[str]:
-    import pipeline.plots
-
-    return pipeline.plots.__all__
-
-
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         from importlib import metadata
 
         return metadata.version("magpend")
-    if name in _HOME_OF:
-        value = _naming_arguments(getattr(import_module(_HOME_OF[name]), name), _HOME_OF[name])
-    elif not name.startswith("_") and name in _analysis_names():
-        value = _analysis(name)
-    elif not name.startswith("_") and name in _plot_names():
-        value = _naming_arguments(getattr(import_module("pipeline.plots"), name), "pipeline.plots")
-    else:
+    if name.startswith("_") or name not in _homes():
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
+    value = globals()[name] = _naming_arguments(resolve_name(_homes()[name]), _homes()[name])
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*_HOME_OF, *_analysis_names(), *_plot_names(), "__version__", "__doc__"})
+    return sorted({*_homes(), "__version__", "__doc__"})
 
 
 class _AccessorRegistration:

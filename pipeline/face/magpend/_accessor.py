@@ -10,7 +10,7 @@ import xarray as xr
 if TYPE_CHECKING:
     import pandas as pd
 
-    from magpend._figures import Plots
+    from magpend._plots import Plots
     from magpend._runs import Run
     from magpend_core.models.model import Model, Parameters
 
@@ -68,7 +68,7 @@ class DatasetAccessor:
         ValueError
             If the Dataset is no cube.
         """
-        from magpend._figures import Plots
+        from magpend._plots import Plots
 
         return Plots(self._cube("plot"))
 

@@ -7,16 +7,28 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Self, overload
 
-from magpend._analyses import Analyses, AnalysisName
-from magpend._figures import Plots
+from magpend._methods import AnalysisMethod
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.basins import BasinOptions
+from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions
+from pipeline.products.chaos import ChaosOptions, DimensionOptions
+from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
+from pipeline.products.noise import DensityOptions, EscapeOptions
+from pipeline.products.product import Options
+from pipeline.products.registry import CELL_PRODUCTS, COMMANDS
+from pipeline.products.resilience import EdgeOptions, ResilienceOptions
+from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
+from pipeline.products.tongues import TongueOptions
 from pipeline.runs import python
 from pipeline.runs.arguments import names_arguments
+from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.store.run import Run as StoredRun
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from magpend._plots import Plots
     from pipeline.explorer.notebook.widget import Explorer
     from pipeline.runs.status import State
     from pipeline.store.checking import Verification
@@ -25,7 +37,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 
 
-class Run(Analyses):
+class Run(StoredRun):
     """An opened run directory with its analyses as methods and its figures under `plot`.
 
     A run holds the commit records found when it was opened, so that all its results use the same cells. Open it
@@ -48,6 +60,27 @@ class Run(Analyses):
     >>> run.attractors().magpend.table()                                 # doctest: +SKIP
     >>> ax = run.plot.bifurcation(degrees=True)                         # doctest: +SKIP
     """
+
+    attractors = AnalysisMethod(AttractorOptions)
+    basins = AnalysisMethod(BasinOptions)
+    hysteresis = AnalysisMethod(Options)
+    settling = AnalysisMethod(Options)
+    chaos = AnalysisMethod(ChaosOptions)
+    dimension = AnalysisMethod(DimensionOptions)
+    branches = AnalysisMethod(BranchOptions)
+    bands = AnalysisMethod(BandOptions)
+    curves = AnalysisMethod(CurveOptions)
+    orbits = AnalysisMethod(OrbitOptions)
+    tongues = AnalysisMethod(TongueOptions)
+    manifolds = AnalysisMethod(ManifoldOptions)
+    tangency = AnalysisMethod(TangencyOptions)
+    tipping = AnalysisMethod(TippingOptions)
+    delay = AnalysisMethod(DelayOptions)
+    overlaps = AnalysisMethod(OverlapOptions)
+    resilience = AnalysisMethod(ResilienceOptions)
+    edge = AnalysisMethod(EdgeOptions)
+    escapes = AnalysisMethod(EscapeOptions)
+    density = AnalysisMethod(DensityOptions)
 
     @classmethod
     def open(cls, source: str | Path | Files | StoredRun) -> Self:
@@ -99,19 +132,19 @@ class Run(Analyses):
     @property
     def plot(self) -> Plots:
         """The figures of the run: ``run.plot.bifurcation()`` draws one and returns its axes."""
+        from magpend._plots import Plots
+
         return Plots(self)
 
-    def table(self, name: AnalysisName, *, echo: Callable[[str], None] | None = None, **options: Any) -> pd.DataFrame:
+    def table(self, name: str, **options: Any) -> pd.DataFrame:
         """Return an analysis of the run as a pandas table, as ``magpend analyse NAME --csv`` writes it.
 
         Parameters
         ----------
         name
             Name of the analysis, such as ``attractors``.
-        echo
-            Function that prints a line about each computation.
         options
-            Options of the analysis, as of the method of its name.
+            Keywords of the method of its name.
 
         Returns
         -------
@@ -123,7 +156,9 @@ class Run(Analyses):
         SpecError
             If the analysis or an option is unknown or out of bounds, or if the run does not suit.
         """
-        return python.table(self._analysed(name, {**options, "echo": echo}))
+        if name not in COMMANDS:
+            raise SpecError(unknown_name("analysis", name, COMMANDS))
+        return python.table(getattr(self, name)(**options))
 
     @names_arguments
     def explore(self, *, curves: str | Path | StoredRun | None = None, height: int = 720) -> Explorer:
@@ -168,9 +203,6 @@ class Run(Analyses):
         SpecError
             If the run has none.
         """
-        from pipeline.products.registry import CELL_PRODUCTS
-        from pipeline.specification.problems import SpecError
-
         if "lyapunov" not in self.spec.products:
             raise SpecError(
                 f"{self.name}: the run has no Lyapunov exponents. Add them with "

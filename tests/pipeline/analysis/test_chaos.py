@@ -206,7 +206,7 @@ def test_chaos__without_exponents():
     assert found.nature.values.tolist() == [Nature.CHAOTIC_BY_TEST, Nature.REGULAR]
     assert "chaotic (by the 0-1 test)" in "\n".join(chaos_table(found).lines)
     with pytest.raises(ValueError, match=r"nothing to compute\. Lyapunov exponents.*0-1 test: 128 sections"):
-        chaos(cube, one_set(cube), stride=2, polish=False)
+        chaos(cube, one_set(cube).assign_attrs(identify_polish=0), stride=2)
 
 
 @pytest.mark.slow
@@ -310,7 +310,6 @@ def test_analyse_chaos__order_and_chaos(main, run, tmp_path):
     [
         (["--n-sigma", "0"], "n_sigma = 0.0: must be"),
         (["--n-frequencies", "9"], "n_frequencies = 9: must be at least 10."),
-        (["--no-polish"], "nothing to compute. Lyapunov exponents of what does not close: the cube has none"),
     ],
 )
 def test_analyse_chaos__refused_before_computing(main, made, arguments, message):
@@ -424,11 +423,12 @@ def test_plot_convergence__lines_bands_and_transients():
 
 @pytest.mark.slow
 def test_commands__dimension_and_figures(main, run, tmp_path):
-    few = ("--at", "frequency=2.4", "--n-sample", "4", "--budget", "0.5")
+    few = ("--at", "frequency=2.4")
+    assert main("analyse", "attractors", run, "--n-sample", "4", "--budget", "0.5")[0] == 0
     code, out, err = main("analyse", "dimension", run, *few, "--csv", tmp_path / "d.csv")
     assert code == 0, err
     assert re.search(r"^  2\.4 +\d +\d+ ", out, re.MULTILINE)
-    near = ("--at", "frequency_hz=2.4", *few[2:])
+    near = ("--at", "frequency_hz=2.4")
     assert "dimension: taken from" in main("analyse", "dimension", run, *near)[2]
     code, out, err = main("plot", "convergence", run, "--at", "frequency=2.4")
     assert code == 0, err

@@ -19,7 +19,6 @@ from pipeline.analysis.resilience.table import resilience_table
 from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.plots.edge import plot_edge
 from pipeline.plots.resilience import plot_resilience
-from pipeline.products.attractors import AttractorOptions
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 
@@ -89,9 +88,9 @@ def magnets(computed):
 
 def at_point(a_run):
     """The only parameter point of a run, as ends of trajectories."""
-    cube, options = a_run.cube(), AttractorOptions()
+    cube = a_run.cube()
     (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
-    ((_, there),) = destinations_at(cube, dense(a_run.derive("attractors"), points=True), points, options)
+    ((_, there),) = destinations_at(cube, dense(a_run.derive("attractors"), points=True), points)
     return there
 
 

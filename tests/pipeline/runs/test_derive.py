@@ -32,11 +32,11 @@ class MeanOptions(Options):
 def register(patch, compute):
     """Put an analysis named ``mean`` beside the others, computed by a function."""
     mean = Analysis("mean", "A mean.", MeanOptions, compute="tests:mean", table="tests:none")
-    patch.setattr(deriving, "ANALYSES", {**ANALYSES, "mean": mean})
-    real, version = deriving.function_of, deriving.code_version
+    real, version = deriving.function_of, versions.code_version
     patch.setattr(deriving, "function_of", lambda name: compute if name == "tests:mean" else real(name))
     for module in (deriving, versions):
-        patch.setattr(module, "code_version", lambda name: "test" if name == "mean" else version(name))
+        patch.setattr(module, "ANALYSES", {**ANALYSES, "mean": mean})
+    patch.setattr(versions, "code_version", lambda name: "test" if name == "mean" else version(name))
     return compute
 
 
@@ -252,20 +252,25 @@ def test_attractors__matching_again_identifies_nothing_again(whole):
 
 
 @pytest.mark.slow
-def test_attractors__what_was_shown_holds_from_then_on(whole):
-    """A search with a smaller budget is the one with the largest; what rests on less is stale."""
+def test_attractors__options_hold_for_the_run(whole):
+    """Options last given hold without being given again, and results that rest on other attractors are stale."""
     directory = whole.info.directory
-    less = derive(directory, "attractors", {**QUICK})
-    assert less.attrs["identify_extend"] == 0
-    others = derive(directory, "attractors", {**QUICK, "n_points": 8})
-    more = derive(directory, "attractors", {"polish": False, "budget": 0.5})
-    assert (more.attrs["identify_extend"], more.attrs["identify_budget"]) == (1, 0.5)
-    for options in (QUICK, {"polish": False, "budget": 0.2}):
-        assert derive(directory, "attractors", options).encoding["source"] == more.encoding["source"]
-    # with another option nothing more is known
-    again = derive(directory, "attractors", {**QUICK, "n_points": 8})
-    assert again.encoding["source"] == others.encoding["source"]
-    found = deriving.stored(directory, "attractors")
-    assert found.encoding["source"] in (more.encoding["source"], others.encoding["source"])
-    assert less.encoding["source"] in deriving.stale(directory)
-    assert more.encoding["source"] not in deriving.stale(directory)
+    first = derive(directory, "attractors", {**QUICK})
+    settling = derive(directory, "settling")
+    assert derive(directory, "attractors").encoding["source"] == first.encoding["source"]
+    other = derive(directory, "attractors", {**QUICK, "n_points": 8})
+    assert derive(directory, "attractors").encoding["source"] == other.encoding["source"]
+    assert deriving.stored(directory, "attractors").encoding["source"] == other.encoding["source"]
+    assert settling.encoding["source"] in deriving.stale(directory)
+    assert deriving.stored(directory, "settling") is None
+    again = derive(directory, "settling")
+    assert again.encoding["source"] != settling.encoding["source"]
+    derive(directory, "attractors", {**QUICK})
+    assert deriving.stored(directory, "settling").encoding["source"] == settling.encoding["source"]
+
+
+def test_attractors__options_that_cannot_be_read(whole):
+    (whole.info.directory / "derived").mkdir(exist_ok=True)
+    (whole.info.directory / "derived" / "attractors.json").write_text('{"budget": "much"}')
+    with pytest.raises(DamagedError, match=r"attractors\.json is damaged; remove it"):
+        derive(whole.info.directory, "settling")

@@ -79,7 +79,7 @@ def test_of_attractors__what_does_not_attract_is_shown_when_asked_for(run, monke
     """Else it is said to be there; where nothing attracts, all sets are shown."""
     opened, options = AnalysedRun.of(run), AnimationOptions(at={"frequency": 0.16})
     found = dense(opened.derive("attractors"), points=True).copy(deep=True)
-    monkeypatch.setattr("pipeline.plots.figure.attractors_of", lambda run, options: found)
+    monkeypatch.setattr(AnalysedRun, "derive", lambda run, name: found)
     found["stability"][:, 1] = TRANSIENT
     found["share"][:, 1] = 0.0
     shown, notes = of_attractors(opened, options)

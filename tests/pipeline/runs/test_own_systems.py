@@ -196,7 +196,7 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, ma
     assert "model_digest" in said
     assert main("analyse", "attractors", elsewhere / "run", *named, "--json")[0] == 0  # what was kept needs no object
     assert main("analyse", "settling", elsewhere / "run", *named)[0] == 0  # and neither does what follows from it
-    code, _, said = main("analyse", "settling", elsewhere / "run", *named, "--budget", "2")
+    code, _, said = main("analyse", "attractors", elsewhere / "run", *named, "--budget", "2")
     assert code == 2  # a longer extension integrates
     assert "restore the code" in said
     sys.modules.pop("mine")

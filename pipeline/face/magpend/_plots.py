@@ -1,0 +1,52 @@
+"""Define `Plots`, the figures of a run or a cube as methods."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from magpend._methods import AnyPanels, Bifurcation, OnePanel, SeveralPanels
+from pipeline.products import figures as options
+from pipeline.products.product import FigureOptions, StateOptions
+from pipeline.products.registry import FIGURES
+from pipeline.store.run import Run as StoredRun
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Plots:
+    """The figures of a run or a cube, by name; each method draws one and returns its axes.
+
+    Parameters
+    ----------
+    source
+        An opened run, or a cube.
+    """
+
+    bifurcation = Bifurcation(options.BifurcationOptions)
+    section = OnePanel(options.SectionOptions)
+    attractors = OnePanel(StateOptions)
+    gallery = SeveralPanels(FigureOptions)
+    basins = OnePanel(options.BasinFigureOptions)
+    fractions = OnePanel(FigureOptions)
+    regimes = AnyPanels(options.RegimeOptions)
+    lyapunov = AnyPanels(options.LyapunovFigureOptions)
+    convergence = SeveralPanels(options.ConvergenceOptions)
+    dimension = SeveralPanels(options.DimensionFigureOptions)
+    branches = OnePanel(options.BranchFigureOptions)
+    multipliers = OnePanel(options.MultiplierOptions)
+    curves = OnePanel(options.CurveFigureOptions)
+    rotation = OnePanel(options.RotationFigureOptions)
+    tongues = OnePanel(options.TongueFigureOptions)
+    manifolds = OnePanel(options.ManifoldFigureOptions)
+    drift = OnePanel(options.DriftFigureOptions)
+    resilience = SeveralPanels(options.ResilienceFigureOptions)
+    edge = OnePanel(options.EdgeFigureOptions)
+    escapes = AnyPanels(options.EscapeFigureOptions)
+    density = AnyPanels(options.DensityFigureOptions)
+
+    def __init__(self, source: StoredRun | xr.Dataset) -> None:
+        self._source = source
+
+    def __repr__(self) -> str:
+        return f"figures: {', '.join(FIGURES)}"
