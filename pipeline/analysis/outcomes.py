@@ -122,10 +122,12 @@ def left_out(ids: xr.Dataset) -> str:
 
 def sentence(ids: xr.Dataset) -> str:
     """Return a text on how many cells end on attractors, and what happens to the others."""
-    total = ids["attractor_id"].size
-    others = other_cells(ids)
-    n = total - sum(int(which.sum()) for which in others.values())
+    return told(ids["attractor_id"].size, {name: int(which.sum()) for name, which in other_cells(ids).items()})
+
+
+def told(total: int, others: Mapping[str, int]) -> str:
+    """Return the text of `sentence` from the number of all cells and those of the others by reason."""
     if not others:
         return f"all {total} cells end on attractors"
-    texts = ", ".join(f"{int(which.sum())} {name}" for name, which in others.items())
-    return f"{n} of {total} cells end on attractors; {texts}"
+    texts = ", ".join(f"{n} {name}" for name, n in others.items())
+    return f"{total - sum(others.values())} of {total} cells end on attractors; {texts}"

@@ -169,26 +169,28 @@ def dense(ds: xr.Dataset, names: Collection[str] = (), *, points: bool = False) 
     """
     if not is_ragged(ds):
         return ds
-    dims, ids, at = dims_of(ds), int(ds.attrs[N_IDS]), (*index_of_rows(ds), ds["attractor"].values)
+    dims, own = dims_of(ds), ds["attractor"].values
+    ids = np.union1d(own[own < 0], np.arange(int(ds.attrs[N_IDS]))).astype(np.int32)
+    at = (*index_of_rows(ds), np.searchsorted(ids, own))
     found: dict[str, Any] = {}
     for name, variable in ds.data_vars.items():
         if SET in variable.dims and not (name == N_POINTS and SAMPLE in ds.dims) and (name in names or not names):
-            own = variable.transpose(SET, ...)
-            found[str(name)] = (own.dims[1:], own.values, variable.attrs)
+            rows = variable.transpose(SET, ...)
+            found[str(name)] = (rows.dims[1:], rows.values, variable.attrs)
     if points and "attractor_points" in ds:
         found["attractor_points"] = (("point", "state"), _padded(ds), ds["attractor_points"].attrs)
     result = ds.drop_dims([SET, SAMPLE, TRANSITION], errors="ignore").drop_vars(ROW_SIZE)
     for name, (own_dims, values, attrs) in found.items():
-        table = np.full((*ds[ROW_SIZE].shape, ids, *values.shape[1:]), _fill(name, values.dtype), values.dtype)
+        table = np.full((*ds[ROW_SIZE].shape, len(ids), *values.shape[1:]), _fill(name, values.dtype), values.dtype)
         table[at] = values
         result[name] = ((*dims, "attractor", *own_dims), table, attrs)
-    return result.assign_coords(attractor=("attractor", np.arange(ids, dtype=np.int32), ds["attractor"].attrs))
+    return result.assign_coords(attractor=("attractor", ids, ds["attractor"].attrs))
 
 
 def _fill(name: str, dtype: np.dtype[Any]) -> float:
     if name == "mirror_partner" or name.endswith("_to"):
         return -1
-    return 0 if dtype.kind in "iu" or name == "share" else np.nan
+    return 0 if dtype.kind in "iu" or name in ("share", "fraction") else np.nan
 
 
 def _padded(ds: xr.Dataset) -> np.ndarray:

@@ -22,6 +22,9 @@ FEW_POINTS = 6
 MOST_RANGES = 6
 """Most ranges of an axis that are listed."""
 
+MOST_ROWS = 30
+"""Most rows that are printed: of ids, or of the sets of a parameter point."""
+
 FRACTION = ("fraction", "low", "high")
 """Names of a fraction and its interval."""
 
@@ -138,6 +141,16 @@ def summary(
     for row in rows:
         groups.setdefault(row[key], []).append(row)
     return aligned([describe(ds, groups[i], dims) for i in sorted(groups)])
+
+
+def leading(rows: Sequence[Row], key: str, size: str) -> tuple[list[Row], int]:
+    """Return the rows of the `MOST_ROWS` groups with the largest fractions or sizes, and the number of other groups."""
+    sizes: dict[int, tuple[float, int]] = {}
+    for row in rows:
+        own = (float(np.nan_to_num(row.get("fraction", np.nan))), row[size])
+        sizes[row[key]] = max(own, sizes.get(row[key], (0.0, 0)))
+    kept = set(sorted(sizes, key=lambda i: sizes[i], reverse=True)[:MOST_ROWS])
+    return [row for row in rows if row[key] in kept], len(sizes) - len(kept)
 
 
 def aligned(rows: Sequence[Words], indent: str = "  ", *, right: bool = False) -> list[str]:

@@ -36,4 +36,5 @@ BASINS = Analysis(
     needs=f"{_ROOM}:needs_starts",
     builds_on=("attractors",),
     figure="basins",
+    by_point=True,
 )

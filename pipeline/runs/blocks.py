@@ -141,8 +141,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files
                 report(what, k, n)
     cells = run.cube()["status"]
     sizes = {d: cells.sizes[d] for d in split_dims(cells)[0]}
-    whole = joined([open_product(folder.below(_name(k))) for k in range(n)], blocks, sizes)
-    return whole.drop_attrs(deep=False).assign_attrs({k: v for k, v in whole.attrs.items() if k not in key})
+    return joined([open_product(folder.below(_name(k))) for k in range(n)], blocks, sizes)
 
 
 def _in_processes(where: Where) -> Where:

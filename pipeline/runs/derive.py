@@ -174,7 +174,8 @@ def derive(
         run.echo(f"{problem}: the result of {name} is shown but not kept")
     with notebook.progress():
         computed = _compute(run, analysis, wanted, None if problem else place)
-        result = _kept(run, place, computed.assign_attrs({**key, **told}))
+        others = {name: value for name, value in computed.attrs.items() if name not in key}
+        result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))
     if is_chosen:
         _keep(run, wanted)
     return result

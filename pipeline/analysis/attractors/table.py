@@ -18,6 +18,7 @@ from pipeline.analysis.tabular import (
     counted,
     distinct,
     largest_share,
+    leading,
     number,
     plain,
     point_table,
@@ -33,9 +34,6 @@ from pipeline.products.product import Table
 
 MOST_STATES = 2
 """Most states of a model whose places are printed; the CSV table has those of all models."""
-
-MOST_ROWS = 30
-"""Most rows that are printed: of ids, or of the sets of a parameter point."""
 
 RUN_AWAY = {"diverged", "not settled"}
 """What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
@@ -66,17 +64,12 @@ def attractors_table(ds: xr.Dataset) -> Table:
 
 
 def _largest(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
-    """Return the rows of the `MOST_ROWS` ids with the largest shares or the most cells, and a line on the others."""
-    sizes: dict[int, tuple[float, int]] = {}
-    for row in rows:
-        share = row.get("fraction", np.nan)
-        size = (share if np.isfinite(share) else 0.0, row["n_cells"])
-        sizes[row["attractor_id"]] = max(size, sizes.get(row["attractor_id"], (0.0, 0)))
-    kept = set(sorted(sizes, key=lambda i: sizes[i], reverse=True)[:MOST_ROWS])
-    shown = [row for row in rows if row["attractor_id"] in kept]
-    kinds = {row["attractor_id"]: row for row in reversed(rows) if row["attractor_id"] not in kept}
-    if not kinds:
+    """Return the rows of the ids with the largest shares or the most cells, and a line on the others."""
+    shown, n_others = leading(rows, "attractor_id", "n_cells")
+    if not n_others:
         return shown, []
+    kept = {row["attractor_id"] for row in shown}
+    kinds = {row["attractor_id"]: row for row in reversed(rows) if row["attractor_id"] not in kept}
     period = {i: f" of period {row['orbit_period']}" if row["orbit_period"] else "" for i, row in kinds.items()}
     counts = Counter(f"{_kind(row)}{period[i]}" for i, row in kinds.items())
     told = ", ".join(f"{n} {name}" for name, n in counts.most_common())

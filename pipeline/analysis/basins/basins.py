@@ -5,19 +5,18 @@ The functions read the cube and the ids of its attractors, and integrate nothing
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_exponent
-from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.basins.boundaries import basin_entropy, box_sides, epsilons_of, uncertainty_exponent
+from pipeline.analysis.basins.numbers import basin_rows
 from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.analysis.outcomes import other_cells, outcomes
-from pipeline.analysis.ragged import dense
 from pipeline.layout import vocabulary
-from pipeline.layout.vocabulary import ATTRACTS, split_dims
+from pipeline.layout.vocabulary import split_dims
 from pipeline.products.basins import BasinOptions
 
 
@@ -41,11 +40,11 @@ def basins(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None,
     -------
     Dataset
         On the cells: `attractor_id`, `decision`, `status`, `n_periods`, and `outcome`, the attractor that a
-        cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). On the parameter dims and
-        `label`, the ids of attractors and -2: `count`, `fraction` and the other variables of
-        `numbers.basin_fractions`, in which cells without an outcome count as unfinished. On the
+        cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). One row (`pipeline.analysis.ragged`)
+        for each outcome of cells at each parameter point, with `attractor`, the id or -2: the variables of
+        `numbers.basin_rows`, in which cells without an outcome count as unfinished. On the
         parameter dims: `n_pending`, `n_not_settled`, `n_transient`, `n_unstable`, `n_neutral` and `n_failed`
-        (step limits), which add up to `n_unfinished`. On the parameter dims and `attractor`: `stability`.
+        (step limits), which add up to `n_unfinished`.
 
         If the starts are a grid, evenly spaced along every axis, on the parameter dims:
         `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
@@ -61,38 +60,22 @@ def basins(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None,
     """
     options = options or BasinOptions(**changes)
     check_starts(ds)
-    ids = dense(ids)
     dims, start_dims = split_dims(ids["attractor_id"])
-    cells = ids[["attractor_id", "decision", "status", "stability", "ran_out"]]
-    result = cells.assign(n_periods=ds["n_periods"].transpose(*dims, *start_dims).load())
-    labels = outcomes(ids)
+    labels = outcomes(ids).transpose(*dims, *start_dims)
+    result = ids[["attractor_id", "decision", "status", "ran_out"]]
+    result["n_periods"] = ds["n_periods"].transpose(*dims, *start_dims).load()
     result["outcome"] = labels.assign_attrs(units="1", long_name="attractor that the cell ends on")
-    attract = np.flatnonzero((ids["stability"] == ATTRACTS).any(dims).values)
-    fractions = basin_fractions(
-        labels,
-        dims=start_dims,
-        ids=ids["attractor"].values[attract].tolist(),
-        inferred=ids["status"] == vocabulary.INFERRED,
-        confidence=options.confidence,
-        method=options.interval,
-    )
-    result = result.assign(fractions.data_vars).assign(_unfinished(ids, dims))
-    result = result.assign_coords(label=fractions["label"])
-    reason = _no_grid(ds, start_dims)
-    points = _Points(dims, tuple(ids.sizes[d] for d in dims))
-    if not reason:
-        for index in np.ndindex(*points.shape):
-            grid = labels.isel(dict(zip(dims, index, strict=True))).values
-            for number in _boundary(grid, options, points.missing):
-                points.add(index, *number)
-        result = result.assign(points.variables())
-    reasons = "\n".join([reason] if reason else sorted(points.missing))
-    about = {f"basin_{name}": getattr(options, name) for name in _OWN}
+    inferred = (ids["status"] == vocabulary.INFERRED).transpose(*dims, *start_dims)
+    result = result.merge(basin_rows(labels, dims, inferred, options.confidence, options.interval))
+    result = result.assign(_unfinished(ids, dims))
+    if reason := _no_grid(ds, start_dims):
+        missing = {"boundaries": reason}
+    else:
+        missing = _problems(labels.shape[len(dims) :], options)
+        result = result.assign(_boundaries(labels, dims, options, missing))
+    about = {f"basin_{name}": getattr(options, name) for name in type(options).model_fields}
+    reasons = "\n".join(f"{name}: {reason}" for name, reason in missing.items())
     return result.assign_attrs({**ids.attrs, **about, "not_computed": reasons})
-
-
-_OWN = ("interval", "confidence", "box", "block", "scaling", "radius", "metric", "resamples", "seed")
-"""Options of basins alone, without those of the attractors."""
 
 
 def check_starts(ds: xr.Dataset) -> None:
@@ -109,7 +92,7 @@ def check_starts(ds: xr.Dataset) -> None:
 def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
     """Count the cells without an outcome at each parameter point by reason, such as "not computed" or "not settled"."""
     others = other_cells(ids)
-    shape = outcomes(ids).transpose(*dims, ...).shape
+    shape = ids["attractor_id"].transpose(*dims, ...).shape
     kinds = {
         "n_pending": (("pending",), "cells not computed"),
         "n_not_settled": (("not settled",), "cells of which nothing could be shown"),
@@ -133,101 +116,86 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
 
 def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
     if "initial_condition" in start_dims:
-        return "boundaries: the starts are no grid"
+        return "the starts are no grid"
     for dim in start_dims:
         steps = np.diff(ds[dim].values)
         if np.ptp(steps) > 1e-6 * np.abs(steps).max(initial=0.0):
-            return f"boundaries: {dim} is not evenly spaced"
+            return f"{dim} is not evenly spaced"
     return ""
+
+
+def _problems(shape: tuple[int, ...], options: BasinOptions) -> dict[str, str]:
+    """Return why measures of the boundaries cannot be computed on a grid, by measure."""
+    found = {}
+    checks = {
+        "basin entropy": lambda: box_sides(options.box, shape),
+        "uncertainty exponent": lambda: epsilons_of(None, shape, options.scaling),
+    }
+    for name, check in checks.items():
+        try:
+            check()
+        except ValueError as error:
+            found[name] = str(error)
+    return found
 
 
 _LONG_NAMES = {
     "basin_entropy": ("nat", "basin entropy"),
     "boundary_basin_entropy": ("nat", "boundary basin entropy"),
-    "above_ln2_surely": ("1", "boundary basin entropy surely above ln 2: a fractal boundary; -1 not known"),
     "uncertainty_exponent": ("1", "uncertainty exponent"),
+    "wada_beyond": ("1", "part of all cells that is off the common boundary"),
+    "above_ln2_surely": ("1", "boundary basin entropy surely above ln 2: a fractal boundary; -1 not known"),
     "boundary_dimension": ("1", "dimension of the basin boundary"),
     "exponent_r_squared": ("1", "R squared of the fit of the uncertainty exponent"),
     "wada_distance": ("cells", "largest distance between boundaries, the least radius that passes"),
-    "wada_beyond": ("1", "part of all cells that is off the common boundary"),
     "wada": ("1", "passes the Wada merge test; -1 fewer than three labels"),
-    "uncertain": ("1", "uncertain part of the region"),
 }
 _FLAGS = ("above_ln2_surely", "wada")
+_WITH_ERRORS = ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent", "wada_beyond")
 _ERRORS = ("stderr", "low", "high")
-_SCALARS = (
-    *(
-        f"{name}{end}"
-        for name in ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent", "wada_beyond")
-        for end in ("", *(f"_{e}" for e in _ERRORS))
-    ),
-    "above_ln2_surely",
-    "boundary_dimension",
-    "exponent_r_squared",
-    "wada_distance",
-    "wada",
-)
 
 
-class _Points:
-    """Arrays that collect the basin measures of all parameter points."""
-
-    def __init__(self, dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
-        self.dims, self.shape = dims, shape
-        self.missing: set[str] = set()
-        self._scalars = {
-            name: np.full(shape, -1, np.int8) if name in _FLAGS else np.full(shape, np.nan) for name in _SCALARS
-        }
-        self._epsilon = np.empty(0, np.int64)
-        self._uncertain: dict[tuple[int, ...], np.ndarray] = {}
-
-    def add(self, index: tuple[int, ...], name: str, value: Any) -> None:
-        if name == "uncertain":
-            self._epsilon, self._uncertain[index] = value["epsilon"].values, value.values
-        else:
-            self._scalars[name][index] = value
-
-    def variables(self) -> dict[str, Any]:
-        """Return the basin measures as (dims, values, attributes), from which xarray builds a Dataset."""
-        found: dict[str, Any] = {}
-        for name, values in self._scalars.items():
-            base = next((name.removesuffix(f"_{e}") for e in _ERRORS if name.endswith(f"_{e}")), name)
-            units, text = _LONG_NAMES[base]
-            suffix = name.removeprefix(base).replace("_stderr", ", standard error").replace("_", ", ")
-            found[name] = (self.dims, values, {"units": units, "long_name": text + suffix})
-        if self._uncertain:
-            table = np.full((*self.shape, len(self._epsilon)), np.nan)
-            for index, values in self._uncertain.items():
-                table[index] = values
-            units, text = _LONG_NAMES["uncertain"]
-            found["uncertain"] = ((*self.dims, "epsilon"), table, {"units": units, "long_name": text})
-            found["epsilon"] = ("epsilon", self._epsilon, {"units": "cells"})
-        return found
+def _boundaries(
+    labels: xr.DataArray, dims: tuple[str, ...], options: BasinOptions, missing: Mapping[str, str]
+) -> dict[str, Any]:
+    """Measure the basin boundaries at each parameter point; return variables as (dims, values, attributes)."""
+    shape, grid = labels.shape[: len(dims)], labels.shape[len(dims) :]
+    points = [dict(_boundary(one, options, missing)) for one in labels.values.reshape(-1, *grid)]
+    found: dict[str, Any] = {}
+    for name, (units, text) in _LONG_NAMES.items():
+        ends = ("", *(f"_{end}" for end in _ERRORS)) if name in _WITH_ERRORS else ("",)
+        for end in ends:
+            lacking = -1 if name in _FLAGS else np.nan
+            values = np.array([point.get(name + end, lacking) for point in points])
+            values = values.astype(np.int8 if name in _FLAGS else np.float64).reshape(shape)
+            long_name = text + end.replace("_stderr", ", standard error").replace("_", ", ")
+            found[name + end] = (dims, values, {"units": units, "long_name": long_name})
+    if "uncertainty exponent" not in missing:
+        epsilon = epsilons_of(None, grid, options.scaling)
+        values = np.array([point.get("uncertain", np.full(len(epsilon), np.nan)) for point in points])
+        attrs = {"units": "1", "long_name": "uncertain part of the region"}
+        found["uncertain"] = ((*dims, "epsilon"), values.reshape(*shape, len(epsilon)), attrs)
+        found["epsilon"] = ("epsilon", epsilon, {"units": "cells"})
+    return found
 
 
-def _boundary(grid: np.ndarray, options: BasinOptions, missing: set[str]) -> Iterator[tuple[str, Any]]:
+def _boundary(grid: np.ndarray, options: BasinOptions, missing: Mapping[str, str]) -> Iterator[tuple[str, Any]]:
     """Yield the name and value of each measure of the basin boundaries on one grid of labels."""
     if not (grid != -1).any():
         return
     common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}
-    try:
+    if "basin entropy" not in missing:
         entropy = basin_entropy(grid, options.box, block=options.block, **common)
-    except ValueError as error:
-        missing.add(f"basin entropy: {error}")
-    else:
         for ours, theirs in (("basin_entropy", "entropy"), ("boundary_basin_entropy", "boundary_entropy")):
             yield from _with_errors(entropy, ours, theirs)
         if np.isfinite(entropy["boundary_entropy_low"]):
             yield "above_ln2_surely", int(entropy["above_ln2_surely"])
-    try:
+    if "uncertainty exponent" not in missing:
         exponent = uncertainty_exponent(grid, method=options.scaling, **common)
-    except ValueError as error:
-        missing.add(f"uncertainty exponent: {error}")
-    else:
         yield from _with_errors(exponent, "uncertainty_exponent", "exponent")
         yield "boundary_dimension", float(exponent["boundary_dimension"])
         yield "exponent_r_squared", float(exponent["r_squared"])
-        yield "uncertain", exponent["uncertain"]
+        yield "uncertain", exponent["uncertain"].values
     if np.unique(grid[grid != -1]).size >= 3:
         wada = wada_merge_test(grid, options.radius, metric=options.metric, **common).isel(radius=0)
         yield from _with_errors(wada, "wada_beyond", "beyond")

@@ -110,7 +110,7 @@ def basin_entropy(
     check_confidence(confidence)
     check_resamples(resamples)
     grid = read_labels(labels, unfinished)
-    sides = _box_sides(box, grid.codes.shape)
+    sides = box_sides(box, grid.codes.shape)
     if block < 1:
         raise ValueError(f"block is {block}, below 1: give the number of boxes drawn as one, per side")
     boxes = _fill_boxes(grid.codes, sides)
@@ -209,7 +209,7 @@ def uncertainty_exponent(
         raise ValueError(f"method is {method!r}: use one of {sorted(_EXPONENT_REFERENCES)}")
     grid = read_labels(labels, unfinished)
     shape = grid.codes.shape
-    eps = _epsilons(epsilons, shape, method)
+    eps = epsilons_of(epsilons, shape, method)
     if method == "perturbation":
         trials, hits = _perturbed(grid.codes, eps)
     else:
@@ -249,7 +249,7 @@ def uncertainty_exponent(
 # --- boxes ---------------------------------------------------------------------------------------------
 
 
-def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
+def box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
     given = np.atleast_1d(np.asarray(box, dtype=np.int64)).tolist()
     sides = tuple(given) * (len(shape) if len(given) == 1 else 1)
     if len(sides) != len(shape):
@@ -314,7 +314,7 @@ class _Line(NamedTuple):
     r_squared: float
 
 
-def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Scaling) -> Ints:
+def epsilons_of(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Scaling) -> Ints:
     """Choose or check the perturbations or box sizes epsilon [cells]; ValueError if they do not fit the grid."""
     first = 1 if method == "perturbation" else 2
     shortest = min(shape)

@@ -7,6 +7,7 @@ imported from here. They take labels: an integer per cell that names its outcome
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_expon
 from pipeline.analysis.basins.labels import UNFINISHED, LabelGrid, read_labels
 from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.analysis.intervals import REFERENCES, Interval, binomial_interval
+from pipeline.analysis.ragged import ROW_SIZE, SET
 
 __all__ = ["basin_entropy", "basin_fractions", "binomial_interval", "uncertainty_exponent", "wada_merge_test"]
 
@@ -96,18 +98,59 @@ def basin_fractions(
     count, n_unfinished = _count_rows(grid, shape)
     n_cells = np.full(shape, grid.codes.size // max(1, int(np.prod(shape))))
     ds = xr.Dataset(coords=coords | {"label": grid.ids})
-    ds = ds.assign(_with_intervals(count, n_cells, n_unfinished, (*kept, "label"), confidence, method))
-    ds = ds.assign(
-        n_cells=(kept, n_cells),
-        n_unfinished=(kept, n_unfinished),
-        fraction_unfinished=(kept, n_unfinished / n_cells),
-        unseen_high=(kept, unseen_bound(n_cells - n_unfinished, confidence)),
-        unseen_high_if_all=(kept, _upper_bound(n_unfinished, n_cells, confidence)),
-    )
+    fractions = _with_intervals(count, n_cells[..., None], n_unfinished[..., None], confidence, method)
+    ds = ds.assign({name: ((*kept, "label"), values) for name, values in fractions.items()})
+    ds = ds.assign(_of_points(kept, n_cells, n_unfinished, confidence))
     if inferred is not None:
         ds["n_inferred"] = ((*kept, "label"), _count_inferred(grid, np.asarray(inferred), shape))
     ds["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
     return ds.assign_attrs(_provenance(unfinished, confidence, method))
+
+
+def basin_rows(
+    labels: xr.DataArray, dims: Sequence[str], inferred: xr.DataArray, confidence: float, method: Interval
+) -> xr.Dataset:
+    """Compute the basin fractions as rows, one for each outcome that cells have at each parameter point.
+
+    Parameters
+    ----------
+    labels
+        Outcome per cell, the parameter dims first; -1 where it is not known.
+    dims
+        Parameter dims.
+    inferred
+        Whether each cell was inferred and not integrated.
+    confidence, method
+        See `basin_fractions`.
+
+    Returns
+    -------
+    Dataset
+        Rows (`pipeline.analysis.ragged`) with the outcome as `attractor`, and `n_sets`, their number at each point.
+        Otherwise the variables of `basin_fractions`.
+    """
+    shape = labels.shape[: len(dims)]
+    grid = labels.values.reshape(int(np.prod(shape)), -1)
+    point, cell = np.nonzero(grid != -1)
+    least = min(int(grid.min()), 0)
+    width = int(grid.max()) - least + 1
+    rows, inverse, count = np.unique(
+        point * width + (grid[point, cell] - least), return_inverse=True, return_counts=True
+    )
+    point_of_row, outcome = rows // width, rows % width + least
+    known = np.bincount(point, minlength=len(grid))
+    n_cells, n_unfinished = np.full(len(grid), grid.shape[1]), grid.shape[1] - known
+    fractions = _with_intervals(count, n_cells[point_of_row], n_unfinished[point_of_row], confidence, method)
+    fractions["n_inferred"] = np.bincount(
+        inverse, weights=inferred.values.reshape(grid.shape)[point, cell], minlength=len(rows)
+    ).astype(np.int64)
+    found = xr.Dataset({name: (SET, values) for name, values in fractions.items()})
+    found["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
+    sizes = np.bincount(point_of_row, minlength=len(grid)).astype(np.int32)
+    found[ROW_SIZE] = (dims, sizes.reshape(shape), {"units": "1", "long_name": "number of outcomes"})
+    found = found.assign(_of_points(dims, n_cells.reshape(shape), n_unfinished.reshape(shape), confidence))
+    about = {"units": "1", "long_name": "attractor, or -2 of cells that diverged"}
+    return found.assign_coords(attractor=(SET, outcome.astype(np.int32), about))
 
 
 def unseen_bound(n: npt.NDArray[np.int64], confidence: float = 0.95) -> npt.NDArray[np.float64]:
@@ -154,29 +197,38 @@ def _count_inferred(
 
 def _with_intervals(
     count: npt.NDArray[np.int64],
-    n_cells: npt.NDArray[np.int64],
-    n_unfinished: npt.NDArray[np.int64],
-    dims: tuple[str, ...],
+    cells: npt.NDArray[np.int64],
+    unknown: npt.NDArray[np.int64],
     confidence: float,
     method: Interval,
-    name: str = "fraction",
-) -> dict[str, tuple[tuple[str, ...], npt.NDArray[np.generic]]]:
+) -> dict[str, npt.NDArray[Any]]:
     """Compute from counts the fraction of each outcome, its interval, and its bounds due to unfinished cells."""
-    cells, unknown = n_cells[..., None], n_unfinished[..., None]
     finished = cells - unknown
     low, high = binomial_interval(count, finished, confidence=confidence, method=method)
     low_if_none, _ = binomial_interval(count, cells, confidence=confidence, method=method)
     _, high_if_all = binomial_interval(count + unknown, cells, confidence=confidence, method=method)
-    fraction = np.where(finished > 0, count / np.maximum(finished, 1), np.nan)
     return {
-        "count": (dims, count),
-        name: (dims, fraction),
-        "low": (dims, low),
-        "high": (dims, high),
-        f"{name}_if_none": (dims, count / cells),
-        f"{name}_if_all": (dims, (count + unknown) / cells),
-        "low_if_none": (dims, low_if_none),
-        "high_if_all": (dims, high_if_all),
+        "count": count,
+        "fraction": np.where(finished > 0, count / np.maximum(finished, 1), np.nan),
+        "low": low,
+        "high": high,
+        "fraction_if_none": count / cells,
+        "fraction_if_all": (count + unknown) / cells,
+        "low_if_none": low_if_none,
+        "high_if_all": high_if_all,
+    }
+
+
+def _of_points(
+    dims: Sequence[str], n_cells: npt.NDArray[np.int64], n_unfinished: npt.NDArray[np.int64], confidence: float
+) -> dict[str, Any]:
+    """Return the variables of parameter points: numbers of cells, and bounds on what no cell shows."""
+    return {
+        "n_cells": (dims, n_cells),
+        "n_unfinished": (dims, n_unfinished),
+        "fraction_unfinished": (dims, n_unfinished / n_cells),
+        "unseen_high": (dims, unseen_bound(n_cells - n_unfinished, confidence)),
+        "unseen_high_if_all": (dims, _upper_bound(n_unfinished, n_cells, confidence)),
     }
 
 

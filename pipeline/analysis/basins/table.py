@@ -7,22 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.outcomes import DIVERGED, sentence
+from pipeline.analysis.outcomes import DIVERGED, told
+from pipeline.analysis.ragged import dims_of, places_of_rows
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     FRACTION,
     Row,
     Words,
     largest_share,
+    leading,
     point_table,
     points_of,
     ranges,
     summary,
-    values,
     with_interval,
 )
 from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Table
 
 
@@ -32,36 +32,50 @@ def basins_table(ds: xr.Dataset) -> Table:
 
     The lines have a table per point if there are few, otherwise ranges; the boundaries follow.
     """
-    rows = _rows(ds)
-    dims, _ = split_dims(ds["attractor_id"])
-    seen = [row for row in rows if row["n_cells"]]
+    rows, dims = _rows(ds), dims_of(ds)
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
     lines = [f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, {confidence}"]
     if int(np.prod([ds.sizes[d] for d in dims])) > FEW_POINTS:
-        lines += summary(ds, seen, dims, _label_summary, "label")
+        shown, n_others = leading(rows, "label", "n_cells")
+        lines += summary(ds, shown, dims, _label_summary, "label")
+        lines += [f"  and {n_others} smaller ones; all are in --csv and --json"] if n_others else []
         lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
     else:
         for at, where in points_of(ds, dims):
             one = ds.isel(at)
-            table = point_table(ds, where, seen, _basin_words)
+            table = point_table(ds, where, rows, _basin_words)
             lines += table
             if len(table) > 1:
                 bound = float(one["unseen_high"])
                 lines.append(f"  an attractor that no cell shows: at most {bound:.3g} of the region")
             lines += _boundary_lines(one)
     lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
-    return Table(rows, [*lines, sentence(ds)])
+    return Table(rows, [*lines, _sentence(ds)])
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
-    dims, _ = split_dims(ds["attractor_id"])
+    dims = dims_of(ds)
+    columns = dict(zip(dims, places_of_rows(ds, dims), strict=True))
+    columns |= {"label": ds["attractor"].values, "n_cells": ds["count"].values}
     names = ("n_inferred", *FRACTION, "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
-    rows = []
-    for at, where in points_of(ds, dims):
-        for i, label in enumerate(ds["label"].values.tolist()):
-            one = ds.isel({**at, "label": i})
-            rows.append({**where, "label": label, "n_cells": int(one["count"]), **values(one, *names)})
-    return rows
+    columns |= {name: ds[name].values for name in names}
+    return [dict(zip(columns, row, strict=True)) for row in zip(*(c.tolist() for c in columns.values()), strict=True)]
+
+
+_OTHERS = {
+    "n_pending": "pending",
+    "n_not_settled": "not settled",
+    "n_transient": "on a transient set",
+    "n_unstable": "on an unstable orbit or equilibrium",
+    "n_neutral": "on a neutral set",
+    "n_failed": "that could not be integrated",
+}
+
+
+def _sentence(ds: xr.Dataset) -> str:
+    counts = {"diverged": int(ds["count"].values[ds["attractor"].values == DIVERGED].sum())}
+    counts |= {text: int(ds[name].sum()) for name, text in _OTHERS.items()}
+    return told(ds["outcome"].size, {text: n for text, n in counts.items() if n})
 
 
 def _basin_words(row: Row) -> Words:

@@ -73,7 +73,7 @@ def test_identify__two_published_orbits(two):
     assert found["mirror_partner"].values.tolist() == [1, 0]
     assert found["mirror_distance"].values.max() < 1e-7
     assert found["lyapunov_max"].values == pytest.approx(np.log(0.624230) * FREQUENCY, rel=1e-5)
-    fractions = basins(two, found)["fraction"].values
+    fractions = basins(two, rows_of(found))["fraction"].values
     assert fractions.sum() == pytest.approx(1.0)
 
 
@@ -89,7 +89,7 @@ def test_identify__a_strange_attractor_stays(strange):
 
 
 def test_chaos__by_the_zero_one_test(chaotic, strange):
-    found = chaos(chaotic, strange)
+    found = chaos(chaotic, rows_of(strange))
     assert found["nature"].attrs["flag_meanings"].split()[found["nature"].item()] == "chaotic"
     assert found["median_zero_one"].item() > 0.95
     # 1.37 from 1e4 points

@@ -8,6 +8,9 @@ import xarray as xr
 
 from magpend_core.status import Status
 from pipeline.analysis.basins.basins import basins
+from pipeline.analysis.basins.numbers import basin_fractions, basin_rows
+from pipeline.analysis.basins.table import basins_table
+from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
@@ -25,17 +28,20 @@ def labelled(grids, status=None, spacing=0.1):
         "psi1_0": spacing * np.arange(grids.shape[1]),
         "psi2_0": spacing * np.arange(grids.shape[2]),
     }
-    per, shape = ("frequency", "attractor"), (len(grids), grids.max() + 1)
+    own = [np.unique(grid[grid >= 0]) for grid in grids]
+    rows = np.concatenate(own)
     ids = xr.Dataset(
         {
             "attractor_id": (DIMS, grids),
             "decision": (DIMS, (grids >= 0).astype(np.int8)),
             "status": (DIMS, status.astype(np.int8)),
-            "kind": (per, np.full(shape, PERIODIC_ORBIT, np.int8)),
-            "stability": (per, np.full(shape, ATTRACTS, np.int8)),
+            "n_sets": ("frequency", np.array([len(one) for one in own])),
+            "kind": ("set", np.full(rows.size, PERIODIC_ORBIT, np.int8)),
+            "stability": ("set", np.full(rows.size, ATTRACTS, np.int8)),
             "ran_out": ("frequency", np.zeros(len(grids), np.int8)),
         },
-        coords={**coords, "attractor": np.arange(grids.max() + 1)},
+        coords={**coords, "attractor": ("set", rows)},
+        attrs={"n_ids": int(grids.max()) + 1},
     )
     cube = ids[["status"]].assign(n_periods=(DIMS, 7 * np.ones(grids.shape, np.int32)))
     return cube, ids
@@ -82,13 +88,16 @@ def test_basins__cells_without_an_outcome():
     found = basins(*labelled([grid], [status]), interval="clopper-pearson").isel(frequency=0)
     counts = [int(found[name]) for name in ("n_pending", "n_not_settled", "n_failed", "n_unfinished")]
     assert counts == [5, 5, 5, 15]
-    assert found["label"].values.tolist() == [-2, 0, 1]
+    assert found["attractor"].values.tolist() == [-2, 0, 1]
     assert found["count"].values.tolist() == [5, 180, 200]
     np.testing.assert_allclose(found["fraction"], np.array([5, 180, 200]) / 385)
     np.testing.assert_allclose(found["fraction_if_all"], np.array([20, 195, 215]) / 400)
     assert (found["attractor_id"].values[:4, :5] == -1).all()
     # at most 3/N
     np.testing.assert_allclose(found["unseen_high"], 3 / 385, rtol=0.01)
+    assert basins_table(found).lines[-1] == (
+        "380 of 400 cells end on attractors; 5 diverged, 5 pending, 5 not settled, 5 that could not be integrated"
+    )
 
 
 def test_basins__a_point_without_any_outcome():
@@ -96,8 +105,21 @@ def test_basins__a_point_without_any_outcome():
     status = np.stack([np.full((20, 20), Status.PERIODIC), np.full((20, 20), Status.PENDING)])
     found = basins(*labelled([halves(20, 8), empty], status))
     assert np.isfinite(found["basin_entropy"].values).tolist() == [True, False]
-    assert np.isnan(found["fraction"].values[1]).all()
+    assert found["n_sets"].values.tolist() == [2, 0]
+    assert np.isnan(dense(found)["low"].values[1]).all()
     assert found["n_pending"].values.tolist() == [0, 400]
+
+
+def test_basin_rows__agree_with_fractions_of_all_labels():
+    rng = np.random.default_rng(3)
+    labels = xr.DataArray(rng.integers(-2, 4, (5, 6, 40)), dims=("f", "a", "start"))
+    inferred = xr.DataArray(rng.random(labels.shape) < 0.3, dims=labels.dims)
+    whole = basin_fractions(labels, dims=["start"], inferred=inferred, method="clopper-pearson")
+    rows = basin_rows(labels, ("f", "a"), inferred, 0.95, "clopper-pearson").assign_attrs(n_ids=4)
+    filled = dense(rows).rename(attractor="label")
+    for name in filled.data_vars:
+        known = filled[name].where(whole["count"] > 0) if "label" in filled[name].dims else filled[name]
+        np.testing.assert_array_equal(known, whole[name].where(whole["count"] > 0) if known.ndim == 3 else whole[name])
 
 
 def test_basins__starts_that_are_no_regular_grid():
@@ -109,7 +131,7 @@ def test_basins__starts_that_are_no_regular_grid():
     sample = [x.isel(psi2_0=0).rename(psi1_0="initial_condition") for x in (cube, ids)]
     found = basins(*sample)
     assert found.attrs["not_computed"] == "boundaries: the starts are no grid"
-    assert found["fraction"].dims == ("frequency", "label")
+    assert found["fraction"].dims == ("set",)
 
 
 def test_basins__a_grid_too_small_for_the_boxes():
@@ -142,11 +164,12 @@ def test_derive_basins__refuses_before_it_identifies(made):
 @pytest.mark.slow
 def test_derive_basins__of_an_incomplete_run(made):
     made.commit(0)
-    found = derive(made.info.directory, "basins", {"polish": False, "box": 2})
+    derive(made.info.directory, "attractors", {"polish": False})
+    found = derive(made.info.directory, "basins", {"box": 2})
     n = made.plan.cells_in(0)
     assert int((found["status"] > 0).sum()) == n
     assert int(found["n_pending"].sum()) == made.plan.n_cells - n
     per_point = found["n_unfinished"] - found["n_pending"] - found["n_not_settled"] - found["n_failed"]
     assert not per_point.any()
-    again = derive(made.info.directory, "basins", {"polish": False, "box": 2})
+    again = derive(made.info.directory, "basins", {"box": 2})
     xr.testing.assert_identical(found, again)

@@ -187,7 +187,7 @@ def test_resilience__distances_of_duffing(found):
 @pytest.mark.slow
 def test_resilience__basin_stability_and_table(found, wells):
     shares = found["basin_stability"].values
-    fractions = wells.derive("basins")["fraction"].sel(label=[0, 1]).values
+    fractions = dense(wells.derive("basins"))["fraction"].sel(attractor=[0, 1]).values
     assert shares == pytest.approx(fractions)
     assert (found["basin_stability_low"] < shares).all()
     assert (shares < found["basin_stability_high"]).all()
