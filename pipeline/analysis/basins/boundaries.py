@@ -250,6 +250,7 @@ def uncertainty_exponent(
 
 
 def box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the sides of a box along each dim of a grid; ValueError if it does not fit."""
     given = np.atleast_1d(np.asarray(box, dtype=np.int64)).tolist()
     sides = tuple(given) * (len(shape) if len(given) == 1 else 1)
     if len(sides) != len(shape):
