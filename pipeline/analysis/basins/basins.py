@@ -5,7 +5,7 @@ The functions read the cube and the ids of its attractors, and integrate nothing
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -127,7 +127,7 @@ def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
 def _problems(shape: tuple[int, ...], options: BasinOptions) -> dict[str, str]:
     """Return why measures of the boundaries cannot be computed on a grid, by measure."""
     found = {}
-    checks = {
+    checks: dict[str, Callable[[], object]] = {
         "basin entropy": lambda: box_sides(options.box, shape),
         "uncertainty exponent": lambda: epsilons_of(None, shape, options.scaling),
     }

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from types import MethodType
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, ParamSpec, Protocol, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, ParamSpec, Protocol, TypeVar, cast, overload
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class BifurcationCall(FigureCall[P, Any], Protocol[P]):
     """A figure of one panel, or of two with ``layout="side"``."""
 
     @overload
-    def __call__(self, *, layout: Literal["side"], **options: Any) -> Panels: ...
+    def __call__(self, *, layout: Literal["side"], **options: Any) -> Panels: ...  # type: ignore[overload-overlap]
     @overload
     def __call__(self, *args: P.args, **options: P.kwargs) -> Axes: ...
     @overload
@@ -105,7 +105,7 @@ class FigureMethod(_Method[P], Generic[P, R]):
     """The method of `Plots` for the figure of its name."""
 
     def __get__(self, plots: Any, owner: type) -> FigureCall[P, R]:
-        return _bound(figure(self.name), plots)
+        return cast("FigureCall[P, R]", _bound(figure(self.name), plots))
 
 
 class OnePanel(FigureMethod[P, "Axes"]):
@@ -124,7 +124,7 @@ class Bifurcation(FigureMethod[P, Any]):
     """The bifurcation diagram, whose option `layout` says how many panels it has."""
 
     def __get__(self, plots: Any, owner: type) -> BifurcationCall[P]:
-        return _bound(figure(self.name), plots)
+        return cast("BifurcationCall[P]", _bound(figure(self.name), plots))
 
 
 def _bound(function: Callable[..., Any], instance: object) -> Any:
