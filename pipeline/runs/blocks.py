@@ -1,6 +1,6 @@
 """Compute an analysis in blocks of parameter points, on the same threads, processes and dask workers as a run.
 
-Each block is stored as it ends, in ``derived/NAME-KEY.blocks``, until the whole result is. So an analysis that was
+Each block is stored as it ends, in ``derived/NAME-KEY.blocks/``, until the whole result is. So an analysis that was
 stopped goes on. Blocks follow from the specification alone, and the result does not depend on them.
 """
 
@@ -33,9 +33,10 @@ from pipeline.products.reporting import report
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.versions import current, key_of
 from pipeline.specification.parsing import Spec
+from pipeline.store.blocks import read_block, write_block
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files
-from pipeline.store.products import blocks_beside, open_product, read_product_attrs, write_product
+from pipeline.store.products import BLOCKS
 
 WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 16_384
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
@@ -97,7 +98,7 @@ def blocks_of(run: PlacedRun) -> list[Block]:
     return [dict(zip(dims, own, strict=True)) for own in itertools.product(*slices)]
 
 
-def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files) -> xr.Dataset:
+def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Dataset:
     """Compute an analysis in blocks, or those that are left of them.
 
     Parameters
@@ -106,8 +107,6 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files
         The run, with the workers and the scheduler.
     analysis, options
         Analysis with `by_point`, and its complete options.
-    place
-        Place of the whole result, beside which its blocks lie.
 
     Raises
     ------
@@ -125,11 +124,11 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files
         run.derive(other)
     where = replace(_in_processes(run.where or Where()), place=run.info.files.place)
     clients.reach(where)
-    key, folder = key_of(current(run, analysis.name), analysis, options), blocks_beside(place)
+    key = key_of(current(run, analysis.name), analysis, options)
     task = partial(
         compute_block, type(run).of, run.info.files.place, run.digest, options, key, blocks, origin=origin(run.model)
     )
-    missing = [k for k in range(n) if not _is_there(folder.below(_name(k)), key)]
+    missing = [k for k in range(n) if not _is_there(run.info.files, key, k)]
     done, what = n - len(missing), f"{analysis.name}, blocks of parameter points"
     if done:
         run.echo(f"{analysis.name}: {done} of {n} blocks done before")
@@ -141,7 +140,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files
                 report(what, k, n)
     cells = run.cube()["status"]
     sizes = {d: cells.sizes[d] for d in split_dims(cells)[0]}
-    return joined([open_product(folder.below(_name(k))) for k in range(n)], blocks, sizes)
+    return joined([read_block(run.info.files, _name(key, k)) for k in range(n)], blocks, sizes)
 
 
 def _in_processes(where: Where) -> Where:
@@ -173,9 +172,8 @@ def compute_block(
         )
     with using_threads(1):
         result: xr.Dataset = function_of(analysis.compute)(Part(run, blocks[index], known), options)
-    place = run.info.files.below(DERIVED).below(f"{analysis.name}-{key['derived_key'][:8]}.zarr")
     with writing_results():
-        write_product(blocks_beside(place).below(_name(index)), result.assign_attrs(key))
+        write_block(run.info.files, _name(key, index), result.assign_attrs(key))
     return {"block": index}
 
 
@@ -185,13 +183,13 @@ def _opened(opened: Callable[[str], PlacedRun], directory: str, digest: str) -> 
     return opened(directory), {}
 
 
-def _name(index: int) -> str:
-    return f"{index:06d}.zarr"
+def _name(key: Mapping[str, str], index: int) -> str:
+    return f"{DERIVED}/{key['derived_product']}-{key['derived_key'][:8]}{BLOCKS}/{index:06d}.npz"
 
 
-def _is_there(part: Files, key: Mapping[str, str]) -> bool:
+def _is_there(files: Files, key: Mapping[str, str], index: int) -> bool:
     try:
-        attrs = read_product_attrs(part)
+        attrs = read_block(files, _name(key, index)).attrs
     except (FileNotFoundError, DamagedError):
         return False
     return all(attrs.get(name) == value for name, value in key.items())

@@ -173,7 +173,7 @@ def derive(
     if problem:
         run.echo(f"{problem}: the result of {name} is shown but not kept")
     with notebook.progress():
-        computed = _compute(run, analysis, wanted, None if problem else place)
+        computed = _compute(run, analysis, wanted, can_keep=not problem)
         others = {name: value for name, value in computed.attrs.items() if name not in key}
         result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))
     if is_chosen:
@@ -342,16 +342,16 @@ def refused(directory: str | Path) -> Iterator[None]:
         raise SpecError(f"{directory}: {error}") from None
 
 
-def _compute(run: AnalysedRun, analysis: Analysis, options: Options, place: Files | None) -> xr.Dataset:
-    """Compute a result, in blocks if they can be kept beside its place, otherwise on threads of the engine."""
+def _compute(run: AnalysedRun, analysis: Analysis, options: Options, *, can_keep: bool) -> xr.Dataset:
+    """Compute a result, in blocks if they can be kept, otherwise on threads of the engine."""
     from magpend_core.engine.threads import using_threads
     from pipeline.runs.blocks import in_blocks
 
     started = time.perf_counter()
     threads = contextlib.nullcontext() if run.workers is None else using_threads(max(run.workers, 1))
     with refused(run.name), threads:
-        if analysis.by_point and place is not None and not getattr(options, "at", None):
-            result = in_blocks(run, analysis, options, place)
+        if analysis.by_point and can_keep and not getattr(options, "at", None):
+            result = in_blocks(run, analysis, options)
         else:
             result = function_of(analysis.compute)(run, options)
         if analysis.finish:

@@ -133,7 +133,7 @@ def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
     try:
         ds = xr.open_zarr(store, consolidated=False, chunks=None)
         with contextlib.nullcontext() if lazy else contextlib.closing(ds):
-            loaded = (ds if lazy else ds.load()).assign(_with_words(ds))
+            loaded = (ds if lazy else ds.load()).assign(with_words(ds))
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, OSError) as error:
         # of zarr and xarray: metadata from a stranger may have any type
         raise DamagedError(f"{files.name}: {error}") from None
@@ -285,14 +285,14 @@ def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
     store = MemoryStore(data)
     group = zarr.create_group(store, zarr_format=3)
     for name in sorted(map(str, ds.variables)):
-        values, attrs = _coded(name, ds.variables[name])
+        values, attrs = coded(name, ds.variables[name])
         fill = np.nan if values.dtype.kind == "f" else 0
         dims = tuple(map(str, ds.variables[name].dims))
         chunks = _product_chunks(values)
         array = create_array(group, name, dims, values.shape, chunks, str(values.dtype), fill, attrs)
         if values.size:
             array[...] = values
-    attrs = _plain(ds.attrs)
+    attrs = plain(ds.attrs)
     others = sorted(str(name) for name in ds.coords if name not in ds.dims)
     stored = {**attrs, "coordinates": " ".join(others)} if others else attrs
     digests = [(key, _sha256(value.to_bytes())) for key, value in data.items() if key != _GROUP]
@@ -337,10 +337,10 @@ def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
     return tuple(chunks)
 
 
-def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]]:
+def coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the values and attributes of a variable as they are stored: text labels become integer codes."""
     values = np.asarray(variable.values)
-    attrs: dict[str, Any] = _plain(variable.attrs)
+    attrs: dict[str, Any] = plain(variable.attrs)
     if values.dtype.kind not in "UO":
         return values, attrs
     if not all(isinstance(word, str) for word in values.flat):
@@ -350,7 +350,8 @@ def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]
     return codes, {**attrs, _WORDS: list(words)}
 
 
-def _with_words(ds: xr.Dataset) -> dict[str, Any]:
+def with_words(ds: xr.Dataset) -> dict[str, Any]:
+    """Return the variables that are stored as codes, as text labels again."""
     found = {}
     for name, variable in ds.variables.items():
         if _WORDS in variable.attrs:
@@ -360,9 +361,10 @@ def _with_words(ds: xr.Dataset) -> dict[str, Any]:
     return found
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return an attribute as JSON values."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -197,14 +197,16 @@ def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkey
     with pytest.raises(InterruptedRunError, match="the same command continues"):
         derive(run, "identified", scheduler="none")
     (folder,) = (run.directory / "derived").glob("identified-*.blocks")
-    assert sorted(path.name for path in folder.iterdir()) == ["000000.zarr", "000001.zarr"]
+    assert sorted(path.name for path in folder.iterdir()) == ["000000.npz", "000001.npz"]
 
     def goes_on(*args, **options):
         computed.append(args[-1])
         return real(*args, **options)
 
     monkeypatch.setattr(blocks, "compute_block", goes_on)
-    (folder / "000001.zarr" / "zarr.json").write_text("{}")  # damaged since
+    content = bytearray((folder / "000001.npz").read_bytes())
+    content[len(content) // 2] ^= 1  # damaged since
+    (folder / "000001.npz").write_bytes(content)
     lines: list[str] = []
     derive(run, "identified", scheduler="none", echo=lines.append)
     assert computed == [0, 1, 1, 2, 3]
@@ -215,7 +217,7 @@ def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkey
 
 def test_prune__removes_blocks_that_were_left(copy, sizes, monkeypatch):
     run = copy("run")
-    (run.directory / "derived" / "identified-00000000.blocks" / "000000.zarr").mkdir(parents=True)
+    (run.directory / "derived" / "identified-00000000.blocks" / "000000.npz").mkdir(parents=True)
     assert [path.rpartition("/")[2] for path in prune(run)] == ["identified-00000000.blocks"]
     assert not list((run.directory / "derived").iterdir())
 
