@@ -14,7 +14,6 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live import noisy_starting
 from pipeline.explorer.serving.answers import ANSWERS, Query
-from pipeline.runs.derive import options_of
 from pipeline.store.run import Run
 from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
 
@@ -87,18 +86,6 @@ def test_edges__are_orbits_at_their_own_point(wells):
     assert beside["edges"] == []
     command = "magpend analyse edge DIR --between A B --at amplitude=VALUE"
     assert beside["notes"] == [f"edge states are not computed here: {command}"]
-
-
-@pytest.mark.slow
-def test_disturbances__of_other_attractors_are_left_out(wells):
-    """Letters of a result whose attractors were told otherwise would name other sets."""
-    explored = ExploredRun.of(wells)
-    for name in ("resilience", "edge"):
-        (one,) = explored.kept_each(name)
-        options = options_of(one.attrs) | {"threshold": 0.25}
-        explored._opened[f"each {name}"] = [one.assign_attrs(derived_options=json.dumps(options))]
-    found = disturbances(explored, {"amplitude": SMOOTH})
-    assert (found["shocks"], found["edges"], len(found["notes"])) == ([], [], 2)
 
 
 def test_disturbances__refuse_an_index_off_the_axis(wells):
