@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.analysis.outcomes import sentence
-from pipeline.analysis.tabular import axis_ranges, counted, distinct, number
+from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
@@ -222,7 +222,8 @@ def _attractors(shown: Shown) -> Iterator[Block]:
     command = command_of("analyse attractors", options, shown.directory)
     table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
     rows = list(table.rows)
-    yield Grid(*_attractor_grid(found, rows, shown.axes), _counted(rows, told), command)
+    most, n_others = leading(rows, "attractor_id", "n_cells")
+    yield Grid(*_attractor_grid(found, most, shown.axes), _counted(rows, told), command, n_others)
     for remark in table.lines[table.lines.index(told) + 1 :]:
         yield Note(f"{remark[:1].upper()}{remark[1:]}.")
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
@@ -267,9 +268,11 @@ def _attractor_grid(
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["basin fraction (95 % interval)"] if sampled else []
-    lines = []
-    for i in sorted({row["attractor_id"] for row in rows}):
-        own = [row for row in rows if row["attractor_id"] == i]
+    lines: list[list[str]] = []
+    by_id: dict[int, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_id.setdefault(row["attractor_id"], []).append(row)
+    for i, own in sorted(by_id.items()):
         line = [letter(i)]
         line += [distinct(r[key].replace("_", " ") for r in own) for key in ("kind", "stability")]
         line.append(distinct(r["evidence"] for r in own if r["evidence"] != "none") or "-")
