@@ -151,6 +151,8 @@ class CellProduct:
         ``watches(options)`` returns the names of the quantities to watch while cells are integrated.
     shortest : callable
         ``shortest(options)`` returns the options with the least work, for compiling ahead.
+    version : int
+        Number of its results, see `magpend_core.versions`.
     """
 
     name: str
@@ -164,6 +166,7 @@ class CellProduct:
     coordinates: Callable[[Any, Any], dict[str, Sequence[Any]]] = lambda options, model: {}
     watches: Callable[[Any], Sequence[str]] = lambda options: ()
     shortest: Callable[[Any], Any] = lambda options: options
+    version: int = 1
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,7 @@ class Analysis:
         from the run filled in (an interval, the nearest value of an axis), so that equivalent options share
         one result.
     builds_on : tuple of str
-        Analyses that `compute` derives; their code counts in this one's version.
+        Analyses that `compute` derives; their versions count in this one's.
     figure : str
         Name of the figure that shows the result best, or empty.
     ignores : tuple of str
@@ -206,6 +209,8 @@ class Analysis:
     finish : str
         ``"module:function"`` or empty: ``finish(ds, options)`` completes the result of all parameter points by what
         needs them all.
+    version : int
+        Number of its results: raised when they change on purpose, see `magpend_core.versions`.
     """
 
     name: str
@@ -222,6 +227,7 @@ class Analysis:
     noisy: bool = False
     by_point: bool = False
     finish: str = ""
+    version: int = 1
 
 
 class FigureOptions(Options):
