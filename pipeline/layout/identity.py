@@ -22,7 +22,7 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 
 _PIPELINE = Path(__file__).parents[1]
-CODE = ("layout.cells", "compute.integrate", "compute.task")
+CODE = ("motion.steady", "layout.cells", "compute.integrate", "compute.task")
 """Modules of the pipeline that decide the numbers of every task.
 
 Modules for refined grids and for products are added where they are used. The numerical core and the model
@@ -70,9 +70,9 @@ def code_of(spec: Spec) -> list[str]:
     products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
     refined = ["compute.refinement"] if spec.refine is not None else []
     walked = ["compute.continuation"] if spec.continuation is not None else []
-    driven = ["compute.recorded_drive", "specification.drive_files"] if spec.drive is not None else []
-    driven += ["compute.drift", "specification.drift"] if spec.drift else []
-    noisy = ["compute.noise"] if spec.noise is not None else []
+    driven = ["motion.recorded", "specification.drive_files"] if spec.drive is not None else []
+    driven += ["motion.drifting", "specification.drift"] if spec.drift else []
+    noisy = ["motion.noisy"] if spec.noise is not None else []
     return [*CODE, *refined, *walked, *driven, *noisy, *(module.removeprefix("pipeline.") for module in products)]
 
 

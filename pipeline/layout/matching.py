@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.layout.cells import InitialStates, Inputs, initial_states, parameter_axes
+from pipeline.layout.cells import InitialStates, initial_states, parameter_axes
 from pipeline.layout.identity import CODE, differences
+from pipeline.motion.inputs import Inputs
 from pipeline.specification.noise import NoiseTable
 from pipeline.specification.parsing import Spec
 from pipeline.specification.tables import FREQUENCY
@@ -25,11 +26,11 @@ NOWHERE = -1
 _CODE = (
     *CODE,
     "compute.continuation",
-    "compute.recorded_drive",
+    "motion.recorded",
     "specification.drive_files",
-    "compute.drift",
+    "motion.drifting",
     "specification.drift",
-    "compute.noise",
+    "motion.noisy",
 )
 
 

@@ -156,8 +156,14 @@ def test_identity__code_of_what_is_computed(sweep_text):
     """A product that a run does not ask for bars nobody from completing it."""
     plain = parse_spec(tomllib.loads(sweep_text))
     spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
-    assert identity.code_of(plain) == ["layout.cells", "compute.integrate", "compute.task"]
-    assert identity.code_of(spectra) == ["layout.cells", "compute.integrate", "compute.task", "compute.exponents"]
+    assert identity.code_of(plain) == ["motion.steady", "layout.cells", "compute.integrate", "compute.task"]
+    assert identity.code_of(spectra) == [
+        "motion.steady",
+        "layout.cells",
+        "compute.integrate",
+        "compute.task",
+        "compute.exponents",
+    ]
     lines = differences(*(identity_of(s, make_plan(s), "k") for s in (plain, spectra)))
     assert any(line.startswith("code.compute.exponents: (absent)") for line in lines)
 
