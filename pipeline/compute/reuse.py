@@ -16,12 +16,12 @@ import numpy as np
 
 from magpend_core import Sections, Status
 from pipeline.compute.continuation import WALKED, going_on
-from pipeline.compute.extension import kept_on, obstacle
-from pipeline.compute.integrate import Integrate, Job, integrate
-from pipeline.layout.cells import CellMap, Inputs
+from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
+from pipeline.layout.cells import CellMap
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
+from pipeline.motion.inputs import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
@@ -139,7 +139,7 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
         Specification and identity of the run that would copy them.
     """
     lines = unlike(run.info.identity, identity)
-    if line := obstacle(run.spec, wanted):
+    if line := _no_extension(run.spec, wanted):
         lines.append(line)
     same = same_products(run, wanted)
     return lines + [
@@ -147,6 +147,22 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
         for name, options in wanted.products.items()
         if name not in same and CELL_PRODUCTS[name].watches(options)
     ]
+
+
+def _no_extension(old: Spec, new: Spec) -> str:
+    """Return the reason why stored cells cannot be integrated further for a new run; empty if they can."""
+    had, wanted = old.integration.n_keep, new.integration.n_keep
+    if had == wanted:
+        return ""
+    line = f"integration.n_keep: {had} in the directory, {wanted} now; "
+    if wanted < had:
+        return f"{line}fewer sections are not taken out of more"
+    if new.continuation is not None:
+        return f"{line}each point of a walk begins where all kept sections of the one before end"
+    if new.section is not None:
+        return f"{line}cells with a section by crossing do not go on"
+    problem = new.motion.no_extension()
+    return problem and line + problem
 
 
 class Pool:
@@ -222,7 +238,8 @@ class Pool:
         """Integrate copied cells further for more section points. Return which cells succeeded, and their variables."""
         rows = np.flatnonzero(taken)
         points = {name: array[:, None] for name, array in stored.items()}
-        is_exact, longer = kept_on(spec, inputs.take(rows), points, source.run.spec.integration.n_keep)
+        n_old, watched = source.run.spec.integration.n_keep, watched_quantities(spec)
+        is_exact, longer = spec.motion.extend(inputs.take(rows), points, n_old, watched)
         taken = taken.copy()
         taken[rows[~is_exact]] = False
         return taken, {name: array[:, 0] for name, array in longer.items()}

@@ -22,10 +22,11 @@ from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
-from pipeline.layout.cells import CellMap, Inputs
+from pipeline.layout.cells import CellMap
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import differences, identity_of
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.motion.inputs import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.commits import write_task

@@ -11,6 +11,7 @@ import numpy as np
 
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
+from pipeline.motion.inputs import Inputs
 from pipeline.specification.parsing import Spec
 from pipeline.specification.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
 from pipeline.specification.tables import FREQUENCY, Range
@@ -146,9 +147,7 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
     model = spec.model
     found = [Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model)) for a in parameter_axes(spec)]
     if FREQUENCY not in spec.axes and spec.section is None:
-        attrs = _parameter_attrs(FREQUENCY, model)
-        if spec.recorded is not None:
-            attrs = {**attrs, "long_name": "mean frequency of the recorded drive"}
+        attrs = {"units": "Hz", "long_name": spec.motion.frequency_meaning}
         value = np.array(spec.frequency_hz, dtype=np.float64)
         found.append(Coordinate(FREQUENCY_DIM, (), value, attrs))
     states = initial_states(spec.initial_conditions)
@@ -196,31 +195,6 @@ def _branch_coords(spec: Spec, states: InitialStates) -> list[Coordinate]:
         Coordinate("seed", dims, seeds, {"long_name": "index of the initial condition"}),
         *(Coordinate(grid_dim(s.name), dims, table[:, i], _start_attrs(s)) for i, s in enumerate(spec.model.states)),
     ]
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Input arrays of `run_branches` for one task: parameters, frequencies and initial states of its branches.
-
-    Attributes
-    ----------
-    parameters : ndarray, (branch, point, parameter)
-    frequency_hz : ndarray, (branch, point)
-    initial_states : ndarray, (branch, n_states)
-    step_size : ndarray, (branch,), or None
-        First step of each branch that continues an earlier task [s]; NaN for a branch that has ended. None
-        for a task in which all branches begin.
-    """
-
-    parameters: np.ndarray
-    frequency_hz: np.ndarray
-    initial_states: np.ndarray
-    step_size: np.ndarray | None = None
-
-    def take(self, branches: Any) -> Inputs:
-        """Return the inputs of selected branches."""
-        step = None if self.step_size is None else self.step_size[branches]
-        return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step)
 
 
 class CellMap:

@@ -36,8 +36,8 @@ def numbered(identity: Mapping[str, Any]) -> dict[str, Any]:
         if own := {module: digest for module, digest in code.items() if module in first}:
             is_first = all(first[module] == digest for module, digest in own.items())
             versions[name] = 1 if is_first else " ".join(own.values())
-    for module, (name, first) in _PRODUCTS.items():
+    for module, (name, digest) in _PRODUCTS.items():
         if module in code:
-            versions[name] = 1 if code[module] == first else code[module]
+            versions[name] = 1 if code[module] == digest else code[module]
     rest = {key: value for key, value in identity.items() if key not in ("kernel_version", "code")}
     return {**rest, "versions": versions}

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.layout.cells import InitialStates, Inputs, initial_states, parameter_axes
+from pipeline.layout.cells import InitialStates, initial_states, parameter_axes
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import differences
+from pipeline.motion.inputs import Inputs
 from pipeline.specification.noise import NoiseTable
 from pipeline.specification.parsing import Spec
 from pipeline.specification.tables import FREQUENCY

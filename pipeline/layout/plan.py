@@ -21,24 +21,8 @@ from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
-from pipeline.specification.drive_files import TORQUE
 from pipeline.specification.parsing import Spec
 from pipeline.specification.tables import FREQUENCY
-
-MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
-"""Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes
-9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %).
-"""
-
-MICROSECONDS_PER_INTERVAL = 0.9
-"""Additional time per trajectory for each interval of a recorded torque."""
-
-RTOL_OF_RULE = 1e-8
-MICROSECONDS_PER_NOISY_STEP = 0.25
-"""Time of a step with noise of one trajectory, a rule for the paper's pendulum."""
-
-ROOT = 6
-"""The time is proportional to (1/rtol)^(1/6)."""
 
 LEAST_LATTICE = 64
 """Cells of the first lattice in a tile of a refined grid, about, if 64 MB hold them.
@@ -78,8 +62,6 @@ class Plan:
         Sizes of the dims that are not cell dims.
     seconds_per_cell : float
         Estimated time on one core [s].
-    is_recorded : bool
-        Whether the drive is a recording.
     directions : tuple of str
         Directions in which branches walk, each for an equal part of the branches; empty in a sweep.
     seconds_at : ndarray or None
@@ -94,7 +76,6 @@ class Plan:
     variables: tuple[Variable, ...]
     sizes: Mapping[str, int]
     seconds_per_cell: float
-    is_recorded: bool = False
     directions: tuple[str, ...] = ()
     seconds_at: np.ndarray | None = field(default=None, compare=False, repr=False)
 
@@ -207,7 +188,7 @@ def make_plan(spec: Spec) -> Plan:
     many points as that time allows, at most 20 s.
     """
     cells = CellMap(spec)
-    seconds = _seconds_per_cell(spec)
+    seconds = sum(periods_per_cell(spec)) * mean_seconds_per_period(spec)
     n_points = 1 if cells.path is None else cells.shape[cells.path]
     wanted = spec.execution.trajectories_per_task or _trajectories(spec, math.prod(cells.shape), n_points, seconds)
     directions: tuple[str, ...] = ()
@@ -231,24 +212,15 @@ def make_plan(spec: Spec) -> Plan:
         variables_of(spec.model, spec.products),
         sizes_of(spec.model, spec.products, spec.integration.n_keep),
         seconds,
-        spec.recorded is not None,
         directions,
         _seconds_at(spec),
     )
 
 
-def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:
-    """Estimate the computing time per drive period of one trajectory on one core [s], by a rule of thumb."""
-    microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND / np.asarray(frequency_hz)
-    return np.asarray(microseconds * 1e-6 * (RTOL_OF_RULE / rtol) ** (1 / ROOT))
-
-
 def mean_seconds_per_period(spec: Spec) -> float:
     """Return the mean computing time per drive period over the run's frequencies [s]."""
     frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.frequency_hz
-    if spec.noise is not None:
-        return float(np.mean(spec.noise.steps_at(np.asarray(frequency)))) * MICROSECONDS_PER_NOISY_STEP * 1e-6
-    return float(np.mean(seconds_per_period(np.asarray(frequency), spec.integration.rtol)))
+    return float(np.mean(spec.motion.seconds_per_period(np.asarray(frequency))))
 
 
 def periods_per_cell(spec: Spec) -> tuple[float, float]:
@@ -263,20 +235,7 @@ def _seconds_at(spec: Spec) -> np.ndarray | None:
     """Return the estimated computing time of a cell at each swept frequency [s]; None if frequency is not swept."""
     if FREQUENCY not in spec.axes:
         return None
-    frequency = spec.axes[FREQUENCY].array()
-    if spec.noise is not None:
-        steps = spec.noise.steps_at(frequency)
-        return np.asarray(sum(periods_per_cell(spec)) * steps * MICROSECONDS_PER_NOISY_STEP * 1e-6)
-    return sum(periods_per_cell(spec)) * seconds_per_period(frequency, spec.integration.rtol)
-
-
-def _seconds_per_cell(spec: Spec) -> float:
-    periods = sum(periods_per_cell(spec))
-    seconds = periods * mean_seconds_per_period(spec)
-    if spec.recorded is not None and spec.recorded.kind == TORQUE:
-        per_period = spec.recorded.n_intervals / spec.recorded.n_periods
-        seconds += periods * per_period * MICROSECONDS_PER_INTERVAL * 1e-6
-    return seconds
+    return sum(periods_per_cell(spec)) * spec.motion.seconds_per_period(spec.axes[FREQUENCY].array())
 
 
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:

@@ -152,12 +152,11 @@ def _label(part: xr.Dataset, parameter: str) -> str:
 def draw(run: Run, options: DriftFigureOptions) -> style.DataFigure:
     """Draw the figure ``drift`` of a run."""
     cube = run.cube()
-    names = tuple(r.parameter for r in getattr(model_of(cube), "ramps", ()))
     at, notes = values_of(run, options)
     below = run.of(options.over).cube() if options.over else None
     figure = plot_drift(
         cube,
-        moving_parameter(names, options.moving),
+        moving_parameter(getattr(model_of(cube), "ramps", ()), options.moving),
         below=below,
         state=options.state,
         at=at,

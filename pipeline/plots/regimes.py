@@ -256,13 +256,11 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
     parts = [kinds == k for k in chosen] + ([~np.isin(kinds, chosen)] if len(met) > most else [])
     tables = [np.bincount(point[own], share[own], math.prod(shape)).reshape(shape) for own in parts]
     stacked = np.stack(tables, axis=-1) if tables else np.zeros((*shape, 0))
-    attrs = {
-        "units": "1",
-        "long_name": "share of all cells on attractors of this kind",
-        "n_others": max(0, len(met) - most),
-    }
+    about = {"units": "1", "long_name": "share of all cells on attractors of this kind"}
     members = [names_of(k) for k in chosen] + ["others"] * (len(met) > most)
-    return data.assign(share_of=((y, x, "member"), stacked, attrs)).assign_coords(member=("member", members))
+    shares = data.assign_coords(member=members).assign(share_of=((y, x, "member"), stacked, about))
+    shares["share_of"].attrs["n_others"] = max(0, len(met) - most)
+    return shares
 
 
 def _period_name(period: int) -> str:

@@ -44,7 +44,7 @@ ESCAPES = Analysis(
     table=f"{_ROOM}.table:escapes_table",
     needs=f"{_ROOM}.escapes:needs_set",
     figure="escapes",
-    noisy=True,
+    motion="noisy",
     by_point=True,
     finish=f"{_ROOM}.escapes:finish_escapes",
 )
@@ -58,5 +58,5 @@ DENSITY = Analysis(
     compute=f"{_ROOM}.density:density",
     table=f"{_ROOM}.table:density_table",
     figure="density",
-    noisy=True,
+    motion="noisy",
 )

@@ -201,8 +201,8 @@ class Analysis:
         Name of the figure that shows the result best, or empty.
     ignores : tuple of str
         Options that do not change the result.
-    for_drift : bool
-        Whether it takes runs whose parameters move; the others assume that parameters are constant.
+    motion : str
+        Kind of motion that its runs have: ``"steady"``, ``"drifting"`` or ``"noisy"``; see `pipeline.motion`.
     by_point : bool
         Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
         results `pipeline.analysis.ragged.joined` joins.
@@ -223,8 +223,7 @@ class Analysis:
     builds_on: tuple[str, ...] = ()
     figure: str = ""
     ignores: tuple[str, ...] = ()
-    for_drift: bool = False
-    noisy: bool = False
+    motion: Literal["steady", "drifting", "noisy"] = "steady"
     by_point: bool = False
     finish: str = ""
     version: int = 1

@@ -49,7 +49,7 @@ TIPPING = Analysis(
     table=f"{_ROOM}.table:tipping_table",
     needs=f"{_ROOM}.product:needs_drift",
     figure="drift",
-    for_drift=True,
+    motion="drifting",
 )
 
 OVERLAPS = Analysis(
@@ -76,5 +76,5 @@ DELAY = Analysis(
     table=f"{_ROOM}.delay:delay_table",
     needs=f"{_ROOM}.delay:needs_sections",
     figure="drift",
-    for_drift=True,
+    motion="drifting",
 )

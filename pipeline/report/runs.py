@@ -207,7 +207,7 @@ def _first_of_others(shown: Shown) -> dict[str, float]:
 
 def _attractors(shown: Shown) -> Iterator[Block]:
     """Make the table of a run's attractors, and figures of them."""
-    if shown.run.spec.noise is not None:
+    if shown.run.spec.motion.obstacle:
         return
     known = shown.options_of("attractors")
     if not known:
@@ -306,9 +306,7 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 
 def _suits(shown: Shown, name: str) -> bool:
-    if shown.run.spec.recorded is not None:  # the recording ends, so no cell can be integrated further
-        return False
-    if ANALYSES[name].noisy != (shown.run.spec.noise is not None):
+    if shown.run.spec.motion.unsuited(ANALYSES[name]):
         return False
     if name == "hysteresis":
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
@@ -361,7 +359,7 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
-    if shown.run.spec.recorded is not None or shown.run.spec.noise is not None:
+    if shown.run.spec.motion.obstacle:
         return
     if "lyapunov" not in shown.run.spec.products:
         yield Note(

@@ -150,8 +150,8 @@ def derive(
         places["where"] = Where.of(scheduler)
         places["where"].resolved()
     run = AnalysedRun.of(source, echo, **places)
-    _refuse_unsteady(run, analysis)
-    _refuse_noise(run, analysis)
+    if problem := run.spec.motion.unsuited(analysis):
+        raise SpecError(f"{run.name}: {problem}")
     is_chosen = name == "attractors" and bool(wanted.model_fields_set)
     if name == "attractors" and not is_chosen:
         wanted = attractor_options(run)
@@ -169,12 +169,12 @@ def derive(
         pass
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
-    problem = unwritable(place.local.parent) if place.local is not None else ""
-    if problem:
-        run.echo(f"{problem}: the result of {name} is shown but not kept")
+    why = unwritable(place.local.parent) if place.local is not None else ""
+    if why:
+        run.echo(f"{why}: the result of {name} is shown but not kept")
     with notebook.progress():
-        computed = _compute(run, analysis, wanted, can_keep=not problem)
-        others = {name: value for name, value in computed.attrs.items() if name not in key}
+        computed = _compute(run, analysis, wanted, can_keep=not why)
+        others = {k: value for k, value in computed.attrs.items() if k not in key}
         result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))
     if is_chosen:
         _keep(run, wanted)
@@ -267,42 +267,6 @@ def options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise DamagedError("its attribute derived_options is not a table in JSON")
     return given
-
-
-def _refuse_unsteady(run: Run, analysis: Analysis) -> None:
-    """Raise `SpecError` for a run driven by a recording, or whose parameters move, unless the analysis is made for it.
-
-    Analyses would integrate beyond the end of the recording, and take the parameters as constant.
-    """
-    name = analysis.name
-    if run.spec.drift and not analysis.for_drift:
-        raise SpecError(
-            f"{run.name}: {run.spec.unsteady}, but {name} takes the parameters as constant. Make a run without "
-            "[drift] for it. Of this run: magpend analyse tipping, magpend plot drift, or plot section."
-        )
-    if run.spec.recorded is not None:
-        raise SpecError(
-            f"{run.name}: its drive is the recording {run.spec.recorded.file}, which ends, but {name} "
-            "integrates further. Make a run at its mean frequency instead (frequency_hz = "
-            f"{run.spec.frequency_hz:.6g} instead of [drive]). You can draw this run's sections: magpend "
-            "plot bifurcation, or section."
-        )
-
-
-def _refuse_noise(run: Run, analysis: Analysis) -> None:
-    """Raise `SpecError` if an analysis of deterministic motions is asked of a noisy run, or the other way round."""
-    if analysis.noisy == (run.spec.noise is not None):
-        return
-    own = ", ".join(name for name, other in ANALYSES.items() if other.noisy)
-    if analysis.noisy:
-        problem = f"{run.name}: {analysis.name} needs a run with noise; add a table [noise] to its specification."
-    else:
-        problem = (
-            f"{run.name}: its cells have noise, and {analysis.name} assumes that the same state goes on in the same "
-            f"way. Analyses of noisy runs: {own}. For {analysis.name} make the run without [noise]. You can draw "
-            "this run's sections: magpend plot bifurcation, or section."
-        )
-    raise SpecError(problem)
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:

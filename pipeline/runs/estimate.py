@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.layout.cells import CellMap, Inputs
-from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell, seconds_per_period
+from pipeline.layout.cells import CellMap
+from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell
+from pipeline.motion.inputs import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 
@@ -178,7 +179,7 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
     Two stretches are measured: one from the initial states, and one from the end of the first, which
     represents the rest of the cell.
     """
-    by_rule = float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).sum())
+    by_rule = float(spec.motion.seconds_per_period(inputs.frequency_hz).sum())
     n_periods = int(min(max(SPEED_S / by_rule, LEAST_PERIODS), most))
     ends, first, seconds = _stretch(spec, inputs, n_periods)
     if seconds > 4 * SPEED_S:  # far slower than the rule: one stretch must suffice
@@ -204,7 +205,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
     values = integrate(replace(spec, integration=integration), inputs)
     seconds = time.process_time() - started
     ends = values["section"][:, -1, -1]
-    a_period = seconds_per_period(inputs.frequency_hz, spec.integration.rtol)
+    a_period = spec.motion.seconds_per_period(inputs.frequency_hz)
     by_rule = float((a_period * values["n_periods"]).sum())
     return np.where(np.isfinite(ends), ends, inputs.initial_states), seconds / by_rule, seconds
 
@@ -221,7 +222,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
     found, n_branches, left = np.empty(0), BRANCHES, CLOSING_S
     while left > 0:
         inputs = _sample(spec, plan, rng, n_branches, pairs=True)
-        a_period = ratio * float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).mean())
+        a_period = ratio * float(spec.motion.seconds_per_period(inputs.frequency_hz).mean())
         if not len(found):
             cap = int(min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))
             integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})

@@ -146,7 +146,7 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
     """
     from pipeline.plots.palette import COLOURS
 
-    _refuse_recorded(run)
+    _refuse(run)
     cube = run.cube()
     shape, dims = cube["status"].shape, cube["status"].dims
     n = math.prod(shape)
@@ -196,19 +196,9 @@ def _where(one: xr.Dataset) -> str:
     return ", ".join(said)
 
 
-def _refuse_recorded(run: AnalysedRun) -> None:
-    if run.spec.drift:
-        raise SpecError(
-            [
-                f"{run.name}: {run.spec.unsteady}; an animation needs a run with constant parameters. To draw this "
-                "run's sections: magpend plot drift."
-            ]
-        )
-    if run.spec.recorded is not None:
-        raise SpecError(
-            f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation needs a "
-            "run at a fixed frequency. To draw this run's sections: magpend plot section."
-        )
+def _refuse(run: AnalysedRun) -> None:
+    if problem := run.spec.motion.refusal("an animation"):
+        raise SpecError(f"{run.name}: {problem}")
 
 
 def of_start(parameters: Parameters, frequency_hz: float, state: Sequence[float], n_transient: int = 0) -> Moving:
@@ -256,7 +246,7 @@ def point_of_run(run: AnalysedRun, options: AnimationOptions) -> tuple[Parameter
     from pipeline.analysis.selection import select_points
     from pipeline.plots.figure import values_of
 
-    _refuse_recorded(run)
+    _refuse(run)
     cube = run.cube()
     with refused(run.name):
         at, notes = values_of(run, options)

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from magpend_core.models.noisy import NoisyModel
-from pipeline.layout.cells import CellMap, Inputs
-from pipeline.specification.noise import STEPS
+from pipeline.layout.cells import CellMap
+from pipeline.motion.inputs import Inputs
+from pipeline.motion.noisy import Noisy
+from pipeline.specification.noise import STEPS, NoiseTable
 from pipeline.specification.parsing import Spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.files import Files
@@ -37,42 +38,38 @@ def check_steps(spec: Spec) -> None:
     SpecError
         With the step's length, the bound and the number of steps that fits.
     """
-    if spec.noise is None:
+    motion = spec.motion
+    if not isinstance(motion, Noisy):
         return
     inputs = _sample(spec)
-    steps = spec.noise.steps_at(inputs.frequency_hz[:, 0])
-    lengths = 1.0 / inputs.frequency_hz[:, 0] / steps
-    if problem := _stiff_problem(spec, inputs, lengths):
+    if problem := _stiff_problem(motion, inputs):
         raise SpecError([problem])
-    from pipeline.compute.noise import under_noise
-
     few = min(PERIODS, spec.integration.n_transient + spec.integration.n_keep)
-    short = replace(spec, integration=spec.integration.model_copy(update={"n_transient": few - 1, "n_keep": 1}))
-    error = under_noise(short, inputs)[1]
+    short = spec.integration.model_copy(update={"n_transient": few - 1, "n_keep": 1})
+    error = replace(motion, integration=short).integrate(inputs, None)[1]["strong_error"]
     largest = float(np.nanmax(error)) if np.isfinite(error).any() else 0.0
-    if largest > spec.noise.tolerance:
-        model = spec.model
-        assert isinstance(model, NoisyModel)
-        order = ORDER_OF_OWN if any(model.noise.own) else ORDER
-        factor = (1.2 * largest / spec.noise.tolerance) ** (1.0 / order)
+    tolerance = motion.table.tolerance
+    if largest > tolerance:
+        order = ORDER_OF_OWN if any(motion.path["noise"].own) else ORDER
+        factor = (1.2 * largest / tolerance) ** (1.0 / order)
         raise SpecError(
             [
-                f"noise.{_step_key(spec)}: halving the steps changes a state within a period by {largest:.2g} of its "
-                f"scale, more than noise.tolerance = {spec.noise.tolerance:g}; set {_remedy(spec, factor)}."
+                f"noise.{_step_key(motion.table)}: halving the steps changes a state within a period by {largest:.2g} "
+                f"of its scale, more than noise.tolerance = {tolerance:g}; set {_remedy(motion.table, factor)}."
             ]
         )
 
 
 def warn_of_steps(spec: Spec, files: Files, echo: Callable[[str], None]) -> None:
     """Print a warning if cells of a finished run have a strong error above ``noise.tolerance``."""
-    if spec.noise is None:
+    if not isinstance(spec.motion, Noisy):
         return
-    error = Run.open(files).cube()["strong_error"].values
-    n_above, n = int((error > spec.noise.tolerance).sum()), int(np.isfinite(error).sum())
+    error, tolerance = Run.open(files).cube()["strong_error"].values, spec.motion.table.tolerance
+    n_above, n = int((error > tolerance).sum()), int(np.isfinite(error).sum())
     if n_above:
         echo(
             f"warning: in {n_above} of {n} cells the last period changes by more than noise.tolerance = "
-            f"{spec.noise.tolerance:g} when its steps are halved (at most {np.nanmax(error):.2g}); take shorter steps."
+            f"{tolerance:g} when its steps are halved (at most {np.nanmax(error):.2g}); take shorter steps."
         )
 
 
@@ -88,31 +85,29 @@ def _sample(spec: Spec) -> Inputs:
     return Inputs(*(np.concatenate([getattr(one, name) for one in found]) for name in parts))
 
 
-def _stiff_problem(spec: Spec, inputs: Inputs, lengths: np.ndarray) -> str | None:
+def _stiff_problem(motion: Noisy, inputs: Inputs) -> str | None:
     from magpend_core.stiffness import fastest_contraction
 
     given = inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states
-    rate = fastest_contraction(spec.model.system, *given)
-    longest = float(lengths.max())
+    rate = fastest_contraction(motion.model.system, *given)
+    longest = float((1.0 / inputs.frequency_hz[:, 0] / motion.steps(inputs)).max())
     if not longest * rate > STABLE:
         return None
     bound = STABLE / rate
     return (
-        f"noise.{_step_key(spec)}: a step has {longest:.3g} s, and the equations contract at {rate:.4g} /s in a layer; "
-        f"steps must be shorter than {bound:.3g} s. Set {_remedy(spec, 1.05 * longest / bound)}."
+        f"noise.{_step_key(motion.table)}: a step has {longest:.3g} s, and the equations contract at {rate:.4g} /s in "
+        f"a layer; steps must be shorter than {bound:.3g} s. Set {_remedy(motion.table, 1.05 * longest / bound)}."
     )
 
 
-def _step_key(spec: Spec) -> str:
-    assert spec.noise is not None
-    if spec.noise.step is not None:
-        return f"step = {spec.noise.step:g}"
-    return f"steps_per_period = {spec.noise.steps_per_period or STEPS}"
+def _step_key(noise: NoiseTable) -> str:
+    if noise.step is not None:
+        return f"step = {noise.step:g}"
+    return f"steps_per_period = {noise.steps_per_period or STEPS}"
 
 
-def _remedy(spec: Spec, factor: float) -> str:
+def _remedy(noise: NoiseTable, factor: float) -> str:
     """Return the key and value with steps shorter by a factor."""
-    assert spec.noise is not None
-    if spec.noise.step is not None:
-        return f"step = {spec.noise.step / factor:.2g}"
-    return f"steps_per_period = {int(np.ceil((spec.noise.steps_per_period or STEPS) * factor))}"
+    if noise.step is not None:
+        return f"step = {noise.step / factor:.2g}"
+    return f"steps_per_period = {int(np.ceil((noise.steps_per_period or STEPS) * factor))}"

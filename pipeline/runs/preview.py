@@ -35,10 +35,8 @@ def first_figure(run: Run) -> str:
     """Return the name of the figure that gives the best overview of a run; the run can draw it."""
     plan = run.plan
     swept, grid = _long(plan)
-    if run.spec.drift:
-        return "drift"
-    if plan.is_recorded or run.spec.noise is not None:  # their cells cannot be integrated further: no attractors
-        return "bifurcation" if swept else "section"
+    if name := run.spec.motion.overview(is_swept=bool(swept)):
+        return name
     if any(v.name == "lyapunov" for v in plan.variables):
         return "lyapunov" if swept else "convergence"
     if len(swept) >= 2:
@@ -261,8 +259,7 @@ def times(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | Non
     compiled = f"; compiling its kernel took {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     whole = duration(found.core_seconds)
     rests = f"{found.how}; writing a task takes {1000 * writing_s:.0f} ms{compiled}"
-    more = (
-        f"; after it, analyse attractors may extend cells for up to {whole} of one core" if spec.noise is None else ""
-    )
+    more = f"; after it, analyse attractors may extend cells for up to {whole} of one core"
+    more = "" if spec.motion.obstacle else more
     line = f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}){more}"
     return Times(seconds, by_clock, line)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unicodedata import category
 
 from magpend_core.models import DEFAULT, load_model
@@ -19,6 +19,10 @@ from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import Preset, is_file
+from pipeline.motion.drifting import Drifting
+from pipeline.motion.noisy import Noisy
+from pipeline.motion.recorded import Recorded
+from pipeline.motion.steady import Steady
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification import drift as moving
@@ -35,9 +39,6 @@ from pipeline.specification.recorded_drive import DriveTable, recorded, run_prob
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
 from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range, Table
-
-if TYPE_CHECKING:
-    from magpend_core.models.drift.sections import Drift
 
 KINDS = ("sweep", "continuation")
 IDENTIFICATION = "identification"
@@ -69,21 +70,16 @@ class Spec:
         return moving.ramps_of(self.drift, self.axes)
 
     @cached_property
-    def motion(self) -> Drift:
-        """How the parameters move, for the numerical core; this imports the compiler."""
-        from magpend_core.models.drift.sections import Drift
-
-        corners = moving.corners_of(self.values, self.axes, self.frequency_hz)
-        return Drift.of(self.model.system, self.ramps, self.values.names, *corners)
-
-    @property
-    def unsteady(self) -> str:
-        """What keeps the run's equations from staying the same for ever, as a clause; empty if nothing does."""
+    def motion(self) -> Steady:
+        """How the cells move: steadily, under a recorded drive, while parameters drift, or with noise."""
+        if self.noise is not None:
+            return Noisy(self.model, self.integration, self.noise)
+        if self.drift:
+            corners = moving.corners_of(self.values, self.axes, self.frequency_hz)
+            return Drifting(self.model, self.integration, self.ramps, self.values, corners)
         if self.recorded is not None:
-            return f"its drive is the recording {self.recorded.file}, which ends"
-        if len(self.drift) == 1:
-            return f"its parameter {next(iter(self.drift))} moves ([drift])"
-        return f"its parameters {' and '.join(self.drift)} move ([drift])" if self.drift else ""
+            return Recorded(self.model, self.integration, self.recorded)
+        return Steady(self.model, self.integration)
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from magpend_core.engine.passage import Region
 from magpend_core.models.model import Model
-from magpend_core.models.noisy import NoisyModel
 from magpend_core.noisy import cell_words, first_passages, noisy_sections
 from magpend_core.status import Status
 from pipeline.analysis.noise.cells import PointCells
 from pipeline.analysis.noise.exits import NOT_LEFT, Exits
 from pipeline.analysis.run import Run
-from pipeline.layout.cells import CellMap, Inputs, parameter_axes
+from pipeline.layout.cells import CellMap, parameter_axes
+from pipeline.motion.inputs import Inputs
+from pipeline.motion.noisy import Noisy
 from pipeline.products.noise import EscapeOptions
 
 
@@ -54,19 +53,13 @@ def find_passages(run: Run, cells: PointCells, options: EscapeOptions, *, halves
 
     Each path is that of the run. With `halves` it is integrated by halved steps, on the same path of the noise.
     """
-    assert run.spec.noise is not None
-    model = run.model
-    assert isinstance(model, NoisyModel)
+    model, motion = run.model, run.spec.motion
+    assert isinstance(motion, Noisy)
     inputs = _inputs_at(run, cells)
-    steps = int(run.spec.noise.steps_at(inputs.frequency_hz[:1, 0])[0])
+    steps = int(motion.steps(inputs)[0])
     n_before = run.spec.integration.n_transient + options.skip + 1
     words = cell_words(inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states)
-    own: dict[str, Any] = {
-        "system": model.system,
-        "noise": model.noise,
-        "seed": run.spec.noise.seed,
-        "steps_per_period": steps,
-    }
+    own = {**motion.path, "steps_per_period": steps}
     first = cells.section[:, options.skip].copy()
     # cells that diverged have no sections
     gone = np.flatnonzero((cells.status == Status.DIVERGED) & (cells.n_periods > n_before))

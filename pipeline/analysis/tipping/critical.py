@@ -12,6 +12,7 @@ from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.run import Run
 from pipeline.analysis.tipping.endings import NONE, Final, Group, endings, finals_of
 from pipeline.layout.cells import initial_states
+from pipeline.motion.drifting import Drifting
 from pipeline.products.reporting import report
 from pipeline.products.tipping import TippingOptions
 from pipeline.specification.tables import FREQUENCY
@@ -184,20 +185,7 @@ def _examples(group: Group, ids: dict[int, int]) -> tuple[np.ndarray, np.ndarray
 
 def drifted(run: Run, packed: np.ndarray, frequency_hz: np.ndarray, starts: np.ndarray) -> Sections:
     """Integrate cells of a run over its whole length, with other parameters; only the last section is kept."""
-    from magpend_core.models.drift.sections import drifting_sections
-
-    spec, integration = run.spec, run.spec.integration
-    return drifting_sections(
-        replace(spec.model.system, method=integration.method),
-        spec.motion,
-        packed,
-        frequency_hz,
-        starts,
-        n_transient=integration.n_transient + integration.n_keep - 1,
-        n_keep=1,
-        rtol=integration.rtol,
-        atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period,
-        closure_tolerance=integration.closure_tolerance,
-        max_orbit_period=1,
-    )
+    motion, integration = run.spec.motion, run.spec.integration
+    assert isinstance(motion, Drifting)
+    length = {"n_transient": integration.n_transient + integration.n_keep - 1, "n_keep": 1}
+    return motion.sections(packed, frequency_hz, starts, **length, max_orbit_period=1)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model
 from pipeline.analysis.run import Run
 from pipeline.analysis.tabular import Row, aligned, counted, number, unit_of
@@ -66,7 +68,7 @@ def left_at(lag: np.ndarray, distance: float) -> np.ndarray:
 def needs_sections(run: Run, options: DelayOptions) -> None:
     """Raise ValueError unless the parameter moves and enough sections are kept."""
     spec = run.spec
-    name = moving_parameter(tuple(spec.drift), options.moving)
+    name = moving_parameter(spec.ramps, options.moving)
     ends = np.asarray(run.cube()[at_section(name)].values)
     if spec.integration.n_keep <= 2 * options.period or not np.ptp(ends):
         raise ValueError(
@@ -75,7 +77,7 @@ def needs_sections(run: Run, options: DelayOptions) -> None:
         )
 
 
-def moving_parameter(names: tuple[str, ...], wanted: str) -> str:
+def moving_parameter(ramps: Sequence[Ramp], wanted: str) -> str:
     """Return the moving parameter that is meant: the one that is named, or the only one.
 
     Raises
@@ -83,6 +85,7 @@ def moving_parameter(names: tuple[str, ...], wanted: str) -> str:
     ValueError
         If it does not move, or several do.
     """
+    names = [ramp.parameter for ramp in ramps]
     if not names:
         raise ValueError("no parameter moves in this run; give its specification a table [drift.NAME].")
     if wanted and wanted not in names:
@@ -95,7 +98,7 @@ def moving_parameter(names: tuple[str, ...], wanted: str) -> str:
 def delay(run: Run, options: DelayOptions) -> xr.Dataset:
     """Find for each cell the value of the moving parameter at which it leaves an orbit of a given period."""
     cube, model = run.cube(), model_of(run.cube())
-    name = moving_parameter(tuple(run.spec.drift), options.moving)
+    name = moving_parameter(run.spec.ramps, options.moving)
     dims, starts = split_dims(cube["status"])
     order = (*dims, *starts)
     section = cube["section"].transpose(*order, "period_index", "state").values

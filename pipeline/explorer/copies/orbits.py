@@ -154,13 +154,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     room
         Limits on number and size of the orbits.
     """
-    if copied.run.spec.unsteady:
-        missing = f"This copy has no orbits: {copied.run.spec.unsteady}."
-        copied.about["orbits"] = {"blocks": [], "missing": missing}
-        copied.sentences.append(missing)
-        return 0
-    if copied.run.spec.noise is not None:
-        missing = "This copy has no orbits: the cells of the run have noise."
+    if obstacle := copied.run.spec.motion.obstacle:
+        missing = f"This copy has no orbits: {obstacle}."
         copied.about["orbits"] = {"blocks": [], "missing": missing}
         copied.sentences.append(missing)
         return 0

@@ -105,19 +105,13 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
     Raises
     ------
     ExplorerError
-        If there is no such section, or the drive is a recording, which no orbit can follow on.
+        If there is no such section, or the run's motion has no orbits.
     ArithmeticError
         If the trajectory ends early.
     """
     explored = ExploredRun.of(run)
-    if run.spec.recorded is not None:
-        raise ExplorerError(
-            "the drive of this run is a recording, which does not repeat: no orbit is drawn from a section."
-        )
-    if run.spec.drift:
-        raise ExplorerError("a parameter of this run moves: no orbit is drawn from a section.")
-    if run.spec.noise is not None:
-        raise ExplorerError("the cells of this run have noise: no orbit without it is drawn from a section.")
+    if problem := run.spec.motion.refusal("an orbit"):
+        raise ExplorerError(f"{run.name}: {problem}")
     found = cell_of(explored, cell)
     section = found.section
     kept = np.isfinite(section).all(axis=1)

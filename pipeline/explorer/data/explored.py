@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from pipeline.layout.cells import CellMap, Inputs, parameter_axes
+from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
+from pipeline.motion.inputs import Inputs
 from pipeline.runs.derive import stored, stored_each
 from pipeline.specification.problems import unknown_name
 from pipeline.store.files import DERIVED
@@ -98,13 +99,13 @@ class ExploredRun(Run):
         with self._lock:
             key = f"derived {name}"
             if key not in self._opened:
-                self._opened[key] = None if self.spec.unsteady else stored(self, name)
+                self._opened[key] = stored(self, name)
             found: xr.Dataset | None = self._opened[key]
             return found
 
     def kept_each(self, name: str) -> list[xr.Dataset]:
         """Return all stored results of an analysis, such as one for each pair of attractors; see `stored_each`."""
-        return self.remembered(f"each {name}", lambda: [] if self.spec.unsteady else list(stored_each(self, name)))
+        return self.remembered(f"each {name}", lambda: list(stored_each(self, name)))
 
     def bifurcation_curves(self) -> xr.Dataset | None:
         """Return the stored bifurcation curves of this run, or of the other run named for them; None if there are

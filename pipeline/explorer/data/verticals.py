@@ -56,7 +56,7 @@ def _verticals(run: ExploredRun) -> list[Vertical]:
     model = run.model
     ordered = sorted(model.states, key=lambda s: s.name not in model.section_states)
     found = [Vertical(s.name, plain(s.symbol, s.name), s.unit, s.on_circle, "section", _state(s.name)) for s in ordered]
-    if not run.spec.unsteady:  # the drive of a recording is another one at each section, and so are moving parameters
+    if run.spec.motion.has_quantities:
         found += [
             Vertical(q.name, plain(q.symbol, q.name), q.unit, False, "section", _quantity(run, q.name))
             for q in model.quantities

@@ -195,11 +195,8 @@ def _drawing(run: ExploredRun) -> dict[str, Any] | None:
 
 def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
     if axis.name == FREQUENCY_DIM:
-        driven = not run.model.autonomous
-        label, unit = "drive frequency" if driven else "strobe frequency", "Hz"
-        meaning = label
-        if run.spec.recorded is not None:
-            label = meaning = "mean frequency of the recorded drive"
+        label = meaning = "strobe frequency" if run.model.autonomous else run.spec.motion.frequency_meaning
+        unit = "Hz"
     else:
         parameter = run.model.parameter(axis.parameter)
         label, unit = plain(parameter.symbol, parameter.name), parameter.unit
@@ -247,10 +244,8 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 def can_have(run: ExploredRun, name: str) -> bool:
     """Return whether an analysis suits a run, with its default options."""
-    if run.spec.unsteady:
-        return False
     analysis = ANALYSES[name]
-    if analysis.noisy != (run.spec.noise is not None):
+    if run.spec.motion.unsuited(analysis):
         return False
     try:
         prepared(AnalysedRun.of(run), analysis, analysis.options())

@@ -49,18 +49,8 @@ CLOSING_S = PATIENCE_S + 2.0
 
 def live_problem(run: Run) -> str | None:
     """Return the reason why trajectories of a run cannot be computed live; None if they can."""
-    if run.spec.recorded is not None:
-        return (
-            f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "
-            "go on where it ends; make a run at its mean frequency."
-        )
-    if run.spec.drift:
-        return f"{run.name}: {run.spec.unsteady}, and a live trajectory has constant parameters; make a run without it."
-    if run.spec.noise is not None:
-        return (
-            f"the cells of {run.name} have noise, and a live trajectory has none; make a run without [noise] to "
-            "explore its motions."
-        )
+    if problem := run.spec.motion.refusal("a live trajectory"):
+        return f"{run.name}: {problem}"
     try:
         run.model.flow.system  # noqa: B018
     except (ParameterError, ImportError) as error:

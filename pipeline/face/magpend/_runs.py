@@ -125,7 +125,7 @@ class Run(StoredRun):
             "  run.cube()                           the cube, an xarray.Dataset",
             f"  {call:36s} a figure; run.plot lists the others",
         )
-        if self.spec.noise is None and not self.spec.drift and self.spec.recorded is None:
+        if not self.spec.motion.obstacle:
             lines += ('  run.table("attractors")              what attracts, and what has been shown of it',)
         return lines
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 import tomllib
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,13 +15,15 @@ from pipeline.compute import integrate as branches
 from pipeline.compute import task
 from pipeline.compute.task import warm_up
 from pipeline.layout.cells import CellMap
-from pipeline.layout.plan import make_plan, seconds_per_period
+from pipeline.layout.plan import make_plan
 from pipeline.runs import estimate as estimates
 from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
 from pipeline.runs.preview import describe_plan
 from pipeline.specification.parsing import parse_spec
 from pipeline.store import commits
 from tests.pipeline.factories import duffing, quietly
+
+sections = import_module("magpend_core.sections")  # `magpend_core.sections` is a function
 
 CLOSING = duffing(
     "frequency_hz = { start = 0.15, stop = 0.25, num = 5 }",
@@ -54,7 +57,7 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
 
     def integrate(spec, inputs):
         values = original(spec, inputs)
-        a_period = seconds_per_period(inputs.frequency_hz, spec.integration.rtol)
+        a_period = spec.motion.seconds_per_period(inputs.frequency_hz)
         clock[0] += float((a_period * values["n_periods"]).sum())
         return values
 
@@ -103,16 +106,14 @@ def test_describe_plan__says_what_the_time_rests_on_and_what_is_left(write_spec,
 
 @pytest.mark.parametrize("stops", [True, False])
 def test_estimate__compiles_no_kernel_that_the_run_does_not_need(monkeypatch, stops):
-    from pipeline.compute import integrate
-
     asked = []
-    original = integrate.run_branches
+    original = sections.run_branches
 
     def run_branches(*arguments, **options):
         asked.append((options["stop_when_closed"], options.get("quantities")))
         return original(*arguments, **options)
 
-    monkeypatch.setattr(integrate, "run_branches", run_branches)
+    monkeypatch.setattr(sections, "run_branches", run_branches)
     text = CLOSING if stops else CLOSING.replace("= true", "= false")
     estimate(*read(text))
     assert set(asked) == {(stops, None)}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
 
 import numpy as np
 import pytest
 
-from magpend_core import Status
+from magpend_core import Status, extension
 from pipeline import open_run
-from pipeline.compute import exponents, extension, integrate, task
+from pipeline.compute import exponents, task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
@@ -17,6 +18,8 @@ from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from pipeline.store.run import Run
 from tests.pipeline.factories import duffing, quietly, silent
+
+sections = import_module("magpend_core.sections")  # `magpend_core.sections` is a function
 
 pytestmark = pytest.mark.slow
 
@@ -38,7 +41,7 @@ class Count:
 
     def __init__(self, monkeypatch):
         self.cells, self.tangents, self.more = 0, 0, 0
-        branches, tangents = integrate.run_branches, exponents.lyapunov_exponents
+        branches, tangents = sections.run_branches, exponents.lyapunov_exponents
 
         def run_branches(parameters, frequency, states, **options):
             self.cells += parameters.shape[0] * parameters.shape[1]
@@ -55,7 +58,7 @@ class Count:
             return more_sections(parameters, *words, **options)
 
         monkeypatch.setattr(extension, "more_sections", go_on)
-        monkeypatch.setattr(integrate, "run_branches", run_branches)
+        monkeypatch.setattr(sections, "run_branches", run_branches)
         monkeypatch.setattr(exponents, "lyapunov_exponents", lyapunov_exponents)
         monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
 

@@ -141,7 +141,7 @@ def test_run__tasks_do_not_change_the_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_derive__refuses_analyses_of_the_other_kind(directory: Path, tmp_path: Path) -> None:
-    with pytest.raises(SpecError, match="attractors assumes that the same state goes on in the same way"):
+    with pytest.raises(SpecError, match="its cells have noise; attractors needs a run without"):
         derive(directory, "attractors")
     plain = {k: v for k, v in spec(**SMALL).items() if k != "noise"}
     plain["axes"] = {"a": {"values": [1.0]}}

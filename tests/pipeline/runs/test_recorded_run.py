@@ -10,9 +10,9 @@ import pytest
 
 from magpend_core import load_preset
 from pipeline import open_run
-from pipeline.compute import integrate as branches
 from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
+from pipeline.motion.recorded import Recorded
 from pipeline.runs.derive import derive
 from pipeline.runs.drawing import figure
 from pipeline.runs.extend import extend
@@ -163,9 +163,11 @@ def test_run__damaged_drive_is_found_and_rebuilt(path, tmp_path, bytes_of):
 
 def test_derive__refuses_what_goes_on_beyond_the_recording(once):
     for name in ("attractors", "basins", "chaos", "settling"):
-        with pytest.raises(SpecError, match=rf"recording drive\.csv, which ends, but {name} integrates further"):
+        with pytest.raises(
+            SpecError, match=rf"recording drive\.csv, which ends; {name} needs a run at a fixed frequency"
+        ):
             derive(once / "run", name)
-    with pytest.raises(SpecError, match="integrates further"):
+    with pytest.raises(SpecError, match="attractors needs a run at a fixed frequency"):
         figure(once / "run", "gallery", {"at": {"q": 1.6}})
 
 
@@ -174,13 +176,13 @@ def test_extend__cells_under_the_same_recording(once, recorded, tmp_path, bytes_
     wider = recorded(RECORDED.replace("[0.6, 1.6]", "[0.6, 1.1, 1.6]"))
     quietly(wider, tmp_path / "fresh")
     calls = []
-    original = branches.under_recording
+    original = Recorded.integrate
 
-    def counted(drive, inputs, *how):
+    def counted(motion, inputs, quantities):
         calls.append(len(inputs.initial_states))
-        return original(drive, inputs, *how)
+        return original(motion, inputs, quantities)
 
-    monkeypatch.setattr(branches, "under_recording", counted)
+    monkeypatch.setattr(Recorded, "integrate", counted)
     monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
     extend(once / "run", wider, tmp_path / "new", workers=0, echo=silent)
     assert sum(calls) == 12

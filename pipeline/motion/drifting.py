@@ -1,0 +1,78 @@
+"""Integrate cells whose parameters move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from magpend_core.models.drift.ramps import Ramp
+from magpend_core.models.model import Parameters
+from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Steady, Values
+
+if TYPE_CHECKING:
+    from magpend_core.models.drift.sections import Drift
+    from magpend_core.sections import Sections
+
+
+@dataclass(frozen=True)
+class Drifting(Steady):
+    """Motion while parameters move.
+
+    Attributes
+    ----------
+    ramps : tuple of Ramp
+        How each parameter moves.
+    values : Parameters
+        Values of the parameters that are not swept.
+    corners : tuple of ndarray
+        Packed parameters and frequencies of cells at the ends of all axes.
+    """
+
+    ramps: tuple[Ramp, ...]
+    values: Parameters
+    corners: tuple[np.ndarray, np.ndarray]
+
+    kind: ClassVar[str] = "drifting"
+    has_quantities: ClassVar[bool] = False  # the parameters are others at each section
+
+    @property
+    def obstacle(self) -> str:
+        names = " and ".join(ramp.parameter for ramp in self.ramps)
+        words = f"parameter {names} moves" if len(self.ramps) == 1 else f"parameters {names} move"
+        return f"its {words} ([drift])"
+
+    @property
+    def needed(self) -> str:
+        return "a run with constant parameters, without [drift]"
+
+    def overview(self, *, is_swept: bool) -> str:
+        return "drift"
+
+    @cached_property
+    def drift(self) -> Drift:
+        """How the parameters move, for the numerical core."""
+        from magpend_core.models.drift.sections import Drift
+
+        return Drift.of(self.model.system, self.ramps, self.values.names, *self.corners)
+
+    def sections(
+        self, parameters: np.ndarray, frequency_hz: np.ndarray, starts: np.ndarray, **changed: Any
+    ) -> Sections:
+        """Integrate cells from time 0 with the settings of the run, or others that are given."""
+        from magpend_core.models.drift.sections import drifting_sections
+
+        return drifting_sections(
+            self.system, self.drift, parameters, frequency_hz, starts, **{**self.settings, **changed}
+        )
+
+    def integrate(self, inputs: Inputs, quantities: Sequence[str] | None) -> tuple[Sections, Values]:
+        cells = inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states
+        return self.sections(*cells, quantities=quantities), {}
+
+    def no_extension(self) -> str:
+        return "cells whose parameters move do not go on"
