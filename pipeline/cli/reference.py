@@ -1,4 +1,4 @@
-"""Write the tables of README and docs, and the methods of `magpend.Spec`, from the code.
+"""Write the tables of README and docs from the code.
 
 The command is ``python -m pipeline.cli.reference``.
 
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.reference_words import bounds_in_words, default_in_words
+from pipeline.specification.words import bounds_in_words, default_in_words
 
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)", re.DOTALL)
@@ -394,16 +394,13 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def stale() -> dict[Path, str]:
-    """Return the new texts of the pages and modules that are out of date, by path."""
-    from pipeline.cli import reference_spec
-
+    """Return the new texts of the pages that are out of date, by path."""
     texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
-    texts[reference_spec.MODULE] = reference_spec.module()
-    return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
+    return {path: text for path, text in texts.items() if path.read_text("utf-8") != text}
 
 
 def main() -> None:
-    """Rewrite the pages and modules that are out of date or, with ``--check``, list them."""
+    """Rewrite the pages that are out of date or, with ``--check``, list them."""
     check = "--check" in sys.argv[1:]
     found = stale()
     for path, text in found.items():
