@@ -42,7 +42,7 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
         rtol=integration.rtol,
         atol=integration.atol,
         max_steps_per_period=integration.max_steps_per_period,
-        system=job.system,
+        system=job.spec.motion.system,
         **options.model_dump(),
     )
     is_closed = cells.status[branch, point] == Status.PERIODIC
@@ -52,7 +52,7 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
         "lyapunov_stderr": found.stderr,
         "lyapunov_blocks": found.blocks,
         "divergence": found.divergence,
-        "lyapunov_flag": flags(found, is_flow=job.system.section is not None),
+        "lyapunov_flag": flags(found, is_flow=job.spec.motion.system.section is not None),
     }
     filled = {}
     for variable in LYAPUNOV_VARIABLES:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core import Sections, Status
-from magpend_core.engine.system import System
 from pipeline.layout.schema import REST_STATE, base_variables
 from pipeline.motion.inputs import Inputs
 from pipeline.products.product import function_of
@@ -31,11 +30,6 @@ class Job:
     spec: Spec
     inputs: Inputs
     cells: Sections
-
-    @property
-    def system(self) -> System:
-        """System of the run's model, with the integration method of the run."""
-        return self.spec.motion.system
 
 
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:

@@ -28,12 +28,12 @@ def rotation(job: Job, options: RotationOptions) -> dict[str, np.ndarray]:
     """
     cells, inputs, integration = job.cells, job.inputs, job.spec.integration
     branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))
-    names = job.system.state_names
+    names = job.spec.motion.system.state_names
     found = rotation_numbers(
         inputs.parameters[branch, point],
         inputs.frequency_hz[branch, point],
         cells.section[branch, point, -1],
-        system=job.system,
+        system=job.spec.motion.system,
         turning=TurningState(tuple(names.index(name) for name in options.of), options.center, options.section),
         n_periods=options.n_periods,
         orbit_period=np.where(options.section, 0, cells.orbit_period[branch, point]),

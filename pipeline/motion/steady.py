@@ -65,7 +65,6 @@ class Steady:
     """The kind of motion that an `Analysis` is for."""
 
     frequency_meaning: ClassVar[str] = "drive frequency"
-
     has_quantities: ClassVar[bool] = True
     """Whether the model's quantities follow from a section point."""
 
@@ -178,14 +177,12 @@ class Steady:
 
         Parameters
         ----------
-        inputs
-            Inputs of the cells, as branches of one point.
+        inputs, quantities
+            As for `integrate`, with branches of one point.
         stored
             Variables of the cells, with leading dims (branch, point).
         n_old
             Number of sections that the cells have.
-        quantities
-            Names of the quantities to watch.
 
         Returns
         -------

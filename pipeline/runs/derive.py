@@ -150,8 +150,8 @@ def derive(
         places["where"] = Where.of(scheduler)
         places["where"].resolved()
     run = AnalysedRun.of(source, echo, **places)
-    if problem := run.spec.motion.unsuited(analysis):
-        raise SpecError(f"{run.name}: {problem}")
+    if reason := run.spec.motion.unsuited(analysis):
+        raise SpecError(f"{run.name}: {reason}")
     is_chosen = name == "attractors" and bool(wanted.model_fields_set)
     if name == "attractors" and not is_chosen:
         wanted = attractor_options(run)

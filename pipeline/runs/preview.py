@@ -259,7 +259,8 @@ def times(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | Non
     compiled = f"; compiling its kernel took {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     whole = duration(found.core_seconds)
     rests = f"{found.how}; writing a task takes {1000 * writing_s:.0f} ms{compiled}"
-    more = f"; after it, analyse attractors may extend cells for up to {whole} of one core"
-    more = "" if spec.motion.obstacle else more
+    more = (
+        "" if spec.motion.obstacle else f"; after it, analyse attractors may extend cells for up to {whole} of one core"
+    )
     line = f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}){more}"
     return Times(seconds, by_clock, line)
