@@ -229,13 +229,16 @@ class Analysis:
     version: int = 1
 
 
+WIDTH: Any = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", ge=40.0, le=1000.0)
+
+
 class FigureOptions(Options):
     """Options that every figure has."""
 
     at: dict[str, float] = option({}, "Value of an axis that the figure does not show.")
     nearest: bool = option(False, "Use the axes' values nearest to --at, and print them; otherwise --at must match.")
     degrees: bool = option(False, "Use degrees instead of radians.")
-    width: float = option(178.0, "Width of the figure; 85 is a journal's column", unit="mm", ge=40.0, le=1000.0)
+    width: float = WIDTH
     xlim: tuple[float, float] | None = option(None, "Range of the horizontal axis, in its unit.")
     ylim: tuple[float, float] | None = option(None, "Range of the vertical axis, in its unit.")
     style: str | Path | list[str | Path | dict[str, Any]] | dict[str, Any] = option(
