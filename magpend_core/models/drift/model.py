@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.drift.ramps import Ramp, ramp_parameters
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Model
 from magpend_core.models.presets import Preset
 from magpend_core.versions import DRIFT, written
 
@@ -94,11 +94,3 @@ def drifting(model: Model, ramps: tuple[Ramp, ...]) -> DriftingModel:
     presets = tuple(with_numbers(p, ramps) for p in model.presets)
     changes: dict[str, Any] = {"parameters": (*model.parameters, *more), "presets": presets}
     return DriftingModel(**{**own, **changes}, still=model, ramps=ramps)
-
-
-def stilled(parameters: Parameters) -> Parameters:
-    """Return the parameters for the model without the motion of its parameters."""
-    model = parameters.model
-    if not isinstance(model, DriftingModel):
-        return parameters
-    return Parameters(model.still, {name: parameters[name] for name in model.still.parameter_names})
