@@ -318,5 +318,5 @@ def _make(name: str) -> Any:
 
 measured_app = command_group(
     "Diagrams and branches of recorded motions, beside and over computed ones.",
-    registry_group("measured", lambda: list(_COMMANDS), _make),
+    registry_group("measured", lambda: {"Commands": dict.fromkeys(_COMMANDS, "")}, _make),
 )

@@ -34,52 +34,22 @@ if TYPE_CHECKING:
 CHEAP = ("attractors", "hysteresis", "basins")
 """Analyses that a report computes by default."""
 
-SHOWN = (
-    "attractors",
-    "hysteresis",
-    "basins",
-    "branches",
-    "curves",
-    "orbits",
-    "manifolds",
-    "tangency",
-    "chaos",
-    "dimension",
-    "settling",
-    "escapes",
-    "density",
-)
-"""Analyses in the order of a report."""
-
-_HEADINGS = {
-    "hysteresis": "Hysteresis",
-    "basins": "Basins",
-    "branches": "Bifurcations",
-    "curves": "Curves of bifurcations",
-    "orbits": "Periodic orbits",
-    "manifolds": "Stable and unstable manifolds",
-    "tangency": "Homoclinic tangencies",
-    "chaos": "Regular and chaotic",
-    "dimension": "Dimensions",
-    "settling": "Transient or attractor",
-    "escapes": "Escapes",
-    "density": "Densities",
+SHOWN = {
+    "attractors": ("Attractors", ""),
+    "hysteresis": ("Hysteresis", "Jumps of the branches: the parameter values, and the attractors before and after"),
+    "basins": ("Basins", "Attractors on which the initial states of the grid end"),
+    "branches": ("Bifurcations", "Located bifurcations"),
+    "curves": ("Curves of bifurcations", "Points of codimension two on the curves of bifurcations"),
+    "orbits": ("Periodic orbits", "All periodic orbits found at a parameter point, stable or not"),
+    "manifolds": ("Stable and unstable manifolds", "Manifolds of the saddle orbits"),
+    "tangency": ("Homoclinic tangencies", "Parameter values at which manifolds of a saddle orbit first touch"),
+    "chaos": ("Regular and chaotic", "Kind of motion of each attractor"),
+    "dimension": ("Dimensions", "Correlation dimensions of the attractors that do not close"),
+    "settling": ("Transient or attractor", "Sets that do not close, and the results of extending their cells"),
+    "escapes": ("Escapes", "Rates at which cells with noise leave a set, and where they go"),
+    "density": ("Densities", "Moments and peaks of the density of section points"),
 }
-
-_CAPTIONS = {
-    "hysteresis": "Jumps of the branches: the parameter values, and the attractors before and after",
-    "basins": "Attractors on which the initial states of the grid end",
-    "branches": "Located bifurcations",
-    "curves": "Points of codimension two on the curves of bifurcations",
-    "orbits": "All periodic orbits found at a parameter point, stable or not",
-    "manifolds": "Manifolds of the saddle orbits",
-    "tangency": "Parameter values at which manifolds of a saddle orbit first touch",
-    "chaos": "Kind of motion of each attractor",
-    "dimension": "Correlation dimensions of the attractors that do not close",
-    "settling": "Sets that do not close, and the results of extending their cells",
-    "escapes": "Rates at which cells with noise leave a set, and where they go",
-    "density": "Moments and peaks of the density of section points",
-}
+"""Analyses in the order of a report: their headings, and the captions of their tables."""
 
 
 class Shown:
@@ -295,14 +265,14 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    for name in SHOWN[1:]:
-        if not _suits(shown, name):
+    for name, (heading, _) in SHOWN.items():
+        if name == "attractors" or not _suits(shown, name):
             continue
         known = shown.options_of(name)
         blocks: list[Block] = [] if known else [_missing(shown, name)]
         for options in known:
             blocks += _analysis(shown, name, options)
-        yield Part(_HEADINGS[name], blocks)
+        yield Part(heading, blocks)
 
 
 def _suits(shown: Shown, name: str) -> bool:
@@ -329,14 +299,14 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
-        yield grid_of(rows, _CAPTIONS[name], command)
+        yield grid_of(rows, SHOWN[name][1], command)
     else:
         yield Note("Nothing of this kind was found.", command)
     drawn = ANALYSES[name].figure
     if drawn and drawn not in ("attractors", "lyapunov"):
         at = {d: float(shown.cube[d].values[0]) for d in shown.axes} if drawn == "basins" else {}
         where = " at the first values of the axes" if any(shown.cube.sizes[d] > 1 for d in at) else ""
-        yield from _drawn(shown, drawn, f"{_CAPTIONS[name]}{where}", **options, **({"at": at} if at else {}))
+        yield from _drawn(shown, drawn, f"{SHOWN[name][1]}{where}", **options, **({"at": at} if at else {}))
 
 
 _OF_ATTRACTORS = {
