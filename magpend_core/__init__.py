@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from magpend_core.orbits import PeriodicOrbits, polish_orbits
     from magpend_core.pointwise import evaluate, jacobian, rates
     from magpend_core.sections import Sections, run_branches, sections
-    from magpend_core.source_digests import kernel_version
     from magpend_core.status import Status
     from magpend_core.trajectory import trajectory
 
@@ -40,7 +39,6 @@ __all__ = [
     "energy",
     "evaluate",
     "jacobian",
-    "kernel_version",
     "load_model",
     "load_preset",
     "lyapunov_exponents",
@@ -58,7 +56,6 @@ __all__ = [
 _HOMES = {
     "crossing": ("Crossing",),
     "lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
-    "source_digests": ("kernel_version",),
     "models": ("ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance"),
     "models.model": ("Model", "Parameters"),
     "models.parameters": ("ParameterError",),

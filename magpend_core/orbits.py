@@ -166,20 +166,6 @@ def section_map(
     return Returns(images, on_section_derivative(derivatives, slopes, crossed), cells.return_times[back, 0])
 
 
-def stroboscopic_map(
-    parameters: np.ndarray,
-    frequency_hz: np.ndarray,
-    points: np.ndarray,
-    n_periods: int,
-    *,
-    rtol: float = RTOL,
-    system: System = PENDULUM_FITTED,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the images of section points and the derivatives of the last images; see `section_map`."""
-    found = section_map(parameters, frequency_hz, points, n_periods, rtol=rtol, system=system)
-    return found.images, found.derivatives
-
-
 def crossed_state(system: System) -> int | None:
     """Return the index of the state whose crossings define the Poincare section; None for a driven system."""
     return None if system.section is None else system.section[0]

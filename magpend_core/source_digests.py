@@ -1,7 +1,7 @@
-"""Compute digests of source code, so that stored results can be compared with the current code.
+"""Compute digests of the source code of users' own models, so that stored results can be compared with it.
 
 Two sources mean the same if they differ in comments, docstrings, layout, or the wording of errors alone. A
-run that was begun with one is completed with the other.
+run that was begun with one is completed with the other. magpend's own code has numbers, see `magpend_core.versions`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parent
-_NOT_KERNEL = ("models",)  # a model has a digest of its own
 _WITHOUT_MEANING = ("type_comment", "kind", "ctx")
 
 
@@ -54,17 +52,6 @@ def _python_meaning(source: bytes) -> bytes:
     tokens: list[str] = []
     _write(ast.parse(source), tokens)
     return hashlib.sha256("".join(tokens).encode()).digest()
-
-
-@cache
-def kernel_version() -> str:
-    """Return a digest of the sources of the numerical core, models excluded; a run stores it as ``kernel_version``.
-
-    It follows the meaning of the sources (see `meaning_digest`): an edited sentence bars nobody from
-    completing a run.
-    """
-    own = (path for path in _PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir())
-    return meaning_digest(path for path in own if path.name not in _NOT_KERNEL)
 
 
 def _files(paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:

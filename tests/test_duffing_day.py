@@ -18,7 +18,6 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
 import magpend
-from pipeline.products.guide import FIGURE_GUIDE
 from pipeline.products.registry import COMMANDS, FIGURES
 
 SWEEP = """
@@ -301,7 +300,7 @@ TAKES = {"resilience": {f"sweep {POINT}"}, "rotation": {"sweep", f"sweep {LINE}"
 @pytest.mark.parametrize("name", FIGURES)
 def test_plot__refuses_runs_that_lack_what_the_guide_says(runs, day, name):
     """What the guide says suffices, too: see the runs of `PICTURES`, and below the plane of two parameters."""
-    (needs,) = [group[name] for group in FIGURE_GUIDE.values() if name in group]
+    (needs,) = [group[name] for group in FIGURES.groups.values() if name in group]
     fields = FIGURES[name].options.model_fields
     required = {key: value for key, value in REQUIRED.items() if key in fields}
     unfit = [run for words, some in UNFIT.items() if words in needs for run in some]

@@ -4,9 +4,8 @@ numba's own ``cache=True`` watches only the file of the cached function: after a
 the cached caller still returns the old result. Here the name of the cache folder contains a digest of all sources
 of ``magpend_core`` and the versions of numba and llvmlite, so that any edit starts an empty folder. Code that calls
 functions from outside the package has a subfolder, named by a digest of these functions and of all that they use
-(see `digests`). numba itself separates CPU models inside a folder. The digest is one of bytes, unlike
-`kernel_version`, which ignores comments: so no rule about what matters can let an old result through. The price is
-one compilation after an edit of a comment.
+(see `digests`). numba itself separates CPU models inside a folder. The digest is one of bytes: so no rule about what
+matters can let an old result through. The price is one compilation after an edit of a comment.
 
 Reading order: `inline` compiles helpers and the functions of a system. `bound_part` and `entry` compile the templates
 of the engine, with values for their free names. `keeping` says under which key the code may be cached.

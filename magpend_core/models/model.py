@@ -21,6 +21,7 @@ import numpy as np
 from magpend_core.models.parameters import Parameter, ParameterError, near_names, unknown_name_problem
 from magpend_core.models.presets import Preset as Preset
 from magpend_core.models.presets import completed, find_preset
+from magpend_core.versions import written
 
 if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
@@ -176,7 +177,9 @@ class Model:
     system_path : str
         ``module:attribute`` of the engine's `System`; imported when it is first needed.
     sources : tuple of Path
-        The files that decide what is integrated; `digest` covers them.
+        Files of a user's own model that decide what is integrated; `digest` covers them.
+    version : int
+        Number of the results of a model of magpend, see `magpend_core.versions`.
     section : str
         The instant of the drive's period at which sections are taken.
     quantities : tuple of Quantity
@@ -199,7 +202,8 @@ class Model:
     parameters: tuple[Parameter, ...]
     presets: tuple[Preset, ...]
     system_path: str
-    sources: tuple[Path, ...]
+    sources: tuple[Path, ...] = ()
+    version: int = 1
     section: str = "the start of the drive's period"
     quantities: tuple[Quantity, ...] = ()
     classifier: Classifier | None = None
@@ -304,10 +308,12 @@ class Model:
 
     @cached_property
     def digest(self) -> str:
-        """Return the digest of the model's source files, comments and docstrings left out."""
+        """Return the digest of the model: its version, and the source files of a user's own Python model, comments
+        and docstrings left out.
+        """
         from magpend_core.source_digests import meaning_digest
 
-        return meaning_digest(self.sources)
+        return meaning_digest(self.sources) if self.sources else written(self.name, self.version)
 
     def state(self, name: str) -> State:
         """Return a state by name; raises `ParameterError` with the nearest names if there is none."""

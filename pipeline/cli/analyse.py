@@ -9,7 +9,7 @@ import typer
 from pipeline.cli import console
 from pipeline.cli.analysing import show
 from pipeline.cli.common import Csv, Directory, Json, check_csv
-from pipeline.cli.groups import add_command, command_group, made, registry_group
+from pipeline.cli.groups import Groups, add_command, command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.running import ClusterFile, Workers
 
@@ -23,16 +23,10 @@ Scheduler = Annotated[
 ]
 
 
-def _names() -> list[str]:
-    from pipeline.products.registry import COMMANDS
+def _groups() -> Groups:
+    from pipeline.products.registry import ANALYSES
 
-    return list(COMMANDS)
-
-
-def _guide() -> Any:
-    from pipeline.products.guide import ANALYSIS_GUIDE
-
-    return ANALYSIS_GUIDE
+    return ANALYSES.groups
 
 
 def _make(name: str) -> Any:
@@ -60,7 +54,7 @@ def _make(name: str) -> Any:
 
 analyse_app = command_group(
     "Find attractors, basins, chaos and branches in a stored cube; results are kept in DIR/derived.",
-    registry_group("analyse", _names, _make, _guide),
+    registry_group("analyse", _groups, _make),
 )
 
 

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import read_pairs
-from pipeline.cli.models import DEFAULT, names
-from pipeline.cli.options import completing
+from pipeline.cli.common import PresetName, Set, read_pairs
+from pipeline.cli.models import DEFAULT
 from pipeline.cli.outputs import check_file
-from pipeline.cli.simulate import read_states
+from pipeline.cli.simulate import Frequency, ModelName, read_states
 
 if TYPE_CHECKING:
     from pipeline.runs.filming import Start
@@ -25,10 +24,14 @@ def animate(
         str | None, typer.Argument(metavar="[DIR]", help="Run directory, or s3://BUCKET/PREFIX.")
     ] = None,
     at: Annotated[
-        list[str] | None, typer.Option(metavar="AXIS=VALUE", help="Value of an axis: the parameter point to show.")
+        list[str] | None,
+        typer.Option(metavar="AXIS=VALUE", help="Value of an axis of the run, for the parameter point."),
     ] = None,
     nearest: Annotated[
-        bool, typer.Option("--nearest", help="Use the axes' values nearest to --at, and print them.")
+        bool,
+        typer.Option(
+            "--nearest", help="Use the axes' values nearest to --at, and print them; otherwise --at must match."
+        ),
     ] = False,
     attractor: Annotated[
         list[str] | None, typer.Option(metavar="LETTER", help="Attractor at the point; by default all, side by side.")
@@ -36,20 +39,10 @@ def animate(
     cell: Annotated[
         list[int] | None, typer.Option(metavar="N", help="Flat index of a cell of the run, to show instead.")
     ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help=f"Without a run: model by name, file or package.module:NAME. Default: {DEFAULT}.",
-            autocompletion=completing(names),
-        ),
-    ] = None,
-    frequency_hz: Annotated[
-        float | None, typer.Option("--frequency-hz", "--frequency", help="Without a run: frequency [Hz]. Default: 2.2.")
-    ] = None,
-    preset: Annotated[str | None, typer.Option(help="Without a run: parameter preset, or a preset's file.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Without a run: a parameter.")
-    ] = None,
+    model: ModelName = None,
+    frequency_hz: Frequency = None,
+    preset: PresetName = None,
+    settings: Set = None,
     transient: Annotated[int, typer.Option(help="For a start: periods before the film begins.")] = 0,
     seconds: Annotated[float | None, typer.Option(help="Length of the film [s]; else 8.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frames per second, GIF at most 50. Default: 25.")] = None,
@@ -72,9 +65,9 @@ def animate(
     """Draw moving motions as GIF, WebP or MP4: the model's drawing, and phase portraits.
 
     With a run, the film shows its attractors at a parameter point (--at) side by side, the cells that you
-    name with --cell, or your own start at that point. Without a run it shows a start of a model. Give a start
-    by the model's names: --NAME VALUE, or --NAME-deg VALUE for an angle or its rate; other states are 0. A
-    periodic motion gives a film without a jump. MP4 needs ffmpeg.
+    name with --cell, or your own start at that point. Without a run it shows a start of a model, which --model,
+    --frequency, --preset and --set choose. Give a start by the model's names: --NAME VALUE, or --NAME-deg VALUE
+    for an angle or its rate; other states are 0. A periodic motion gives a film without a jump. MP4 needs ffmpeg.
     """
     from pipeline.plots.files import save_data
     from pipeline.plots.films import film_problems, save_animation

@@ -26,6 +26,11 @@ Csv = Annotated[
     str | None,
     typer.Option("--csv", metavar="FILE", help="Write the table as CSV; - writes it to the standard output."),
 ]
+MAPPING = "Mapping file (TOML) from channels to states."
+PresetName = Annotated[
+    str | None, typer.Option(help="Parameter preset, or a preset's file, FILE.toml; by default the model's first.")
+]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
 PRINTED = "-"
 """Value of ``--csv`` and ``--json`` that stands for the standard output."""
 

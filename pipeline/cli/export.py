@@ -9,6 +9,7 @@ import typer
 
 from pipeline.cli import console
 from pipeline.cli.common import Directory
+from pipeline.cli.options import FORCE
 
 
 def export(
@@ -23,16 +24,12 @@ def export(
             metavar="OUT", help="Folder for a static web host instead, with the whole cube, loaded on demand."
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file, or a folder made by export.")] = False,
+    force: FORCE = False,
     quantity: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Additional quantity of the model for the vertical axis.")
     ] = None,
-    orbits: Annotated[
-        int, typer.Option(min=0, help="Largest number of orbits to integrate and include. Default: 2000.")
-    ] = 2000,
-    megabytes: Annotated[
-        float, typer.Option(min=1, max=100, help="Largest size of the single file [MB]. Default: 20.")
-    ] = 20.0,
+    orbits: Annotated[int, typer.Option(min=0, help="Largest number of orbits to integrate and include.")] = 2000,
+    megabytes: Annotated[float, typer.Option(min=1, max=100, help="Largest size of the single file [MB].")] = 20.0,
 ) -> None:
     """Write the interactive page of a run as files that need no magpend server, to send or publish.
 

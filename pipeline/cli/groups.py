@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -12,9 +12,7 @@ from typer.main import get_command
 from pipeline.cli.common import PRINTED, UsageError
 from pipeline.cli.options import Command, speaking
 
-if TYPE_CHECKING:
-    from pipeline.products.guide import Guide
-
+Groups = Mapping[str, Mapping[str, str]]
 SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 
@@ -67,12 +65,13 @@ class TopGroup(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-def registry_group(
-    verb: str, names: Callable[[], list[str]], make: Callable[[str], Any], guide: Callable[[], Guide] = dict
-) -> type[TyperGroup]:
-    """Make a class of command groups, from functions that list command names, create a command, and tell what each
-    command needs.
+def registry_group(verb: str, groups: Callable[[], Groups], make: Callable[[str], Any]) -> type[TyperGroup]:
+    """Make a class of command groups from a function that lists the commands, in groups with what each needs, and one
+    that creates a command.
     """
+
+    def names() -> list[str]:
+        return [name for group in groups().values() for name in group]
 
     class Group(TyperGroup):
         def list_commands(self, ctx: Any) -> list[str]:
@@ -83,12 +82,10 @@ def registry_group(
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             """Write the commands in groups, each with the run that it needs."""
-            told = guide()
-            others = [name for name in self.list_commands(ctx) if not any(name in needs for needs in told.values())]
-            for title, needs in {**told, "Others" if told else "Commands": dict.fromkeys(others, "")}.items():
-                if needs:
-                    with formatter.section(title):
-                        formatter.write_dl([(name, self._about(ctx, name, words)) for name, words in needs.items()])
+            others = dict.fromkeys(super().list_commands(ctx), "")
+            for title, needs in {**groups(), **({"Others": others} if others else {})}.items():
+                with formatter.section(title):
+                    formatter.write_dl([(name, self._about(ctx, name, words)) for name, words in needs.items()])
 
         def _about(self, ctx: Any, name: str, needs: str) -> str:
             summary = self.get_command(ctx, name).get_short_help_str(200)

@@ -13,7 +13,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import PRINTED, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
+from pipeline.cli.common import (
+    MAPPING,
+    PRINTED,
+    Csv,
+    Directory,
+    Json,
+    PresetName,
+    Set,
+    check_csv,
+    json_rows,
+    read_pairs,
+    tell,
+    tell_data,
+)
 from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import drawing, taking
 from pipeline.cli.outputs import check_file, check_place
@@ -29,11 +42,7 @@ if TYPE_CHECKING:
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of sweeps of the drive frequency.")
 ]
-Mappings = Annotated[
-    list[Path], typer.Option("--mapping", metavar="MAP", help="Mapping file, one for all recordings or one for each.")
-]
-Preset = Annotated[str | None, typer.Option(help="Preset of the parameters; by default the model's first.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
+Mappings = Annotated[list[Path], typer.Option("--mapping", metavar="MAP", help=f"{MAPPING} One for all, or for each.")]
 
 
 def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
@@ -85,7 +94,7 @@ def steps(
     recordings: Recordings,
     mapping: Mappings,
     options: Any,
-    preset: Preset = None,
+    preset: PresetName = None,
     settings: Set = None,
     csv: Csv = None,
     as_json: Json = None,
@@ -183,10 +192,10 @@ def compare(
 
 def series(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording with a drive.")],
-    mapping: Annotated[Path, typer.Option("--mapping", metavar="MAP", help="Mapping file.")],
-    out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg; the series goes beside it.")],
+    mapping: Annotated[Path, typer.Option(metavar="MAP", help=MAPPING)],
+    out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg.")],
     options: Any,
-    preset: Preset = None,
+    preset: PresetName = None,
     settings: Set = None,
 ) -> None:
     """Draw a recording and the model from the same state: time series and phase portraits."""
@@ -309,5 +318,5 @@ def _make(name: str) -> Any:
 
 measured_app = command_group(
     "Diagrams and branches of recorded motions, beside and over computed ones.",
-    registry_group("measured", lambda: list(_COMMANDS), _make),
+    registry_group("measured", lambda: {"Commands": dict.fromkeys(_COMMANDS, "")}, _make),
 )

@@ -32,13 +32,6 @@ IMPORT = Annotated[
         metavar="MODULE:NAME", help="Import this Python object, the model of a run; otherwise nothing is imported."
     ),
 ]
-STYLE = Annotated[
-    str | None,
-    typer.Option(metavar="TEXT", help="Style of matplotlib that changes magpend's: its name, or a style file."),
-]
-DPI = Annotated[
-    float | None, typer.Option(min=20.0, max=2400.0, metavar="X", help="Resolution of figures [1/in]; by default 200.")
-]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
 _IMPORTED = "import_model"
@@ -69,17 +62,17 @@ def speaking(command: Command) -> Command:
 
 def drawing(command: Command) -> Command:
     """Wrap a command that draws figures so that it has the options ``--style`` and ``--dpi``."""
+    from pipeline.products.product import FigureOptions
 
     def run(*args: Any, style: str | None, dpi: float | None, **given: Any) -> None:
-        if style is None and dpi is None:
-            command(*args, **given)
-            return
         from pipeline.plots import looks
+        from pipeline.specification.problems import validated
 
-        with looks.given(style or "", dpi):
+        looked = validated(FigureOptions, {"style": style or "", "dpi": dpi})
+        with looks.given(looked.style, looked.dpi):
             command(*args, **given)
 
-    return _signed(run, command, [*_own(command), _keyword("style", STYLE, None), _keyword("dpi", DPI, None)])
+    return _signed(run, command, [*_own(command), *(_parameter(FigureOptions, name) for name in ("style", "dpi"))])
 
 
 def taking(model: type[Options], command: Command) -> Command:

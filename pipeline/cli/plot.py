@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.cli import console
 from pipeline.cli.common import Directory
-from pipeline.cli.groups import command_group, made, registry_group
+from pipeline.cli.groups import Groups, command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.outputs import check_file
 
@@ -19,16 +19,10 @@ if TYPE_CHECKING:
 SUFFIXES = (".png", ".pdf", ".svg")
 
 
-def _names() -> list[str]:
+def _groups() -> Groups:
     from pipeline.products.registry import FIGURES
 
-    return list(FIGURES)
-
-
-def _guide() -> Any:
-    from pipeline.products.guide import FIGURE_GUIDE
-
-    return FIGURE_GUIDE
+    return FIGURES.groups
 
 
 def _make(name: str) -> Any:
@@ -43,7 +37,7 @@ def _make(name: str) -> Any:
 
 
 plot_app = command_group(
-    "Draw figures from a stored cube; no cell is computed again.", registry_group("plot", _names, _make, _guide)
+    "Draw figures from a stored cube; no cell is computed again.", registry_group("plot", _groups, _make)
 )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import Json, json_rows, tell, tell_data
+from pipeline.cli.common import MAPPING, Json, json_rows, tell, tell_data
 from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.options import drawing
 from pipeline.cli.outputs import check_file, check_place
@@ -23,18 +23,18 @@ Window = Annotated[
     tuple[float, float] | None,
     typer.Option(metavar="FROM TO", help="Part of the recording [s since its first sample]."),
 ]
+Smooth = Annotated[bool, typer.Option("--smooth", help="Take smoothed states, and the rates from them.")]
+SmoothingWindow = Annotated[float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")]
 
 recordings_app = command_group("Recordings of a rig: show a file's content and findings, convert it, simulate one.")
 
 
 def show(
     file: File,
-    mapping: Annotated[Path | None, typer.Option(help="Mapping (TOML) from channels to states.")] = None,
+    mapping: Annotated[Path | None, typer.Option(metavar="MAP", help=MAPPING)] = None,
     window: Window = None,
-    smooth: Annotated[bool, typer.Option("--smooth", help="Draw smoothed states and the rates from them.")] = False,
-    smoothing_window: Annotated[
-        float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
-    ] = None,
+    smooth: Smooth = False,
+    smoothing_window: SmoothingWindow = None,
     out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
     as_json: Json = None,
 ) -> None:
@@ -64,12 +64,10 @@ def show(
 def convert(
     file: File,
     out: Annotated[Path, typer.Option(help="File to write: .tdms, .csv or .nc.")],
-    mapping: Annotated[Path, typer.Option(help="Mapping (TOML) from channels to states.")],
+    mapping: Annotated[Path, typer.Option(metavar="MAP", help=MAPPING)],
     window: Window = None,
-    smooth: Annotated[bool, typer.Option("--smooth", help="Write smoothed states, and the rates from them.")] = False,
-    smoothing_window: Annotated[
-        float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
-    ] = None,
+    smooth: Smooth = False,
+    smoothing_window: SmoothingWindow = None,
 ) -> None:
     """Convert a recording to SI units and another file format; for TDMS and CSV also write its mapping file."""
     from pipeline.rig.recordings import mapping_for, write_recording
@@ -113,7 +111,7 @@ def simulate(
 
 def drive(
     file: File,
-    mapping: Annotated[Path, typer.Option(help="Mapping (TOML) that names the drive's channel.")],
+    mapping: Annotated[Path, typer.Option(metavar="MAP", help=MAPPING)],
     kind: Annotated[
         Literal["edges", "torque"], typer.Option(help="Content: the times at which the drive switches, or its values.")
     ] = "edges",

@@ -1,4 +1,4 @@
-"""Write the tables of README and docs, and the methods of `magpend.Spec`, from the code.
+"""Write the tables of README and docs from the code.
 
 The command is ``python -m pipeline.cli.reference``.
 
@@ -12,12 +12,14 @@ import inspect
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.reference_words import bounds_in_words, default_in_words
+from pipeline.specification.words import bounds_in_words, default_in_words
 
+Row = tuple[str, str]
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)", re.DOTALL)
 
@@ -48,37 +50,87 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def commands() -> str:
-    """Return the Markdown table of all commands, with one line for each."""
-    rows = ((f"`magpend {name}{_arguments(command)}`", _first(command)) for name, command in _commands())
-    return table(("command", "does"), rows)
-
-
-SHARED = ("plot fractions", "analyse branches", "analyse hysteresis")
-"""Commands whose options other commands have, too. The options are listed only with these commands."""
-
-
-def options() -> str:
-    """Return the Markdown text that describes every command, with a table of its options."""
-    found, parts = dict(_commands()), []
-    listed = {name: dict(_options(found[name])) for name in SHARED}
-    for name, command in found.items():
-        own, also = dict(_options(command)), list[str]()
-        for other in SHARED:
-            if other != name and listed[other].items() <= own.items():
-                also.append(f"`magpend {other}`")
-                own = {flag: text for flag, text in own.items() if flag not in listed[other]}
-        paragraphs = "\n\n".join(" ".join(p.split()) for p in (command.help or "").split("\n\n"))
-        part = f"### `magpend {name}{_arguments(command)}`\n\n{_text(paragraphs)}"
-        part += f"\n\nTakes the options of {' and '.join(also)}{', and:' if own else '.'}" if also else ""
-        parts.append(part + (f"\n\n{table(('option', 'meaning'), own.items())}" if own else ""))
+    """Return the Markdown text on all commands: the options that several share, then a section for each group with its
+    commands and their own options.
+    """
+    found = dict(_commands())
+    listed = {name: _options(command) for name, command in found.items()}
+    among = Counter(row for rows in listed.values() for row in rows)
+    own = {name: [row for row in rows if among[row] < _EVERYWHERE] for name, rows in listed.items()}
+    bases = {name: _bases(name, own) for name in own}
+    for name, others in bases.items():
+        covered = {row for other in others for row in listed[other]}
+        own[name] = [row for row in own[name] if row not in covered]
+    again = Counter(row for rows in own.values() for row in rows)
+    takers = {row: _takers([n for n in found if row in listed[n]], found) for row in among}
+    shared = [(row[0], takers[row], row[1]) for row in sorted(among) if among[row] >= _EVERYWHERE or again[row] > 1]
+    parts = [f"### Options of several commands\n\n{table(('option', 'commands', 'meaning'), shared)}"]
+    for group, names in _groups(found).items():
+        does, rows = [], []
+        for name in names:
+            takes = " and ".join(f"`{other}`" for other in bases[name])
+            does.append((f"`magpend {name}{_arguments(found[name])}`", _does(found[name], takes)))
+            rows += [(f"`{name}`", *row) for row in own[name] if again[row] == 1]
+        parts.append(f"### {group}\n\n{table(('command', 'does'), does)}")
+        parts += [table(("command", "option", "meaning"), rows)] if rows else []
     return "\n\n".join(parts)
 
 
-def _options(command: Any) -> list[tuple[str, str]]:
+_EVERYWHERE = 10
+"""Number of commands from which on an option says nothing about a command."""
+
+_COMMON = ("help", "quiet", "verbose", "log", "force", "import_model")
+"""Options of every command, which the page describes above its tables."""
+
+
+def _bases(name: str, own: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return the commands all whose options a command has, too: the largest, of the equal ones the first."""
+    order = list(own)
+    smaller = [
+        other
+        for other, rows in own.items()
+        if len(rows) > 1
+        and (set(rows) < set(own[name]) or (set(rows) == set(own[name]) and order.index(other) < order.index(name)))
+    ]
+    found: list[str] = []
+    for other in sorted(smaller, key=lambda other: -len(own[other])):
+        if not set(own[other]) <= {row for one in found for row in own[one]}:
+            found.append(other)
+    return found
+
+
+def _groups(found: Mapping[str, Any]) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name in found:
+        first, _, inner = name.partition(" ")
+        groups.setdefault(f"`magpend {first}`" if inner else "Runs, models and reports", []).append(name)
+    return groups
+
+
+def _takers(names: Sequence[str], found: Mapping[str, Any]) -> str:
+    """Return the names of commands as text; a group's name stands for all its commands."""
+    parts = []
+    for members in _groups(found).values():
+        having, first = [name for name in members if name in names], members[0].partition(" ")[0]
+        lacking = [name for name in members if name not in names]
+        if len(having) > 9 and " " in members[0]:
+            but = f" but {', '.join(f'`{name}`' for name in lacking)}" if lacking else ""
+            parts.append(f"all of `{first}`{but}")
+        else:
+            parts += [f"`{name}`" for name in having]
+    return ", ".join(parts)
+
+
+def _does(command: Any, takes: str) -> str:
+    text = _text(" ".join((command.help or "").split()))
+    return f"{text} Takes the options of {takes}." if takes else text
+
+
+def _options(command: Any) -> list[Row]:
     return [
         (f"`{', '.join((*p.opts, *p.secondary_opts))}{_metavar(p)}`", _help(p))
         for p in command.params
-        if p.param_type_name == "option" and p.name not in ("help", "quiet", "verbose", "log", "import_model")
+        if p.param_type_name == "option" and p.name not in _COMMON
     ]
 
 
@@ -115,12 +167,12 @@ def _metavar(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    has_default = isinstance(parameter.default, (int, float, str, Path)) and parameter.default is not False
+    has_default = (
+        parameter.default != ""
+        and isinstance(parameter.default, (int, float, str, Path))
+        and parameter.default is not False
+    )
     return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
-
-
-def _first(command: Any) -> str:
-    return _text(" ".join((command.help or "").split("\n\n")[0].split()))
 
 
 def _text(text: str) -> str:
@@ -373,7 +425,6 @@ def measured_branch() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "commands": commands,
-    "options": options,
     "exit codes": exit_codes,
     "workflows": workflows,
     "specification": specification,
@@ -394,16 +445,13 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def stale() -> dict[Path, str]:
-    """Return the new texts of the pages and modules that are out of date, by path."""
-    from pipeline.cli import reference_spec
-
+    """Return the new texts of the pages that are out of date, by path."""
     texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
-    texts[reference_spec.MODULE] = reference_spec.module()
-    return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
+    return {path: text for path, text in texts.items() if path.read_text("utf-8") != text}
 
 
 def main() -> None:
-    """Rewrite the pages and modules that are out of date or, with ``--check``, list them."""
+    """Rewrite the pages that are out of date or, with ``--check``, list them."""
     check = "--check" in sys.argv[1:]
     found = stale()
     for path, text in found.items():

@@ -54,26 +54,25 @@ ClusterFile = Annotated[
 Dashboard = Annotated[
     bool, typer.Option("--dashboard", help="With a dask scheduler: serve its dashboard, and print the address.")
 ]
+Out = Annotated[str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")]
+Smoke = Annotated[bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")]
+Analyses = Annotated[str, typer.Option(metavar="NAMES", help="Analyse the finished run, such as attractors,basins.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Describe the work; create nothing.")]
 
 
 def run(
     spec: Spec,
-    out: Annotated[str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")] = None,
+    out: Out = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
     dashboard: Dashboard = False,
     dry_run: DryRun = False,
-    smoke: Annotated[
-        bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
-    ] = False,
+    smoke: Smoke = False,
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map.")
     ] = False,
-    analyse: Annotated[
-        str, typer.Option(metavar="NAMES", help="Analyse the finished run, such as attractors,basins.")
-    ] = "",
+    analyse: Analyses = "",
     posterior: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Run once for each draw of the posterior of an identification.")
     ] = None,

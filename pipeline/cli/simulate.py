@@ -10,7 +10,7 @@ import typer
 
 from magpend_core.defaults import ATOL, RTOL
 from pipeline.cli import console
-from pipeline.cli.common import read_pairs
+from pipeline.cli.common import PresetName, Set, read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
 from pipeline.cli.outputs import check_file
@@ -21,36 +21,35 @@ if TYPE_CHECKING:
 
 DEFAULT_HZ = 2.2
 
+ModelName = Annotated[
+    str | None,
+    typer.Option(
+        help=f"Model: a name (see magpend models), a file with its text, or package.module:NAME; by default {DEFAULT}.",
+        autocompletion=completing(names),
+    ),
+]
+Frequency = Annotated[
+    float | None,
+    typer.Option(
+        "--frequency-hz",
+        "--frequency",
+        help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}. Without a drive a period is 1 s.",
+    ),
+]
+
 EXTRA = {"ignore_unknown_options": True, "allow_extra_args": True}
 """Settings for commands whose options include a model's states by name."""
 
 
 def simulate(
     context: typer.Context,
-    model: Annotated[
-        str,
-        typer.Option(
-            help="Model: a name (see magpend models), a file with its text, or package.module:NAME.",
-            autocompletion=completing(names),
-        ),
-    ] = DEFAULT,
-    frequency_hz: Annotated[
-        float | None,
-        typer.Option(
-            "--frequency-hz",
-            "--frequency",
-            help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}. Without a drive a period is 1 s.",
-        ),
-    ] = None,
+    model: ModelName = None,
+    frequency_hz: Frequency = None,
     drive: Annotated[
         Path | None, typer.Option(help="Drive file with a recorded drive (see magpend recordings drive).")
     ] = None,
-    preset: Annotated[
-        str | None, typer.Option(help="Parameter preset, or a preset's file, FILE.toml; by default the model's first.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
-    ] = None,
+    preset: PresetName = None,
+    settings: Set = None,
     transient: Annotated[int, typer.Option(help="Drive periods before the series begins.")] = 0,
     periods: Annotated[
         int | None, typer.Option(help="Drive periods of the series; by default 10, or all that a drive file has.")
@@ -76,7 +75,7 @@ def simulate(
     from pipeline.specification.models import find_model
     from pipeline.store.provenance import provenance, versions
 
-    chosen = find_model(model, at="--model")
+    chosen = find_model(model or DEFAULT, at="--model")
     check_new_file(out, simulation.SUFFIXES)
     check_file(out)
     target = figure or out.with_suffix(".png")

@@ -9,12 +9,12 @@ import typer
 
 from pipeline.cli.common import Json, tell_data
 from pipeline.cli.outputs import check_file
-from pipeline.cli.running import Spec
+from pipeline.cli.running import Analyses, Out, Smoke, Spec
 
 
 def submit(
     spec: Spec,
-    out: Annotated[str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")] = None,
+    out: Out = None,
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -35,12 +35,8 @@ def submit(
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the job file to FILE, and send nothing.")
     ] = None,
-    smoke: Annotated[
-        bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
-    ] = False,
-    analyse: Annotated[
-        str, typer.Option(metavar="NAMES", help="Analyse the finished run in the same job, such as attractors,basins.")
-    ] = "",
+    smoke: Smoke = False,
+    analyse: Analyses = "",
     json: Json = None,
 ) -> None:
     """Submit a specification as a job of SLURM, PBS, Torque, Grid Engine or LSF, and print commands to watch and cancel

@@ -12,21 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
+from pipeline.specification.batch_systems import SYSTEMS, TORQUE_RESOURCES
 from pipeline.specification.clusters import Cluster, hours_and_minutes, refuse_breaks
 from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 
 JOB_NAME = "magpend-worker"
-_CLASSES = {
-    "slurm": "SLURMCluster",
-    "pbs": "PBSCluster",
-    "torque": "PBSCluster",
-    "sge": "SGECluster",
-    "lsf": "LSFCluster",
-}
-COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "torque": "qsub", "sge": "qsub", "lsf": "bsub"}
-"""Commands that submit a batch script."""
-
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
 _MEANWHILE_S = 60
 _TARGET = "0.1 s"
@@ -42,9 +33,10 @@ def check_means(cluster: Cluster) -> None:
         If an extra is not installed or a command is not found; the message names it.
     """
     import_extra("dask_jobqueue", "cluster", cluster.kind)
-    if not shutil.which(COMMANDS[cluster.kind]):
+    command = SYSTEMS[cluster.kind].send[0]
+    if not shutil.which(command):
         raise SpecError(
-            f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; use a machine that "
+            f"{cluster.kind}: there is no command {command!r} here; use a machine that "
             "sends jobs, such as the login node."
         )
 
@@ -96,13 +88,10 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
     if cluster.kind == "lsf":
         found["lsf_units"] = "mb"
     if cluster.kind == "torque":  # `select` is PBS Professional's; Torque has nodes and ppn
-        found["resource_spec"] = torque_resources(cluster.cores, cluster.memory_bytes)
+        found["resource_spec"] = TORQUE_RESOURCES.format(
+            cores=cluster.cores, mebibytes=-(-cluster.memory_bytes // 2**20)
+        )
     return {name: value for name, value in found.items() if value is not None}
-
-
-def torque_resources(cores: int, memory_bytes: int) -> str:
-    """Return the resources of a job on one node as Torque's ``qsub -l`` takes them."""
-    return f"nodes=1:ppn={cores},mem={-(-memory_bytes // 2**20)}mb"
 
 
 def worker_script(cluster: Cluster, folder: Path) -> str:
@@ -126,13 +115,13 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
     dask_jobqueue = import_extra("dask_jobqueue", "cluster", cluster.kind)
     from distributed import Security
 
-    kind = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
+    kind = getattr(dask_jobqueue, SYSTEMS[cluster.kind].jobqueue).job_cls
     keys = f"{folder}/.keys-OF-THIS-RUN"
     # dask-jobqueue creates the folder of the logs when it writes a script
     with tempfile.TemporaryDirectory(prefix="magpend-script-") as logs:
         job = kind(
             scheduler="tls://COORDINATOR:PORT",
-            name=f"{_CLASSES[cluster.kind]}-NUMBER",
+            name=f"{SYSTEMS[cluster.kind].jobqueue}-NUMBER",
             protocol="tls://",
             security=Security(  # type: ignore[no-untyped-call]
                 require_encryption=True,
@@ -180,7 +169,7 @@ def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callab
     import dask_jobqueue
 
     folder.mkdir(parents=True, exist_ok=True)
-    kind = getattr(dask_jobqueue, _CLASSES[cluster.kind])
+    kind = getattr(dask_jobqueue, SYSTEMS[cluster.kind].jobqueue)
     with tempfile.TemporaryDirectory(prefix=".keys-", dir=folder) as keys:
         options = {"dashboard": dashboard, "dashboard_address": "127.0.0.1:0"}
         try:

@@ -10,17 +10,17 @@ import uuid
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
+from magpend_core.versions import ENGINE
 from pipeline.compute.addresses import SchedulerError
+from pipeline.layout.identity import CELLS
 from pipeline.layout.writing import TEMPORARY
 from pipeline.store.errors import StoreError
 from pipeline.store.files import COMMITS
 from pipeline.store.places import open_files
 
 PACKAGES = ("numpy", "numba", "zarr", "numcodecs", "dask", "distributed")
-_ROOMS = ("specification", "layout", "products", "compute", "store")
 _SHOWN = 3
 _LATE_S, _AGAIN_S = 5.0, 0.2
 """Longest wait for a new file on a network's file system, and time between two looks [s]."""
@@ -28,18 +28,15 @@ _LATE_S, _AGAIN_S = 5.0, 0.2
 
 @cache
 def installation() -> dict[str, str]:
-    """Return the versions of Python and of the installed packages, and digests of magpend's own code."""
-    from magpend_core.source_digests import kernel_version, meaning_digest
-
-    pipeline = Path(__file__).parents[1]
+    """Return the versions of Python and of the installed packages, and the numbers of magpend's own versions."""
     found = {"Python": ".".join(platform.python_version_tuple()[:2])}
-    for name in PACKAGES:
+    for name in ("magpend", *PACKAGES):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             found[name] = "none"
-    found["magpend's kernel"] = kernel_version()
-    found["magpend's code"] = meaning_digest(pipeline / room for room in _ROOMS)
+    found["magpend's engine"] = str(ENGINE)
+    found["magpend's cells"] = str(CELLS)
     return found
 
 

@@ -18,7 +18,7 @@ from magpend_core import Sections, Status
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
-from pipeline.layout.identity import code_version
+from pipeline.layout.first_versions import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
 from pipeline.motion.inputs import Inputs
@@ -119,17 +119,13 @@ class Source:
 
 
 def same_products(run: Run, wanted: Spec) -> list[str]:
-    """Return those products of a specification that a run has already computed with the same options and code."""
-    code = run.info.identity["code"]
+    """Return those products of a specification that a run has already computed with the same options and version."""
+    versions = numbered(run.info.identity)["versions"]
     return [
         name
         for name, options in wanted.products.items()
-        if run.spec.products.get(name) == options and code.get(_module(name)) == code_version(_module(name))
+        if run.spec.products.get(name) == options and versions.get(name) == CELL_PRODUCTS[name].version
     ]
-
-
-def _module(product: str) -> str:
-    return CELL_PRODUCTS[product].compute.partition(":")[0].removeprefix("pipeline.")
 
 
 def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:

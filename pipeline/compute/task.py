@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core import Status, kernel_version
+from magpend_core import Status
 from magpend_core.engine.threads import using_threads
 from magpend_core.models import import_model
 from pipeline.compute.continuation import WALKED, going_on
@@ -23,7 +23,8 @@ from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap
-from pipeline.layout.identity import differences, digest_of, identity_of
+from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import differences, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.motion.inputs import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
@@ -47,9 +48,9 @@ def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tup
     info = read_run(directory)
     spec = kept_spec(info.spec)
     plan = make_plan(spec)
-    identity = identity_of(spec, plan, kernel_version())
-    if digest != info.digest or digest_of(identity) != digest:
-        why = "; ".join(differences(info.identity, identity)) or "another run was begun in the directory"
+    different = differences(numbered(info.identity), identity_of(spec, plan))
+    if digest != info.digest or different:
+        why = "; ".join(different) or "another run was begun in the directory"
         raise RefusedError(
             f"{directory}: this worker's magpend would not compute the same run ({why}); "
             "install the same version everywhere."

@@ -8,30 +8,23 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from magpend_core.source_digests import meaning_digest
+from magpend_core.versions import ENGINE
 from pipeline.layout.cells import coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.schema import FORMAT, REFINEMENT
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 
-_PIPELINE = Path(__file__).parents[1]
-CODE = ("motion.steady", "layout.cells", "compute.integrate", "compute.task")
-"""Modules of the pipeline that decide the numbers of every task.
-
-Modules for refined grids and for products are added where they are used. The numerical core and the model
-have their own versions.
-"""
+CELLS = 1
+"""Number of what turns a specification into cells: inputs, motions, refined grids. See `magpend_core.versions`."""
 
 
-def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
-    """Return all data that determine the bytes of a run's store: specification, parameters, layout, kernel, code.
+def identity_of(spec: Spec, plan: Plan) -> dict[str, Any]:
+    """Return all data that determine the bytes of a run's store: specification, parameters, layout, versions.
 
     The title and ``[execution]`` are left out; the chunks that follow from ``[execution]`` are included. So
     is a digest of the coordinates, the numbers that ranges and seeds stand for.
@@ -45,8 +38,7 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
     return {
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
-        "kernel_version": kernel_version,
-        "code": {name: code_version(name) for name in code_of(spec)},
+        "versions": versions_of(spec),
         "spec": tables,
         "model_digest": spec.model.digest,
         "parameter_values": spec.values.as_dict(),
@@ -65,21 +57,10 @@ def _coordinates_digest(spec: Spec) -> str:
     return digest.hexdigest()[:16]
 
 
-def code_of(spec: Spec) -> list[str]:
-    """Return the pipeline modules whose code determines the numbers that a run's tasks compute."""
-    products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
-    refined = ["compute.refinement"] if spec.refine is not None else []
-    walked = ["compute.continuation"] if spec.continuation is not None else []
-    driven = ["motion.recorded", "specification.drive_files"] if spec.drive is not None else []
-    driven += ["motion.drifting", "specification.drift"] if spec.drift else []
-    noisy = ["motion.noisy"] if spec.noise is not None else []
-    return [*CODE, *refined, *walked, *driven, *noisy, *(module.removeprefix("pipeline.") for module in products)]
-
-
-@lru_cache
-def code_version(module: str) -> str:
-    """Return a digest of a module's code that ignores comments and docstrings; see `magpend_core.source_digests`."""
-    return meaning_digest([_PIPELINE / f"{module.replace('.', '/')}.py"])
+def versions_of(spec: Spec) -> dict[str, int]:
+    """Return the numbers of the versions that decide the numbers of a run."""
+    products = {name: CELL_PRODUCTS[name].version for name in spec.products}
+    return {"engine": ENGINE, "cells": CELLS, **products}
 
 
 def canonical(data: Any) -> str:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.layout.cells import InitialStates, initial_states, parameter_axes
-from pipeline.layout.identity import CODE, differences
+from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import differences
 from pipeline.motion.inputs import Inputs
 from pipeline.specification.noise import NoiseTable
 from pipeline.specification.parsing import Spec
@@ -22,16 +23,6 @@ from pipeline.specification.tables import FREQUENCY
 
 NOWHERE = -1
 """Index that stands for a cell that the run does not have."""
-
-_CODE = (
-    *CODE,
-    "compute.continuation",
-    "motion.recorded",
-    "specification.drive_files",
-    "motion.drifting",
-    "specification.drift",
-    "motion.noisy",
-)
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -43,8 +34,8 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
     spec = identity["spec"]
     integration = {name: value for name, value in spec["integration"].items() if name != "n_keep"}
     return {
-        **{key: identity[key] for key in ("format", "kernel_version", "model_digest")},
-        "code": {name: version for name, version in identity["code"].items() if name in _CODE},
+        **{key: identity[key] for key in ("format", "model_digest")},
+        "versions": {name: identity["versions"][name] for name in ("engine", "cells")},
         **{name: spec[name] for name in ("kind", "drive", "section", "drift") if name in spec},
         "integration": integration,
         **({"noise": NoiseTable.model_validate(spec["noise"]).deciding} if "noise" in spec else {}),
@@ -56,7 +47,7 @@ def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Return a line of text for each integration setting that differs between two runs; if any differs, no cell is
     shared.
     """
-    return differences(deciding(old), deciding(new))
+    return differences(deciding(numbered(old)), deciding(new))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.outcomes import left_out
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.analysis.selection import place
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import once
 from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
@@ -140,9 +141,8 @@ class _Layout:
 
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
-    attractors = dense(attractors)
-    at = {d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"}
-    return attractors.sel(at)
+    dims = [d for d in dims_of(attractors) if d in portraits.coords]
+    return dense(isel(attractors, {d: place(attractors[d], float(portraits[d])) for d in dims}))
 
 
 def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:

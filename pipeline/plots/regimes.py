@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
-from pipeline.analysis.ragged import N_IDS, SET, dense, dims_of, index_of_rows
+from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.analysis.sets import rows_by_number
 from pipeline.layout.attractor_letters import letter
@@ -76,8 +76,9 @@ def plot_regimes(
         period, or each attractor, has a map of its own, dark where it is met, with the share of the cells
         as its depth. A cross marks points where more than `SHARE_LIMIT` of the cells have no attractor, so
         that one may be missing. Its `data` hold ``regime`` (index of the names in ``label``),
-        ``n_attractors``, ``share_without``, ``share`` of each attractor, and ``share_of`` each ``member``
-        of the regimes. Of a sweep also ``low`` and ``high``, the 95 % Wilson interval of each share, and
+        ``n_attractors``, ``share_without``, ``share_of`` each ``member`` of the regimes (of more than twelve the
+        rest in one, ``others``), and as rows (`pipeline.analysis.ragged`) the ``share`` of each attractor at each
+        point. Of a sweep also ``low`` and ``high``, the 95 % Wilson interval of each share, and
         ``unseen_high``: a basin larger than this shows in one of the cells whose outcome is known with a
         probability of 95 % or more. The largest such bound, points with a cross left out, stands above
         the map.
@@ -144,9 +145,9 @@ def _draw_multiples(
     data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame, cast: palette.Cast
 ) -> style.DataFigure:
     """Draw one panel per attractor or period, shaded by its share of the cells."""
-    most = len(style.colours())
     total = data["share_of"].sum([x, y]).values
-    chosen = np.sort(np.argsort(-total, kind="stable")[:most])
+    rest = int(data["share_of"].attrs["n_others"])
+    chosen = range(data.sizes["member"] - bool(rest))
     columns = 2 if frame.compact else 4
     rows = math.ceil(len(chosen) / columns)
     width = frame.width_in / columns
@@ -169,8 +170,7 @@ def _draw_multiples(
         ax.set_title(_member_name(member, show, cast), fontsize=fig.look.legend, loc="left", pad=2.5)
     fig.supxlabel(labels.parameter_label(data[x]), fontsize=fig.look.label)
     fig.supylabel(labels.parameter_label(data[y]), fontsize=fig.look.label)
-    rest = data.sizes["member"] - len(chosen)
-    met = palette.percent(float(1.0 - total[chosen].sum() / total.sum())) if rest else ""
+    met = palette.percent(float(total[-1] / total.sum())) if rest else ""
     more = f"{rest} more, met by {met} of the cells, are not shown" if rest else ""
     note = style.join([text, "depth of colour: share of the cells", more])
     fig.suptitle(style.folded(note, frame.width_in - 0.3, fig.look.legend), fontsize=fig.look.legend, x=0.01, ha="left")
@@ -239,8 +239,8 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
             "share_without": ((y, x), without.values, {"units": "1", "long_name": "share without attractor"}),
             **_numbers(part, x, y),
         },
-        coords={x: part[x], y: part[y], "label": ("label", names)},
-        attrs={"title": "regimes", "show": show},
+        coords={x: part[x], y: part[y], "label": ("label", names), "attractor": part["attractor"].variable},
+        attrs={"title": "regimes", "show": show, N_IDS: part.attrs[N_IDS]},
     )
     if show == "number":
         return data
@@ -250,12 +250,17 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
         if show == "attractors"
         else sorted(set(periods.tolist()), key=lambda p: p or math.inf)
     )
-    share = part["share"].values[rows]
-    tables = [np.bincount(point[kinds == k], share[kinds == k], math.prod(shape)).reshape(shape) for k in met]
+    share, most = part["share"].values[rows], len(style.colours())
+    total = np.array([share[kinds == k].sum() for k in met])
+    chosen = [met[k] for k in np.sort(np.argsort(-total, kind="stable")[:most])]
+    parts = [kinds == k for k in chosen] + ([~np.isin(kinds, chosen)] if len(met) > most else [])
+    tables = [np.bincount(point[own], share[own], math.prod(shape)).reshape(shape) for own in parts]
     stacked = np.stack(tables, axis=-1) if tables else np.zeros((*shape, 0))
-    attrs = {"units": "1", "long_name": "share of all cells on attractors of this kind"}
-    members = [names_of(k) for k in met]
-    return data.assign(share_of=((y, x, "member"), stacked, attrs)).assign_coords(member=("member", members))
+    about = {"units": "1", "long_name": "share of all cells on attractors of this kind"}
+    members = [names_of(k) for k in chosen] + ["others"] * (len(met) > most)
+    shares = data.assign_coords(member=members).assign(share_of=((y, x, "member"), stacked, about))
+    shares["share_of"].attrs["n_others"] = max(0, len(met) - most)
+    return shares
 
 
 def _period_name(period: int) -> str:
@@ -265,18 +270,15 @@ def _period_name(period: int) -> str:
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
     """Return the basin fractions with their 95 % intervals, and a bound on the size of a basin that was missed."""
     about = {"units": "1", "long_name": "share of the cells with an outcome"}
-    rows = part.assign(share=part["share"].assign_attrs(about))
-    names, unseen = ["share"], {}
+    found = {ROW_SIZE: part[ROW_SIZE].variable, "share": (SET, part["share"].values, about)}
     if "branch" not in start_dims(part):
         interval = share_interval(part["n_cells"].values, part["share"].values)
         for name, values in zip(("low", "high"), interval, strict=True):
-            rows[name] = (SET, values, {"units": "1", "long_name": f"95 % interval of the share, {name} end"})
-        names += ["low", "high"]
+            found[name] = (SET, values, {"units": "1", "long_name": f"95 % interval of the share, {name} end"})
         known = (outcomes(part) != -1).sum(start_dims(part)).transpose(y, x)
         attrs = {"units": "1", "long_name": "95 % bound on a basin not seen"}
-        unseen["unseen_high"] = ((y, x), unseen_bound(known.values), attrs)
-    found = dense(rows, names)
-    return {name: found[name].transpose(y, x, "attractor").variable for name in names} | unseen
+        found["unseen_high"] = ((y, x), unseen_bound(known.values), attrs)
+    return found
 
 
 def _about(data: xr.Dataset) -> str:

@@ -11,7 +11,8 @@ import xarray as xr
 
 from magpend_core.models.model import Model
 from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.analysis.selection import place
 from pipeline.layout.period_names import section_name
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, palette, pixels, style
@@ -150,9 +151,8 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     """Colour each point by the attractor of its cell, or by the grey for the reason why the cell has none."""
-    attractors = chosen = dense(attractors)
-    for dim in split_dims(attractors["attractor_id"])[0]:
-        chosen = chosen.sel({dim: float(part[dim])})
+    at = {dim: place(attractors[dim], float(part[dim])) for dim in dims_of(attractors)}
+    chosen = dense(isel(attractors, at))
     cast = palette.cast_of(attractors, chosen)
     ids, greys = sorted(cast.names), list(palette.GREYS)
     motions = Motions(

@@ -12,7 +12,7 @@ class AnimationOptions(Options):
     """Options of an animation of a run."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point to show.")
-    nearest: bool = option(False, "Use the axes' values nearest to --at, and print them.")
+    nearest: bool = option(False, "Use the axes' values nearest to --at, and print them; otherwise --at must match.")
     degrees: bool = option(False, "Use degrees instead of radians.")
     portrait: str = option("", "State whose phase portrait is shown.")
     seconds: float = option(8.0, "Length of the film.", unit="s", gt=0.0, le=600.0)

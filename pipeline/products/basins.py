@@ -13,7 +13,7 @@ class BasinOptions(Options):
     """Options for measuring basins of attraction: fractions, basin entropy, uncertainty exponent."""
 
     interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")
-    confidence: float = option(0.95, "Level of all intervals.", gt=0.0, lt=1.0)
+    confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
     box: int = option(5, "Basin entropy: side of the boxes.", unit="cells", ge=2)
     block: int = option(1, "Basin entropy: side of the bootstrap's blocks, in boxes.", ge=1)
     scaling: Literal["perturbation", "boxes", "entropy"] = option(

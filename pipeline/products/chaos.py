@@ -21,7 +21,7 @@ class ChaosOptions(Options):
 class DimensionOptions(Options):
     """Options for fitting a correlation dimension."""
 
-    at: dict[str, float] = option({}, "Value of a swept parameter; by default all values.")
+    at: dict[str, float] = option({}, "Value of an axis of the run; by default all values.")
     theiler: int = option(1, "Theiler window: pairs of sections at most so far apart in time are left out.", ge=0)
     n_max: int = option(10_000, "Most section points of an attractor.", ge=100)
     floor: float = option(1e-6, "Smallest resolved distance, in units of the states' scales.", gt=0.0)

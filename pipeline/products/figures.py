@@ -114,7 +114,7 @@ class CurveFigureOptions(CurveOptions, _AlongOptions):
     """Options of a figure of bifurcation curves."""
 
     over: str = option("", "Run over both parameters whose map of regimes is drawn below.")
-    show: Literal["periods", "attractors", "number"] = option("periods", "Property of the map that is coloured.")
+    show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
 
 
 class RotationFigureOptions(FigureOptions):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipeline.products.product import Options, option
+from pipeline.products.product import WIDTH, Options, option
 
 TRANSIENT, WINDOW_S, MAX_PERIOD = 20, 0.08, 16
 
@@ -28,8 +28,8 @@ class ComparisonOptions(SweepOptions):
 
     state: str = option("", "State to draw; by default the first measured one.")
     degrees: bool = option(False, "Use degrees instead of radians.")
-    width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)
-    at: dict[str, float] = option({}, "Value of another axis of the run.")
+    width: float = WIDTH
+    at: dict[str, float] = option({}, "Value of an axis that the figure does not show.")
 
 
 class DiagramOptions(ComparisonOptions):
@@ -48,11 +48,11 @@ class SeriesOptions(Options):
         None, "Band about the drive's middle that an edge must cross, in its unit.", gt=0.0
     )
     degrees: bool = option(False, "Use degrees instead of radians.")
-    width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)
+    width: float = WIDTH
 
 
 class MeasuredBranchOptions(Options):
     """Options for measured branches of periodic orbits and their figure."""
 
     state: str = option("", "State that the amplitudes of a CSV table are of; by default the model's first.")
-    width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)
+    width: float = WIDTH

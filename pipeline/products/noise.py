@@ -18,7 +18,7 @@ class EscapeOptions(Options):
     centre: dict[str, float] = option({}, "Ball: its centre by state; by default each cell's first section.")
     skip: int = option(0, "Sections at the begin of the record that are not counted.", ge=0)
     stretch: int = option(20, "Sections before leaving of which mean and spread are kept.", ge=1, le=1000)
-    confidence: float = option(0.95, "Level of all intervals.", gt=0.0, lt=1.0)
+    confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
 
 
 class DensityOptions(Options):

@@ -151,6 +151,8 @@ class CellProduct:
         ``watches(options)`` returns the names of the quantities to watch while cells are integrated.
     shortest : callable
         ``shortest(options)`` returns the options with the least work, for compiling ahead.
+    version : int
+        Number of its results, see `magpend_core.versions`.
     """
 
     name: str
@@ -164,6 +166,7 @@ class CellProduct:
     coordinates: Callable[[Any, Any], dict[str, Sequence[Any]]] = lambda options, model: {}
     watches: Callable[[Any], Sequence[str]] = lambda options: ()
     shortest: Callable[[Any], Any] = lambda options: options
+    version: int = 1
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,7 @@ class Analysis:
         from the run filled in (an interval, the nearest value of an axis), so that equivalent options share
         one result.
     builds_on : tuple of str
-        Analyses that `compute` derives; their code counts in this one's version.
+        Analyses that `compute` derives; their versions count in this one's.
     figure : str
         Name of the figure that shows the result best, or empty.
     ignores : tuple of str
@@ -206,6 +209,8 @@ class Analysis:
     finish : str
         ``"module:function"`` or empty: ``finish(ds, options)`` completes the result of all parameter points by what
         needs them all.
+    version : int
+        Number of its results: raised when they change on purpose, see `magpend_core.versions`.
     """
 
     name: str
@@ -221,6 +226,10 @@ class Analysis:
     motion: Literal["steady", "drifting", "noisy"] = "steady"
     by_point: bool = False
     finish: str = ""
+    version: int = 1
+
+
+WIDTH: Any = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", ge=40.0, le=1000.0)
 
 
 class FigureOptions(Options):
@@ -229,7 +238,7 @@ class FigureOptions(Options):
     at: dict[str, float] = option({}, "Value of an axis that the figure does not show.")
     nearest: bool = option(False, "Use the axes' values nearest to --at, and print them; otherwise --at must match.")
     degrees: bool = option(False, "Use degrees instead of radians.")
-    width: float = option(178.0, "Width of the figure; 85 is a journal's column", unit="mm", ge=40.0, le=1000.0)
+    width: float = WIDTH
     xlim: tuple[float, float] | None = option(None, "Range of the horizontal axis, in its unit.")
     ylim: tuple[float, float] | None = option(None, "Range of the vertical axis, in its unit.")
     style: str | Path | list[str | Path | dict[str, Any]] | dict[str, Any] = option(

@@ -1,4 +1,4 @@
-"""List all products by name, with the modules that declare them."""
+"""List all products by name: analyses and figures in groups, with the run that each of them needs."""
 
 from __future__ import annotations
 
@@ -16,91 +16,104 @@ class Registry(Mapping[str, P]):
 
     Parameters
     ----------
-    kind
-        Word for the products, for messages.
-    places
-        ``"module:object"`` by name.
+    groups
+        By title of a group and by name: the module of `pipeline.products` that declares the product, under its name
+        in capital letters, and the words on the run that it needs; no words for a product that takes any steady run.
+        Products in the group without a title are not listed.
+
+    Attributes
+    ----------
+    groups : dict
+        By title and by name: the words on the run.
     """
 
-    def __init__(self, kind: str, places: Mapping[str, str]) -> None:
-        self.kind, self._places = kind, places
+    def __init__(self, groups: Mapping[str, Mapping[str, tuple[str, str]]]) -> None:
+        self.groups = {
+            title: {name: needs for name, (_, needs) in group.items()} for title, group in groups.items() if title
+        }
+        self._modules = {name: module for group in groups.values() for name, (module, _) in group.items()}
 
     def __getitem__(self, name: str) -> P:
-        product: P = resolve_name(self._places[name])
+        product: P = resolve_name(f"pipeline.products.{self._modules[name]}:{name.upper()}")
         return product
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
+        return iter(self._modules)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._modules)
 
 
-CELL_PRODUCTS: Registry[CellProduct] = Registry(
-    "product",
-    {
-        "lyapunov": "pipeline.products.lyapunov:LYAPUNOV",
-        "extremes": "pipeline.products.extremes:EXTREMES",
-        "rotation": "pipeline.products.rotation:ROTATION",
-    },
-)
+_POINT = "one parameter point (--at)"
+_ONE, _TWO = "one swept parameter (--at chooses values of others)", "two swept parameters"
+_NOISE, _DRIFT = "a run with [noise]", "a run with [drift]"
+_ROTATION, _EXPONENTS = "the product rotation", "the product lyapunov"
+
+CELL_PRODUCTS: Registry[CellProduct] = Registry({"": {n: (n, "") for n in ("lyapunov", "extremes", "rotation")}})
 
 ANALYSES: Registry[Analysis] = Registry(
-    "analysis",
     {
-        "identified": "pipeline.products.attractors:IDENTIFIED",
-        "attractors": "pipeline.products.attractors:ATTRACTORS",
-        "basins": "pipeline.products.basins:BASINS",
-        "hysteresis": "pipeline.products.attractors:HYSTERESIS",
-        "settling": "pipeline.products.attractors:SETTLING",
-        "chaos": "pipeline.products.chaos:CHAOS",
-        "dimension": "pipeline.products.chaos:DIMENSION",
-        "branches": "pipeline.products.branches:BRANCHES",
-        "bands": "pipeline.products.branches:BANDS",
-        "curves": "pipeline.products.branches:CURVES",
-        "orbits": "pipeline.products.branches:ORBITS",
-        "tongues": "pipeline.products.tongues:TONGUES",
-        "manifolds": "pipeline.products.manifolds:MANIFOLDS",
-        "tangency": "pipeline.products.manifolds:TANGENCY",
-        "tipping": "pipeline.products.tipping:TIPPING",
-        "delay": "pipeline.products.tipping:DELAY",
-        "overlaps": "pipeline.products.tipping:OVERLAPS",
-        "resilience": "pipeline.products.resilience:RESILIENCE",
-        "edge": "pipeline.products.resilience:EDGE",
-        "escapes": "pipeline.products.noise:ESCAPES",
-        "density": "pipeline.products.noise:DENSITY",
-    },
+        "Attractors, of any run without noise and drift": {
+            "attractors": ("attractors", ""),
+            "settling": ("attractors", ""),
+            "hysteresis": ("attractors", "a continuation in both directions"),
+        },
+        "Basins and shocks": {
+            "basins": ("basins", "a sweep; all numbers but fractions need starts on a grid"),
+            "resilience": ("resilience", "a sweep"),
+            "edge": ("resilience", "a sweep, and " + _POINT),
+            "overlaps": ("tipping", "a sweep along the parameter that changes"),
+        },
+        "Chaos": {"chaos": ("chaos", ""), "dimension": ("chaos", "")},
+        "Orbits and branches, stable or not": {
+            "branches": ("branches", ""),
+            "bands": ("branches", "a posterior of magpend identify"),
+            "curves": ("branches", ""),
+            "orbits": ("branches", _POINT),
+            "tongues": ("tongues", _ROTATION),
+            "manifolds": ("manifolds", _POINT),
+            "tangency": ("manifolds", _POINT + ", and two states"),
+        },
+        "Moving parameters": {"tipping": ("tipping", _DRIFT), "delay": ("tipping", _DRIFT)},
+        "Noise": {"escapes": ("noise", _NOISE), "density": ("noise", _NOISE)},
+        "": {"identified": ("attractors", "")},
+    }
 )
 
-COMMANDS = tuple(name for name in ANALYSES if name != "identified")
+COMMANDS = tuple(name for group in ANALYSES.groups.values() for name in group)
 """Analyses that have a table, and therefore a command."""
 
-FIGURES: Registry[Figure] = Registry(
-    "figure",
-    {
-        name: f"pipeline.products.figures:{name.upper()}"
-        for name in (
-            "bifurcation",
-            "section",
-            "attractors",
-            "gallery",
-            "basins",
-            "fractions",
-            "regimes",
-            "lyapunov",
-            "convergence",
-            "dimension",
-            "branches",
-            "multipliers",
-            "curves",
-            "rotation",
-            "tongues",
-            "manifolds",
-            "drift",
-            "resilience",
-            "edge",
-            "escapes",
-            "density",
-        )
+_FIGURES = {
+    "Sections and attractors": {
+        "bifurcation": _ONE,
+        "section": _POINT,
+        "attractors": _ONE,
+        "gallery": _POINT,
+        "regimes": _TWO,
     },
+    "Basins and shocks": {
+        "basins": "a sweep with starts on a grid, and " + _POINT,
+        "fractions": _ONE,
+        "resilience": "a sweep, and at most " + _ONE,
+        "edge": "a sweep, and " + _POINT,
+    },
+    "Chaos": {
+        "lyapunov": f"{_EXPONENTS}, and {_ONE}; two with --map",
+        "convergence": f"{_EXPONENTS}, and {_POINT}",
+        "dimension": _POINT,
+    },
+    "Orbits and branches, stable or not": {
+        "branches": "",
+        "multipliers": "",
+        "curves": "",
+        "rotation": f"{_ROTATION}, and {_ONE}, or {_TWO}",
+        "tongues": f"{_ROTATION}, and {_ONE}",
+        "manifolds": _POINT,
+    },
+    "Moving parameters": {"drift": _DRIFT},
+    "Noise": {"escapes": _NOISE, "density": _NOISE},
+}
+
+FIGURES: Registry[Figure] = Registry(
+    {title: {name: ("figures", needs) for name, needs in group.items()} for title, group in _FIGURES.items()}
 )

@@ -10,7 +10,7 @@ from pipeline.products.product import Analysis, Options, option
 class ResilienceOptions(Options):
     """Options for measuring how attractors respond to shocks."""
 
-    at: dict[str, float] = option({}, "Value of an axis of the run; by default all parameter points.")
+    at: dict[str, float] = option({}, "Value of an axis of the run; by default all values.")
     states: str = option("", "States that a shock changes, separated by commas; by default the rates.")
     phases: int = option(8, "Phases of a drive period, or of a flow's orbit, at which shocks are tried.", ge=1)
     largest: float = option(2.0, "Largest shock that is tried, in units of the states' scales.", gt=0.0)
@@ -24,7 +24,7 @@ class ResilienceOptions(Options):
         0.01, "Distance from its attractor within which a trajectory has arrived, in units of the scales.", gt=0.0
     )
     timed: int = option(256, "Initial states of each parameter point whose arrival is timed.", ge=0)
-    interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the shares.")
+    interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")
     confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
     seed: int = option(0, "Seed of directions, random shocks and timed initial states.", ge=0)
 

@@ -23,7 +23,7 @@ class OverlapOptions(Options):
     parameter: str = option("", "Swept parameter; by default the only axis.")
     before: float = option(..., "Value of the parameter before the change, on its axis.", flag="--from")
     after: float = option(..., "Value of the parameter after the change, on its axis.", flag="--to")
-    at: dict[str, float] = option({}, "Value of another axis of the run.")
+    at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point.")
     confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.analysis.outcomes import sentence
-from pipeline.analysis.tabular import axis_ranges, counted, distinct, number
+from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
@@ -34,52 +34,22 @@ if TYPE_CHECKING:
 CHEAP = ("attractors", "hysteresis", "basins")
 """Analyses that a report computes by default."""
 
-SHOWN = (
-    "attractors",
-    "hysteresis",
-    "basins",
-    "branches",
-    "curves",
-    "orbits",
-    "manifolds",
-    "tangency",
-    "chaos",
-    "dimension",
-    "settling",
-    "escapes",
-    "density",
-)
-"""Analyses in the order of a report."""
-
-_HEADINGS = {
-    "hysteresis": "Hysteresis",
-    "basins": "Basins",
-    "branches": "Bifurcations",
-    "curves": "Curves of bifurcations",
-    "orbits": "Periodic orbits",
-    "manifolds": "Stable and unstable manifolds",
-    "tangency": "Homoclinic tangencies",
-    "chaos": "Regular and chaotic",
-    "dimension": "Dimensions",
-    "settling": "Transient or attractor",
-    "escapes": "Escapes",
-    "density": "Densities",
+SHOWN = {
+    "attractors": ("Attractors", ""),
+    "hysteresis": ("Hysteresis", "Jumps of the branches: the parameter values, and the attractors before and after"),
+    "basins": ("Basins", "Attractors on which the initial states of the grid end"),
+    "branches": ("Bifurcations", "Located bifurcations"),
+    "curves": ("Curves of bifurcations", "Points of codimension two on the curves of bifurcations"),
+    "orbits": ("Periodic orbits", "All periodic orbits found at a parameter point, stable or not"),
+    "manifolds": ("Stable and unstable manifolds", "Manifolds of the saddle orbits"),
+    "tangency": ("Homoclinic tangencies", "Parameter values at which manifolds of a saddle orbit first touch"),
+    "chaos": ("Regular and chaotic", "Kind of motion of each attractor"),
+    "dimension": ("Dimensions", "Correlation dimensions of the attractors that do not close"),
+    "settling": ("Transient or attractor", "Sets that do not close, and the results of extending their cells"),
+    "escapes": ("Escapes", "Rates at which cells with noise leave a set, and where they go"),
+    "density": ("Densities", "Moments and peaks of the density of section points"),
 }
-
-_CAPTIONS = {
-    "hysteresis": "Jumps of the branches: the parameter values, and the attractors before and after",
-    "basins": "Attractors on which the initial states of the grid end",
-    "branches": "Located bifurcations",
-    "curves": "Points of codimension two on the curves of bifurcations",
-    "orbits": "All periodic orbits found at a parameter point, stable or not",
-    "manifolds": "Manifolds of the saddle orbits",
-    "tangency": "Parameter values at which manifolds of a saddle orbit first touch",
-    "chaos": "Kind of motion of each attractor",
-    "dimension": "Correlation dimensions of the attractors that do not close",
-    "settling": "Sets that do not close, and the results of extending their cells",
-    "escapes": "Rates at which cells with noise leave a set, and where they go",
-    "density": "Moments and peaks of the density of section points",
-}
+"""Analyses in the order of a report: their headings, and the captions of their tables."""
 
 
 class Shown:
@@ -222,7 +192,8 @@ def _attractors(shown: Shown) -> Iterator[Block]:
     command = command_of("analyse attractors", options, shown.directory)
     table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
     rows = list(table.rows)
-    yield Grid(*_attractor_grid(found, rows, shown.axes), _counted(rows, told), command)
+    most, n_others = leading(rows, "attractor_id", "n_cells")
+    yield Grid(*_attractor_grid(found, most, shown.axes), _counted(rows, told), command, n_others)
     for remark in table.lines[table.lines.index(told) + 1 :]:
         yield Note(f"{remark[:1].upper()}{remark[1:]}.")
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
@@ -267,9 +238,11 @@ def _attractor_grid(
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["basin fraction (95 % interval)"] if sampled else []
-    lines = []
-    for i in sorted({row["attractor_id"] for row in rows}):
-        own = [row for row in rows if row["attractor_id"] == i]
+    lines: list[list[str]] = []
+    by_id: dict[int, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_id.setdefault(row["attractor_id"], []).append(row)
+    for i, own in sorted(by_id.items()):
         line = [letter(i)]
         line += [distinct(r[key].replace("_", " ") for r in own) for key in ("kind", "stability")]
         line.append(distinct(r["evidence"] for r in own if r["evidence"] != "none") or "-")
@@ -292,14 +265,14 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    for name in SHOWN[1:]:
-        if not _suits(shown, name):
+    for name, (heading, _) in SHOWN.items():
+        if name == "attractors" or not _suits(shown, name):
             continue
         known = shown.options_of(name)
         blocks: list[Block] = [] if known else [_missing(shown, name)]
         for options in known:
             blocks += _analysis(shown, name, options)
-        yield Part(_HEADINGS[name], blocks)
+        yield Part(heading, blocks)
 
 
 def _suits(shown: Shown, name: str) -> bool:
@@ -326,14 +299,14 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
-        yield grid_of(rows, _CAPTIONS[name], command)
+        yield grid_of(rows, SHOWN[name][1], command)
     else:
         yield Note("Nothing of this kind was found.", command)
     drawn = ANALYSES[name].figure
     if drawn and drawn not in ("attractors", "lyapunov"):
         at = {d: float(shown.cube[d].values[0]) for d in shown.axes} if drawn == "basins" else {}
         where = " at the first values of the axes" if any(shown.cube.sizes[d] > 1 for d in at) else ""
-        yield from _drawn(shown, drawn, f"{_CAPTIONS[name]}{where}", **options, **({"at": at} if at else {}))
+        yield from _drawn(shown, drawn, f"{SHOWN[name][1]}{where}", **options, **({"at": at} if at else {}))
 
 
 _OF_ATTRACTORS = {

@@ -38,7 +38,7 @@ from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files
 from pipeline.store.products import BLOCKS
 
-WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 16_384
+WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 8192
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
 
 Block = Mapping[str, slice]

@@ -3,30 +3,44 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from magpend_core.models.presets import is_file
 from pipeline.layout.domains import check_starts
+from pipeline.products.extremes import EXTREMES, ExtremesOptions
+from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
+from pipeline.products.rotation import ROTATION, RotationOptions
 from pipeline.runs.arguments import knows_its_keys, names_arguments
-from pipeline.runs.spec_tables import SpecTables
+from pipeline.runs.table_methods import TableMethod
 from pipeline.runs.workflows import find_spec, read_given
+from pipeline.specification.drift import DriftTable
 from pipeline.specification.files import check_new_file, merged, read_toml, toml_tables, write_new
 from pipeline.specification.inputs import is_toml_text, plain_tables
 from pipeline.specification.models import is_model_file
+from pipeline.specification.noise import NoiseTable
+from pipeline.specification.recorded_drive import DriveTable
+from pipeline.specification.section import SectionTable
+from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable
 from pipeline.specification.writing import specification_toml
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from magpend_core.models.model import Model
     from pipeline.runs.preview import Preview
 
 __all__ = ["Spec"]
 
 Table = Mapping[str, Any]
+if TYPE_CHECKING:
+    Numbers = Sequence[float] | npt.NDArray[np.float64]
+    Rows = Sequence[Numbers] | npt.NDArray[np.float64]
 
 
-class Spec(SpecTables, Mapping[str, Any]):
+class Spec(Mapping[str, Any]):
     r"""A specification of a run, built in Python; a mapping with the tables and keys of the TOML file.
 
     A specification does not change: each method returns a changed copy. Nothing is checked before `check`,
@@ -118,6 +132,97 @@ class Spec(SpecTables, Mapping[str, Any]):
     def smoke(self, changes: Table) -> Self:
         """Set the changes for a short run, by dotted key; ``smoke=True`` of `magpend.run` applies them."""
         return self._of({**self._tables, "smoke": plain_tables(changes)})
+
+    # ---- tables --------------------------------------------------------------------------------
+
+    @knows_its_keys
+    def axis(
+        self,
+        name: str,
+        start: float | None = None,
+        stop: float | None = None,
+        num: int | None = None,
+        step: float | None = None,
+        values: Numbers | None = None,
+    ) -> Self:
+        """Sweep a parameter.
+
+        Parameters
+        ----------
+        name
+            ``frequency_hz`` or a parameter of the model.
+        start
+            First value.
+        stop
+            Last value; with `step`, an upper bound.
+        num
+            Number of evenly spaced values, both ends included; 2 or more, at most 1e+07.
+        step
+            Spacing, instead of `num`; above 0.
+        values
+            All values, instead of the other keys.
+        """
+        keys = {"start": start, "stop": stop, "num": num, "step": step, "values": values}
+        return self._replaced(f"axes.{name}", keys)
+
+    @knows_its_keys
+    def start_grid(
+        self, *, refine: int | None = None, **states: float | tuple[float, float, int] | Numbers | Mapping[str, Any]
+    ) -> Self:
+        """Start on a grid of initial states.
+
+        Parameters
+        ----------
+        refine
+            Stride of the cells that are computed first: 2, 4, 8, 16, 32, 64.
+        states
+            States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number, ``(start, stop,
+            num)``, a list of values, or a table with the keys of `axis`. States not given are 0.
+        """
+        return self._replaced("initial_conditions", {"kind": "grid", "refine": refine, **states})
+
+    @knows_its_keys
+    def start_list(self, points: Rows | None = None, points_deg: Rows | None = None) -> Self:
+        """Start from a list of initial states.
+
+        Parameters
+        ----------
+        points
+            Rows of states in their units.
+        points_deg
+            Rows in degrees and degrees/s.
+        """
+        return self._replaced("initial_conditions", {"kind": "list", "points": points, "points_deg": points_deg})
+
+    @knows_its_keys
+    def start_random(self, *, n: int, seed: int | None = None, **states: float | tuple[float, float]) -> Self:
+        """Start from random initial states in a box.
+
+        Parameters
+        ----------
+        n
+            Number of random states; 1 or more.
+        seed
+            Seed of the random numbers; 0 or more.
+        states
+            States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number or ``(low, high)``.
+        """
+        return self._replaced("initial_conditions", {"kind": "random", "n": n, "seed": seed, **states})
+
+    parameters = TableMethod(ParametersTable, "Set values of the model's parameters.")
+    section = TableMethod(SectionTable, "Take sections where a state crosses a level.")
+    continuation = TableMethod(Continuation, "Choose the axis that branches follow.")
+    drive = TableMethod(DriveTable, "Replace the model's drive by a recorded one.")
+    # type checkers know the key `from_` by its alias, which is no name
+    drift: Callable[..., Spec] = TableMethod(
+        DriftTable, "Move a parameter while the run integrates.", "drift.{name}", "Parameter of the model."
+    )  # type: ignore[assignment]
+    noise = TableMethod(NoiseTable, "Add white noise to equations.")
+    integration = TableMethod(Integration, "Set tolerances, transient and kept sections.")
+    execution = TableMethod(Execution, "Set the sizes of tasks, which change no number.")
+    lyapunov = TableMethod(LyapunovOptions, LYAPUNOV.help, "products.lyapunov")
+    extremes = TableMethod(ExtremesOptions, EXTREMES.help, "products.extremes")
+    rotation = TableMethod(RotationOptions, ROTATION.help, "products.rotation")
 
     def toml(self) -> str:
         """Return the specification as the text of a TOML file, which makes the same run."""

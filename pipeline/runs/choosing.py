@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runs.systems import LOOKED_FOR, System, find_systems
-from pipeline.specification.clusters import QUEUES, TITLES, Cluster, cluster_of, read_table
+from pipeline.specification.batch_systems import SYSTEMS
+from pipeline.specification.clusters import QUEUES, Cluster, cluster_of, read_table
 from pipeline.specification.problems import SpecError, unknown_key
 
 CLUSTER_FILE = "MAGPEND_CLUSTER"
@@ -154,6 +155,6 @@ def _only(retry: str) -> System:
 def no_command(kind: str, name: str, retry: str) -> str:
     """Return the message for a batch system whose command is not on this machine."""
     return (
-        f"{TITLES[kind]}: there is no command {name!r} here; give this command on a machine that sends jobs, such as "
-        f"the login node, or write the job file: magpend submit {retry} --write job.sh"
+        f"{SYSTEMS[kind].title}: there is no command {name!r} here; give this command on a machine that sends jobs, "
+        f"such as the login node, or write the job file: magpend submit {retry} --write job.sh"
     )

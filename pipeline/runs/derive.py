@@ -1,9 +1,9 @@
 """Compute the analyses of a run, each once, and store their results in the run's folder ``derived/``.
 
 A result's key holds everything that decides its numbers: the digest of the committed cells, the analysis'
-name, its options, and the version of its code (`code_version`). `derive` returns the stored result with that
+name, its options, and its version (`pipeline.runs.versions.version_of`). `derive` returns the stored result with that
 key, or computes it. A damaged or incomplete result is computed again. A result of an earlier cube or an
-earlier version of the code is never read; it stays until `prune` is called.
+earlier version is never read; it stays until `prune` is called.
 
 Each result is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. ``xarray.open_zarr(path)`` reads it.
 The attribute ``derived_options`` holds the options as JSON. Labels (``state``, ``direction``) are codes with
@@ -169,12 +169,12 @@ def derive(
         pass
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
-    problem = unwritable(place.local.parent) if place.local is not None else ""
-    if problem:
-        run.echo(f"{problem}: the result of {name} is shown but not kept")
+    why = unwritable(place.local.parent) if place.local is not None else ""
+    if why:
+        run.echo(f"{why}: the result of {name} is shown but not kept")
     with notebook.progress():
-        computed = _compute(run, analysis, wanted, can_keep=not problem)
-        others = {name: value for name, value in computed.attrs.items() if name not in key}
+        computed = _compute(run, analysis, wanted, can_keep=not why)
+        others = {k: value for k, value in computed.attrs.items() if k not in key}
         result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))
     if is_chosen:
         _keep(run, wanted)
@@ -232,7 +232,7 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
     run = Run.open(source)
     folder = run.info.files.below(DERIVED)
     places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
-    if not places:  # saves the time to compute the code's version
+    if not places:
         return
     wanted = current(run, name)
     found = []
@@ -344,7 +344,7 @@ def _placed(stored: xr.Dataset, place: Files) -> xr.Dataset:
 def stale(source: Source) -> list[str]:
     """Return the paths of stored results that are outdated, damaged or incomplete.
 
-    Outdated results belong to an earlier cube or an earlier version of the code. A leftover was begun by a
+    Outdated results belong to an earlier cube or an earlier version. A leftover was begun by a
     process that was killed. Leftovers younger than an hour may belong to a running process and are not
     listed. Blocks of results that are not complete are listed.
     """

@@ -5,16 +5,18 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from pipeline.runs.batch import WORDS, is_whole, log_name, resources
+from pipeline.runs.batch import is_whole, resources
 from pipeline.runs.progress import size, whole
 from pipeline.runs.sizing import remarks
 from pipeline.runs.submit import SCRIPT, TABLE, Submission
-from pipeline.specification.clusters import TITLES
+from pipeline.runs.systems import answer
+from pipeline.specification.batch_systems import SYSTEMS
 from pipeline.specification.toml import toml_value
 
 NUMBER = "JOB"
 """Word for the number of a job that is not sent yet."""
 
+_MOST_QUEUES = 20
 _SIZES = ("cores", "memory", "walltime")
 
 
@@ -27,12 +29,12 @@ def explain(submission: Submission) -> list[str]:
     lines = [
         *head,
         *work.lines(),
-        f"batch system: {TITLES[cluster.kind]} ({submission.choice.why})",
-        _queue_line(submission),
+        f"batch system: {SYSTEMS[cluster.kind].title} ({submission.choice.why})",
+        *_queues(submission),
         f"jobs: {_jobs(submission)}",
         *(f"  {key} = {toml_value(getattr(cluster, key))}: {_reason(submission, key)}" for key in _SIZES),
         *(f"  {key} = {toml_value(value)}: {_reason(submission, key)}" for key, value in _others(submission)),
-        *(f"warning: {remark}" for remark in remarks(cluster, work, submission.site)),
+        *(f"warning: {remark}" for remark in remarks(cluster, work)),
         *_places(submission),
         *_commands(submission),
         "change: --job KEY=VALUE, such as --job walltime=02:00:00 --job account=NAME; or a file with [cluster], given "
@@ -55,9 +57,9 @@ def _table(submission: Submission) -> list[str]:
 def brief(submission: Submission) -> list[str]:
     """Return the text lines of a job that was sent."""
     cluster = submission.cluster
-    warnings = remarks(cluster, submission.work, submission.site)
+    warnings = remarks(cluster, submission.work)
     return [
-        f"sent: job {submission.job} to {TITLES[cluster.kind]}; {_jobs(submission)}",
+        f"sent: job {submission.job} to {SYSTEMS[cluster.kind].title}; {_jobs(submission)}",
         f"work: about {whole(submission.work.seconds)} of one core, {_clock(submission)}",
         *(f"warning: {remark}" for remark in warnings),
         *_places(submission),
@@ -68,7 +70,7 @@ def brief(submission: Submission) -> list[str]:
 def written(submission: Submission, file: str) -> list[str]:
     """Return the text lines of a job file that was written."""
     return [
-        f"written: {file}, for {TITLES[submission.cluster.kind]}: {_jobs(submission)}",
+        f"written: {file}, for {SYSTEMS[submission.cluster.kind].title}: {_jobs(submission)}",
         f"send it: {_send(submission, file)}",
         *_places(submission),
         *_commands(submission),
@@ -79,7 +81,7 @@ def as_data(submission: Submission) -> dict[str, Any]:
     """Return a submission as JSON values: sizes in bytes and seconds, commands as texts."""
     cluster, work = submission.cluster, submission.work
     cores, memory, time_s = resources(cluster)
-    words, job = WORDS[cluster.kind], submission.job or NUMBER
+    words, job = SYSTEMS[cluster.kind], submission.job or NUMBER
     one = {"cores": cores, "memory_bytes": memory, "walltime_s": time_s, "script": submission.script}
     jobs = [{"role": "all" if is_whole(cluster) else "coordinator", "most": 1, **one}]
     if submission.worker is not None:
@@ -90,7 +92,7 @@ def as_data(submission: Submission) -> dict[str, Any]:
         "complete": submission.complete,
         "batch_system": cluster.kind,
         "batch_system_reason": submission.choice.why,
-        "queue": cluster.queue or submission.site.default,
+        "queue": cluster.queue,
         "jobs": jobs,
         "reasons": {key: _reason(submission, key) for key in (*_SIZES, *dict(_others(submission)))},
         "cluster": cluster.model_dump(mode="json", exclude_none=True),
@@ -101,9 +103,9 @@ def as_data(submission: Submission) -> dict[str, Any]:
         "periods_left": work.periods,
         "core_seconds": work.seconds,
         "wall_seconds": work.wall(cluster.cores * cluster.max_jobs),
-        "warnings": remarks(cluster, work, submission.site),
+        "warnings": remarks(cluster, work),
         "results": submission.name,
-        "log": log_name(cluster.kind, submission.log, job),
+        "log": submission.log_of(job),
         "folder": str(submission.folder),
         "status": f"magpend status {shlex.quote(submission.name)}",
         "follow": f"{words.follow} {job}",
@@ -115,7 +117,7 @@ def as_data(submission: Submission) -> dict[str, Any]:
 def _send(submission: Submission, file: str) -> str:
     """Return the command that sends a job file."""
     reads = ["<"] if submission.cluster.kind == "lsf" else []
-    return " ".join([*WORDS[submission.cluster.kind].send, *reads, shlex.quote(file)])
+    return " ".join([*SYSTEMS[submission.cluster.kind].send, *reads, shlex.quote(file)])
 
 
 def _others(submission: Submission) -> list[tuple[str, Any]]:
@@ -127,18 +129,14 @@ def _reason(submission: Submission, key: str) -> str:
     return submission.reasons.get(key) or submission.choice.sources.get(key, "by default")
 
 
-def _queue_line(submission: Submission) -> str:
-    site, name = submission.site, submission.cluster.queue
-    queue = site.queue(name)
-    if queue is not None:
-        return f"{site.word}: {queue.described}" + (
-            f", the default of {TITLES[site.kind]}" if queue.name == site.default else ""
-        )
-    unknown = f"'{site.silent}' gave no answer" if site.silent else f"{TITLES[site.kind]} is not asked for them"
-    if site.queues:
-        unknown = f"{TITLES[site.kind]} does not list it"
-    which = name or f"the default of {TITLES[site.kind]}"
-    return f"{site.word}: {which}; its nodes and limits are not known ({unknown})"
+def _queues(submission: Submission) -> list[str]:
+    """Return the queue of a job, and what the batch system itself says of its queues and their limits."""
+    system = SYSTEMS[submission.cluster.kind]
+    said = (answer(shlex.split(system.queues)) or "").rstrip().splitlines()[:_MOST_QUEUES]
+    head = f"queue: {submission.cluster.queue or f'the default of {system.title}'}"
+    if not said:
+        return [f"{head}; '{system.queues}', which lists queues and their limits, gave no answer here"]
+    return [f"{head}; '{system.queues}' lists:", *(f"  {line}" for line in said)]
 
 
 def _jobs(submission: Submission) -> str:
@@ -163,18 +161,18 @@ def _clock(submission: Submission) -> str:
 
 def _places(submission: Submission) -> list[str]:
     job = submission.job or NUMBER
-    log = log_name(submission.cluster.kind, submission.log, job)
+    log = submission.log_of(job)
     late = "; PBS writes it at the end of the job" if submission.cluster.kind in ("pbs", "torque") else ""
     workers = "" if submission.worker is None else f", and those of the workers in {submission.folder}"
     return [f"results: {submission.name}", f"log: {log}{workers}{late}"]
 
 
 def _commands(submission: Submission) -> list[str]:
-    words, job = WORDS[submission.cluster.kind], submission.job or NUMBER
+    words, job = SYSTEMS[submission.cluster.kind], submission.job or NUMBER
     name = shlex.quote(submission.name)
     return [
         f"follow: magpend status {name}; {words.follow} {job}; tail -F {submission.folder}/coordinator*",
         f"cancel: {words.cancel} {job}; what is computed stays",
         "continue: after a cancel, or at the end of its time, give the same command again; if its node fails, "
-        f"{TITLES[submission.cluster.kind]} starts the job again",
+        f"{SYSTEMS[submission.cluster.kind].title} starts the job again",
     ]

@@ -157,18 +157,15 @@ def carry_out(
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """Return everything that decides the numbers and the layout of a run, with the installed version of the compiled
-    core.
+    """Return everything that decides the numbers and the layout of a run.
 
     Raises
     ------
     SpecError
         If the run is too large, see `limits.check_plan`.
     """
-    from magpend_core import kernel_version
-
     check_plan(plan)
-    return identity_of(spec, plan, kernel_version())
+    return identity_of(spec, plan)
 
 
 def _complete(

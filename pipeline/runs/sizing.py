@@ -1,4 +1,4 @@
-"""Choose cores, memory and time of a batch job from the work of a run and the nodes of a site, with the reasons."""
+"""Choose cores, memory and time of a batch job from the work of a run, with the reasons."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from typing import Any
 from pipeline.layout.plan import Plan, periods_per_cell
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import size, whole
-from pipeline.runs.sites import Queue, Site
-from pipeline.specification.clusters import TITLES, Cluster, clock
+from pipeline.specification.clusters import Cluster, clock
 from pipeline.specification.parsing import Spec
 
 AIM_S = 1800.0
 """Time that a job is given enough cores for [s]: short enough to start soon, long enough to be worth a job."""
 
 MOST_UNASKED = 16
-"""Most cores of a job if the nodes are not known."""
+"""Most cores of a job that are asked for unless they are given: nearly every node has them."""
 
 START_BYTES, WORKER_BYTES, TASKS_HELD = 10**9, 5 * 10**8, 3
 """Memory of the coordinator and of a worker process [bytes]; a worker holds this many times the results of a task."""
@@ -101,7 +100,7 @@ def measure(spec: Spec, plan: Plan, done: Mapping[int, Any]) -> Work:
     )
 
 
-def complete(given: Mapping[str, Any], work: Work, site: Site) -> tuple[dict[str, Any], dict[str, str]]:
+def complete(given: Mapping[str, Any], work: Work) -> tuple[dict[str, Any], dict[str, str]]:
     """Fill in the cores, the memory and the wall time of a job where they are not given.
 
     Parameters
@@ -110,8 +109,6 @@ def complete(given: Mapping[str, Any], work: Work, site: Site) -> tuple[dict[str
         Values of the ``[cluster]`` table; they are not changed.
     work
         Work of the run.
-    site
-        Queues of the batch system.
 
     Returns
     -------
@@ -121,64 +118,39 @@ def complete(given: Mapping[str, Any], work: Work, site: Site) -> tuple[dict[str
         Reason for each value that was filled in, by key.
     """
     table, reasons = dict(given), {}
-    name = given.get("queue")
-    queue = site.queue(name if isinstance(name, str) else None) or Queue(str(name or "the default queue"))
     if "cores" not in table:
-        table["cores"], reasons["cores"] = _cores(work, queue, site, table)
+        table["cores"], reasons["cores"] = _cores(work, table)
     cores = table["cores"] if isinstance(table["cores"], int) else 1
     if "memory" not in table:
-        table["memory"], reasons["memory"] = _memory(work, queue, cores)
+        each = WORKER_BYTES + TASKS_HELD * work.task_bytes
+        table["memory"] = f"{(START_BYTES + cores * each) // 10**6} MB"
+        reasons["memory"] = f"{size(START_BYTES)}, and {size(each)} for each core"
     if "walltime" not in table:
         jobs = table.get("max_jobs", 1)
-        table["walltime"], reasons["walltime"] = _walltime(work, queue, cores * (jobs if isinstance(jobs, int) else 1))
+        wall = work.wall(cores * (jobs if isinstance(jobs, int) else 1))
+        wanted = math.ceil((SAFETY * wall + EXTRA_S) / STEP_S) * STEP_S
+        table["walltime"] = clock(min(wanted, 9999 * 3600))
+        reasons["walltime"] = f"{SAFETY:g} times the {whole(wall)}, and {whole(EXTRA_S)}"
     return table, reasons
 
 
-def _cores(work: Work, queue: Queue, site: Site, table: Mapping[str, Any]) -> tuple[int, str]:
-    wanted = max(1, math.ceil(work.seconds / AIM_S))
-    if site.kind == "sge" and not any("-pe" in str(line) for line in table.get("directives") or ()):
+def _cores(work: Work, table: Mapping[str, Any]) -> tuple[int, str]:
+    if table.get("kind") == "sge" and not any("-pe" in str(line) for line in table.get("directives") or ()):
         return 1, "Grid Engine gives more only with the parallel environment of your site (docs/clusters.md)"
-    node = queue.cores or MOST_UNASKED
-    if queue.memory is not None:
-        node = min(node, max(1, (queue.memory - START_BYTES) // _worker_bytes(work)))
-    most = f"no node of {queue.name} has more" if queue.cores else "no more are asked for if the nodes are not known"
     cores, why = min(
-        (wanted, f"a job aims at {whole(AIM_S)} or less"),
+        (max(1, math.ceil(work.seconds / AIM_S)), f"a job aims at {whole(AIM_S)} or less"),
         (work.n_parallel, "no more tasks can run at a time"),
-        (node, most),
+        (MOST_UNASKED, "no more are asked for by themselves"),
         key=lambda bound: bound[0],
     )
     return cores, f"about {whole(work.wall(cores))} by the clock; {why}"
 
 
-def _worker_bytes(work: Work) -> int:
-    return WORKER_BYTES + TASKS_HELD * work.task_bytes
-
-
-def _memory(work: Work, queue: Queue, cores: int) -> tuple[str, str]:
-    wanted = START_BYTES + cores * _worker_bytes(work)
-    why = f"{size(START_BYTES)}, and {size(_worker_bytes(work))} for each core"
-    if queue.memory is not None and wanted > queue.memory:
-        wanted, why = queue.memory, f"all of a node of {queue.name}"
-    return f"{max(1, wanted // 10**6)} MB", why
-
-
-def _walltime(work: Work, queue: Queue, cores: int) -> tuple[str, str]:
-    wall = work.wall(cores)
-    wanted = math.ceil((SAFETY * wall + EXTRA_S) / STEP_S) * STEP_S
-    why = f"{SAFETY:g} times the {whole(wall)}, and {whole(EXTRA_S)}"
-    if queue.limit_s is not None and wanted > queue.limit_s:
-        wanted, why = queue.limit_s, f"the longest time of {queue.name}; {why} would be more"
-    return clock(min(wanted, 9999 * 3600)), why
-
-
-def remarks(cluster: Cluster, work: Work, site: Site) -> list[str]:
-    """Return warnings: a job that the work does not fit in, or that the queue may never start."""
-    found = []
-    queue = site.queue(cluster.queue)
-    n_cores = cluster.cores * cluster.max_jobs
+def remarks(cluster: Cluster, work: Work) -> list[str]:
+    """Return warnings about a job that the work does not fit in."""
+    n_cores, limit_s = cluster.cores * cluster.max_jobs, cluster.walltime_s
     wall = work.wall(n_cores)
-    limit_s = cluster.walltime_s
+    found = []
     if cluster.max_jobs == 1 and wall > limit_s:
         n_jobs = math.ceil(wall / limit_s)
         found.append(
@@ -191,26 +163,4 @@ def remarks(cluster: Cluster, work: Work, site: Site) -> list[str]:
             f"on several nodes it takes less: --job max_jobs={jobs} takes about "
             f"{whole(work.wall(jobs * cluster.cores))} (docs/clusters.md, more than one node)"
         )
-    if site.queues and queue is None and cluster.queue is not None:
-        names = ", ".join(one.name for one in site.queues[:12])
-        found.append(f"queue {cluster.queue!r}: {TITLES[site.kind]} lists no such {site.word}, but {names}")
-    if queue is not None:
-        found += _too_much(cluster, queue, site)
     return found
-
-
-def _too_much(cluster: Cluster, queue: Queue, site: Site) -> list[str]:
-    """Return a warning for each value above the limit of the queue. Some sites never start such a job."""
-    asked = [
-        ("walltime", cluster.walltime_s, queue.limit_s, whole),
-        ("cores", cluster.cores, queue.cores, "{:.0f}".format),
-        ("memory", cluster.memory_bytes, queue.memory, size),
-    ]
-    most = {"walltime": "the longest time", "cores": "the cores of most nodes", "memory": "the memory of most nodes"}
-    return [
-        f"{key} is {show(value)}, above {most[key]} of {site.word} {queue.name}, {show(bound)}: "
-        f"{TITLES[site.kind]} may refuse the job or never start it; lower it (--job {key}=...) or choose another "
-        f"{site.word} (--job queue=...)"
-        for key, value, bound, show in asked
-        if bound is not None and value > bound
-    ]

@@ -16,16 +16,15 @@ from pipeline.compute.jobqueue import jobs_folder, worker_script
 from pipeline.layout.domains import check_starts
 from pipeline.layout.plan import make_plan
 from pipeline.layout.writing import write_atomically
-from pipeline.runs.batch import WORDS, coordinator_script, is_whole
+from pipeline.runs.batch import coordinator_script, is_whole
 from pipeline.runs.choosing import Choice, choose, no_command
 from pipeline.runs.derive import analyses_in
 from pipeline.runs.noise import check_steps
-from pipeline.runs.refusals import remedy
 from pipeline.runs.run import identity_here
 from pipeline.runs.scaling import in_scales
-from pipeline.runs.sites import Site, ask_site, no_default
 from pipeline.runs.sizing import Work, complete, measure
 from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.specification.batch_systems import SYSTEMS
 from pipeline.specification.clusters import Cluster, cluster_of
 from pipeline.specification.inputs import toml_of
 from pipeline.specification.parsing import load_spec
@@ -65,8 +64,6 @@ class Submission:
         Description of a job.
     reasons : dict of str
         Reason for each value of the job that was not given, by key.
-    site : Site
-        Queues of the batch system.
     work : Work
         Work that the run still has to do.
     script : str
@@ -86,17 +83,15 @@ class Submission:
     choice: Choice
     cluster: Cluster
     reasons: dict[str, str]
-    site: Site
     work: Work
     script: str
     worker: str | None
     complete: bool
     job: str | None = None
 
-    @property
-    def log(self) -> str:
-        """Path of the job's output, without the suffix that the batch system adds."""
-        return f"{self.folder}/coordinator"
+    def log_of(self, job: str) -> str:
+        """Return the path of the output of a job, by its number or a word for it."""
+        return f"{self.folder}/coordinator{SYSTEMS[self.cluster.kind].log.format(job=job)}"
 
     @property
     def has_table(self) -> bool:
@@ -158,11 +153,8 @@ def prepare(
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info is not None else {}
-    site = ask_site(choice.kind)
-    if site.queues and site.default is None and "queue" not in choice.table:
-        raise SpecError(no_default(site))
     work = measure(parsed, plan, done)
-    table, reasons = complete(choice.table, work, site)
+    table, reasons = complete(choice.table, work)
     described = cluster_of(table)
     file = choice.file or folder / TABLE
     name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', folder.stem)}"
@@ -175,7 +167,6 @@ def prepare(
         choice=choice,
         cluster=described,
         reasons=reasons,
-        site=site,
         work=work,
         script=coordinator_script(described, name, f"{folder}/coordinator", str(Path.cwd()), command),
         worker=None if is_whole(described) else worker_script(described, folder),
@@ -210,23 +201,23 @@ def send(submission: Submission) -> Submission:
         If the batch system does not accept the job.
     """
     kind = submission.cluster.kind
-    words = WORDS[kind]
-    if not shutil.which(words.send[0]):
-        raise SpecError(no_command(kind, words.send[0], f"{submission.retry} --cluster {kind}"))
+    system = SYSTEMS[kind]
+    if not shutil.which(system.send[0]):
+        raise SpecError(no_command(kind, system.send[0], f"{submission.retry} --cluster {kind}"))
     _refuse_second(submission)
     _make_folder(submission)
     script = submission.folder / SCRIPT
     write_atomically(script, submission.script)
     by_name, as_input = ([], submission.script) if kind == "lsf" else ([str(script)], None)
-    done = _ask([*words.send, *by_name], as_input)
-    job = words.job(done.stdout) if done.returncode == 0 else None
+    done = _ask([*system.send, *by_name], as_input)
+    job = system.job(done.stdout) if done.returncode == 0 else None
     if job is None:
         said = " ".join((done.stderr or done.stdout).split()) or f"exit code {done.returncode}"
-        advice = remedy(kind, said)
         raise SubmitError(
-            f"{words.send[0]} did not take the job: {said.rstrip('.')}.\n"
-            + (f"{advice}\n" if advice else "")
-            + f"The script is {script}."
+            f"{system.send[0]} did not take the job: {said.rstrip('.')}.\n"
+            f"Change what it names by --job KEY=VALUE, such as --job queue=NAME or --job walltime=HH:MM:SS: "
+            f"'{system.queues}' lists queues and their limits, {system.accounts} your accounts.\n"
+            f"The script is {script}."
         )
     write_atomically(submission.folder / SENT, json.dumps({"kind": kind, "job": job}) + "\n")
     return replace(submission, job=job)
@@ -243,18 +234,18 @@ def _refuse_second(submission: Submission) -> None:
     try:
         sent = json.loads((submission.folder / SENT).read_text("utf-8"))
         kind, job = sent["kind"], sent["job"]
-        words = WORDS[kind]
+        system = SYSTEMS[kind]
     except (OSError, ValueError, TypeError, KeyError):
         return  # no job was sent, or its note is lost; then the run's lock prevents a second computation
-    if not (isinstance(job, str) and words.job(f"<{job}>")) or not shutil.which(words.ask[0]):
+    if not (isinstance(job, str) and system.job(f"<{job}>")) or not shutil.which(system.ask[0]):
         return
-    done = _ask([*words.ask, job])
+    done = _ask([*system.ask, job])
     state = done.stdout.strip()
-    if done.returncode == 0 and state and not re.fullmatch(words.over, state):
+    if done.returncode == 0 and state and not re.fullmatch(system.over, state):
         named = f" ({state})" if "\n" not in state else ""
         raise LockedError(
             f"{submission.name}: job {job} of this run exists already{named}; wait for it "
-            f"({words.follow} {job}) or cancel it ({words.cancel} {job})."
+            f"({system.follow} {job}) or cancel it ({system.cancel} {job})."
         )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.specification.clusters import TITLES
+from pipeline.specification.batch_systems import SYSTEMS
 
 LOOKED_FOR = "sbatch (SLURM), bsub (LSF), qsub (PBS, Torque, Grid Engine)"
 ANSWER_S = 20.0
@@ -39,7 +39,7 @@ class System:
     @property
     def named(self) -> str:
         """Name and command, for messages."""
-        return f"{TITLES[self.kind]} ({self.command})"
+        return f"{SYSTEMS[self.kind].title} ({self.command})"
 
 
 def find_systems() -> list[System]:

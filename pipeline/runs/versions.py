@@ -1,15 +1,12 @@
-"""Tell which stored results of analyses hold: the versions of their code, and the attractors that they rest on."""
+"""Tell which stored results of analyses hold: the versions that decide them, and the attractors that they rest on."""
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
 from collections.abc import Mapping
-from functools import cache
-from pathlib import Path
 
-from magpend_core.source_digests import meaning_digest
+from magpend_core.versions import ENGINE
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.product import Analysis, Options
 from pipeline.products.registry import ANALYSES
@@ -19,66 +16,15 @@ from pipeline.store.run import Run
 
 OF_ATTRACTORS = "attractors.json"
 
-_ROOT = Path(__file__).parents[2]
-_COUNTED = ("pipeline.analysis", "pipeline.layout.vocabulary")
+
+def version_of(name: str) -> str:
+    """Return the numbers that decide the results of an analysis: of the engine, and of what it builds on."""
+    own = {one: ANALYSES[one].version for one in sorted(_parts(name))}
+    return ", ".join(f"{part} {number}" for part, number in {"engine": ENGINE, **own}.items())
 
 
-@cache
-def code_version(name: str) -> str:
-    """Return a digest of the code that decides the numbers of an analysis.
-
-    It covers the numerical core, the modules of `pipeline.analysis` that the analysis imports, directly or
-    not, and those of the analyses that it builds on. Comments, docstrings and the wording of errors do not
-    count.
-    """
-    from magpend_core import kernel_version
-
-    digest = hashlib.sha256(kernel_version().encode())
-    for module in sorted(modules_of(name)):
-        digest.update(f"{module} {meaning_digest([_file(module)])}\n".encode())
-    return digest.hexdigest()[:16]
-
-
-def modules_of(name: str) -> set[str]:
-    """Return the modules that an analysis imports, directly or indirectly."""
-    analysis = ANALYSES[name]
-    found: set[str] = set()
-    left = [analysis.compute.partition(":")[0]]
-    while left:
-        module = left.pop()
-        if module not in found:
-            found.add(module)
-            left += _imports(module)
-    for other in analysis.builds_on:
-        found |= modules_of(other)
-    return found
-
-
-@cache
-def _imports(module: str) -> tuple[str, ...]:
-    """Return the modules that a module imports and that count for the version of an analysis."""
-    names: list[str] = []
-    for node in ast.walk(ast.parse(_file(module).read_bytes())):
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-    return tuple(n for n in names if n.startswith(_COUNTED) and _is_module(n))
-
-
-def _is_module(name: str) -> bool:
-    try:
-        return _file(name).is_file()
-    except FileNotFoundError:
-        return False
-
-
-def _file(module: str) -> Path:
-    path = _ROOT.joinpath(*module.split("."))
-    for file in (path.with_suffix(".py"), path / "__init__.py"):
-        if file.is_file():
-            return file
-    raise FileNotFoundError(path)
+def _parts(name: str) -> set[str]:
+    return {name}.union(*(_parts(other) for other in ANALYSES[name].builds_on))
 
 
 def attractor_options(run: Run) -> AttractorOptions:
@@ -95,7 +41,7 @@ def current(run: Run, name: str) -> dict[str, str]:
     """Return the attributes of those results of an analysis that hold for the present cells and attractors of a run."""
     rests = rests_on_attractors(name)
     options = json.dumps(attractor_options(run).changed(), sort_keys=True) if rests else ""
-    found = {"derived_product": name, "cube_digest": run.digest, "analysis_version": code_version(name)}
+    found = {"derived_product": name, "cube_digest": run.digest, "analysis_version": version_of(name)}
     return {**found, "attractor_options": options}
 
 

@@ -9,14 +9,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from pipeline.specification.batch_systems import SYSTEMS
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, problems_of, unknown_key
 from pipeline.specification.tables import Table
 
-TITLES = {"slurm": "SLURM", "pbs": "PBS", "torque": "Torque", "sge": "Grid Engine", "lsf": "LSF"}
-"""Names of the batch systems that can start workers, for messages."""
-
-QUEUES = tuple(TITLES)
+QUEUES = tuple(SYSTEMS)
 
 _TIME = re.compile(r"(\d{1,4}):([0-5]\d):([0-5]\d)")
 _MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?([kMGT]i?)B")

@@ -41,17 +41,18 @@ class NoiseTable(Table):
         "that of the state over the square root of a second.",
     )
     interpretation: Literal["ito", "stratonovich"] | None = Field(
-        None, description="Stochastic integral; required where a strength depends on its own state."
+        default=None, description="Stochastic integral; required where a strength depends on its own state."
     )
-    seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of the noise.")
+    seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Seed of the noise.")
     steps_per_period: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = Field(
-        None, description=f"Equal steps per period; {STEPS} by default."
+        default=None, description=f"Equal steps per period; {STEPS} by default."
     )
     step: Annotated[float, Field(gt=0)] | None = Field(
-        None, description="Largest step [s], instead of their number: the next shorter one that divides the period."
+        default=None,
+        description="Largest step [s], instead of their number: the next shorter one that divides the period.",
     )
     tolerance: float = Field(
-        0.01,
+        default=0.01,
         gt=0,
         description="Largest change of the states within a period when the steps are halved, in units of their "
         "scales; a run is refused if a sample of its cells exceeds it.",

@@ -22,10 +22,10 @@ class DriveTable(Table):
 
     file: str = Field(min_length=1, description="Drive file (CSV), relative to the specification.")
     section_hz: Annotated[float, Field(gt=0)] | None = Field(
-        None, description="Sections per second of a torque; by default sections lie at its rising edges."
+        default=None, description="Sections per second of a torque; by default sections lie at its rising edges."
     )
-    sha256: str | None = Field(None, description="Digest of the file; filled in when the file is read.")
-    text: str | None = Field(None, description="The file's text; filled in when the file is read.")
+    sha256: str | None = Field(default=None, description="Digest of the file; filled in when the file is read.")
+    text: str | None = Field(default=None, description="The file's text; filled in when the file is read.")
 
 
 def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:

@@ -25,10 +25,10 @@ class SectionTable(Table):
     """
 
     of: str = Field(min_length=1, description="State that crosses the level.")
-    value: float = Field(0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
-    direction: Literal["up", "down"] = Field("up", description="Whether the state rises or falls there.")
+    value: float = Field(default=0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
+    direction: Literal["up", "down"] = Field(default="up", description="Whether the state rises or falls there.")
     longest: float = Field(
-        100.0, gt=0, description="Longest time between crossings [s]; a cell that takes longer does not return."
+        default=100.0, gt=0, description="Longest time between crossings [s]; a cell that takes longer does not return."
     )
 
     @property

@@ -31,14 +31,14 @@ class Table(BaseModel):
 class Range(Table):
     """Increasing values of an axis, given as ``start, stop, num``, as ``start, stop, step``, or as ``values``."""
 
-    start: float | None = Field(None, description="First value.")
-    stop: float | None = Field(None, description="Last value; with step, an upper bound.")
+    start: float | None = Field(default=None, description="First value.")
+    stop: float | None = Field(default=None, description="Last value; with step, an upper bound.")
     num: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = Field(
-        None, description="Number of evenly spaced values, both ends included."
+        default=None, description="Number of evenly spaced values, both ends included."
     )
-    step: Annotated[float, Field(gt=0)] | None = Field(None, description="Spacing, instead of num.")
+    step: Annotated[float, Field(gt=0)] | None = Field(default=None, description="Spacing, instead of num.")
     values: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] | None = Field(
-        None, description="All values, instead of the other keys."
+        default=None, description="All values, instead of the other keys."
     )
 
     @model_validator(mode="after")
@@ -116,13 +116,13 @@ class ParametersTable(Table):
         Annotated[Annotated[str, Tag("(name)")] | Annotated[PresetTable, Tag("(table)")], Discriminator(_name_or_table)]
         | None
     ) = Field(
-        None,
+        default=None,
         description="Preset of the model, by default the first; or a preset's file, FILE.toml, relative to "
         "the specification.",
     )
-    overrides: dict[str, float] = Field({}, description="Values by parameter name, in SI units.")
+    overrides: dict[str, float] = Field(default={}, description="Values by parameter name, in SI units.")
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(
-        None, description="Drive frequency [Hz], unless it is an axis."
+        default=None, description="Drive frequency [Hz], unless it is an axis."
     )
 
     @property
@@ -134,8 +134,10 @@ class ParametersTable(Table):
 class Continuation(Table):
     """The table ``[continuation]``: the parameter axis along which branches are followed, and the direction."""
 
-    path: str = Field(FREQUENCY, description="Axis that the branches follow: the continuation parameter.")
-    direction: Literal["up", "down", "both"] = Field("up", description="Direction in which the branches follow it.")
+    path: str = Field(default=FREQUENCY, description="Axis that the branches follow: the continuation parameter.")
+    direction: Literal["up", "down", "both"] = Field(
+        default="up", description="Direction in which the branches follow it."
+    )
 
     @property
     def directions(self) -> tuple[str, ...]:
@@ -146,35 +148,39 @@ class Continuation(Table):
 class Integration(Table):
     """The table ``[integration]``: tolerances, length of the transient, and section points kept for each trajectory."""
 
-    rtol: float = Field(defaults.RTOL, ge=1e-13, lt=1, description="Relative tolerance of a step.")
+    rtol: float = Field(default=defaults.RTOL, ge=1e-13, lt=1, description="Relative tolerance of a step.")
     atol: float = Field(
-        defaults.ATOL,
+        default=defaults.ATOL,
         gt=0,
         lt=1,
         description="Absolute tolerance of a step, in the states' units; or in units of the sizes "
         "that the motion gave them.",
     )
     method: Literal["dopri5", "dop853"] = Field(
-        "dopri5", description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations."
+        default="dopri5",
+        description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations.",
     )
     n_transient: int = Field(
-        300, ge=0, le=100_000_000, description="Drive periods or returns before sections are kept."
+        default=300, ge=0, le=100_000_000, description="Drive periods or returns before sections are kept."
     )
-    n_keep: int = Field(60, ge=1, le=1_000_000, description="Sections kept, one per drive period or return.")
+    n_keep: int = Field(default=60, ge=1, le=1_000_000, description="Sections kept, one per drive period or return.")
     max_steps_per_period: int = Field(
-        defaults.MOST_STEPS, ge=1, le=1_000_000_000, description="Attempted steps after which a cell is given up."
+        default=defaults.MOST_STEPS,
+        ge=1,
+        le=1_000_000_000,
+        description="Attempted steps after which a cell is given up.",
     )
     stop_when_closed: bool = Field(
-        False, description="Keep sections as soon as the orbit has closed, without waiting for n_transient."
+        default=False, description="Keep sections as soon as the orbit has closed, without waiting for n_transient."
     )
     closure_tolerance: float = Field(
-        defaults.CLOSURE,
+        default=defaults.CLOSURE,
         gt=0,
         lt=1,
         description="Scaled distance to a closed orbit below which a cell counts as closed.",
     )
     max_orbit_period: int = Field(
-        defaults.LONGEST_PERIOD,
+        default=defaults.LONGEST_PERIOD,
         ge=1,
         le=32_000,
         description="Longest orbit period that is detected [drive periods or returns].",
@@ -187,8 +193,8 @@ class Execution(Table):
     """
 
     trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
-        None, description="Cells or branches of a task; by default chosen by chunk size and time."
+        default=None, description="Cells or branches of a task; by default chosen by chunk size and time."
     )
     points_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
-        None, description="Points of the continuation that a task covers; by default chosen by time."
+        default=None, description="Points of the continuation that a task covers; by default chosen by time."
     )

@@ -11,6 +11,7 @@ from magpend_core.models.model import Model
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.conventions import conventional
+from pipeline.layout.first_versions import numbered
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import (
     drift_attributes,
@@ -70,7 +71,7 @@ def _attributes(run: OpenedRun) -> dict[str, Any]:
     attrs: dict[str, Any] = {
         "title": info.title,
         "source": f"magpend {info.versions.get('magpend', '(not installed)')}, "
-        f"kernel {info.identity['kernel_version']}",
+        f"engine {numbered(info.identity)['versions']['engine']}",
         **info.provenance,
         "kind": run.plan.kind,
         "model": model_attribute(run.spec.model),

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
@@ -55,7 +56,7 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
     if info is None:
         _refuse_foreign(files, names, digest_of(identity))
         return None
-    lines = differences(info.identity, identity)
+    lines = differences(numbered(info.identity), identity)
     if lines and all(line.startswith(_VERSIONS) for line in lines):
         raise RefusedError(_other_version(info, lines))
     if lines:
@@ -65,8 +66,8 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
     return info
 
 
-_VERSIONS = ("kernel_version: ", "code.")
-"""Keys of an identity that differ where only the version of magpend does."""
+_VERSIONS = "versions."
+"""Begin of the keys of an identity that differ where only the version of magpend does."""
 
 
 def _other_version(info: RunInfo, lines: list[str]) -> str:
@@ -235,7 +236,7 @@ def establish(
             echo(f"{CUBE}/{problem}: rebuilt from the specification")
         if rest:
             # another version of zarr writes other metadata: write all files and digests again
-            info = create(files, spec, plan, identity, info.spec_text)
+            info = create(files, spec, plan, info.identity, info.spec_text)
     damaged = verify(info, plan).damaged
     withdraw(info, damaged)
     for problem in damaged.values():

@@ -69,8 +69,9 @@ class StoredIdentity(Stored):
 
     refinement: int | None = None
     format: int | float
-    kernel_version: str
-    code: dict[str, str]
+    versions: dict[str, Count] | None = None
+    kernel_version: str | None = None
+    code: dict[str, str] | None = None
     spec: dict[str, Any]
     model_digest: str
     parameter_values: dict[str, int | float]

@@ -6,7 +6,7 @@ import pytest
 from magpend_core import Status, jacobian, lyapunov_exponents, polish_orbits, sections
 from magpend_core.lyapunov import MOST_LOSS
 from magpend_core.models.duffing.system import DUFFING
-from magpend_core.orbits import stroboscopic_map
+from tests.core.maps import stroboscopic_map
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
 CHAOTIC = [0.2, -1.0, 1.0, 0.3]  # damping, linear, cubic, amplitude of the chaotic Duffing oscillator

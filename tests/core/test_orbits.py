@@ -13,7 +13,8 @@ from magpend_core import load_preset, polish_orbits, run_branches
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.duffing.system import DUFFING
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from magpend_core.orbits import scaled_distance, section_map, stroboscopic_map, wrap_angles
+from magpend_core.orbits import scaled_distance, section_map, wrap_angles
+from tests.core.maps import stroboscopic_map
 
 # made by Newton's method on the stroboscopic map at rtol 1e-12 with other integrators: points agree
 # among them to 3e-11, multipliers are good to 1e-6

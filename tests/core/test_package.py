@@ -1,20 +1,20 @@
-"""The package as people import it: names without the compiler; and the version of the kernel."""
+"""The package as people import it: names without the compiler; and digests of sources."""
 
 import pytest
 
 import magpend_core
-from magpend_core.source_digests import kernel_version, meaning_digest
+from magpend_core.source_digests import meaning_digest
 
 
 @pytest.mark.slow
 def test_import__leaves_the_compiler_out(run_python):
     script = (
         "import sys, magpend_core\n"
-        "from magpend_core import ParameterError, Parameters, Status, kernel_version\n"
+        "from magpend_core import ParameterError, Parameters, Status\n"
         "from magpend_core import load_model, load_preset\n"
         "from magpend_core.status import Status as same\n"
         "assert Status is same and Status.PERIODIC == 1\n"
-        "kernel_version(), load_preset(q=1.5).pack(), load_model('duffing').digest, dir(magpend_core)\n"
+        "load_preset(q=1.5).pack(), load_model('duffing').digest, dir(magpend_core)\n"
         "print([m for m in ('numba', 'llvmlite', 'scipy') if m in sys.modules])\n"
     )
     assert run_python(script).strip() == "[]"
@@ -105,23 +105,3 @@ def test_meaning_digest__sees_names_and_places_of_files(digest, tmp_path):
     above = meaning_digest([tmp_path / "deep"])
     (tmp_path / "deep" / "one.py").rename(tmp_path / "deep" / "er" / "one.py")
     assert meaning_digest([tmp_path / "deep"]) != above
-
-
-def version_after(run_python, copied, name, old, new):
-    path = copied / "magpend_core" / name
-    text = path.read_text("utf-8")
-    assert text.count(old) == 1
-    path.write_text(text.replace(old, new), "utf-8")
-    return run_python("from magpend_core import kernel_version; print(kernel_version())", package=copied).strip()
-
-
-@pytest.mark.slow
-def test_kernel_version__follows_the_engines_meaning(run_python, copied):
-    edited = version_after(run_python, copied, "engine/lanes.py", "# accepted in this cell", "# so far")
-    assert edited == kernel_version()
-    edited = version_after(run_python, copied, "status.py", '"""Define the status codes', '"""List the status codes')
-    assert edited == kernel_version()
-    edited = version_after(run_python, copied, "models/parameters.py", 'FRACTION = "between', 'FRACTION = "in')
-    assert edited == kernel_version()  # models have digests of their own
-    edited = version_after(run_python, copied, "engine/lanes.py", "SAFETY = 0.85", "SAFETY = 0.84")
-    assert edited != kernel_version()

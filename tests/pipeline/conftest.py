@@ -130,7 +130,7 @@ def made(tmp_path, write_spec, sweep_text):
     path = write_spec(sweep_text)
     spec = load_spec(path)
     plan = make_plan(spec)
-    identity = identity_of(spec, plan, "test-kernel")
+    identity = identity_of(spec, plan)
     info = create(tmp_path / "run", spec, plan, identity, sweep_text)
 
     def values(index: int) -> dict[str, np.ndarray]:

@@ -82,7 +82,6 @@ DOUBLE_PENDULUM = Model(
     parameters=PARAMETERS,
     presets=tuple(Preset.read(path) for path in sorted((_ROOM / "presets").glob("*.toml"))),
     system_path=f"{__package__}.system:DOUBLE_PENDULUM",
-    sources=(Path(__file__), _ROOM / "system.py"),
     section="the drive's rising zero",
     quantities=QUANTITIES,
     mirror=Mirror((-1, -1, -1, -1), half_period=True),

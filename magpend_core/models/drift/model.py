@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.drift.ramps import Ramp, ramp_parameters
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Model
 from magpend_core.models.presets import Preset
-from magpend_core.source_digests import meaning_digest
+from magpend_core.versions import DRIFT, written
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from magpend_core.engine.system import System
-
-_CODE = Path(__file__).parent
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,7 +48,7 @@ class DriftingModel(Model):
     @cached_property
     def digest(self) -> str:
         """Return a digest of the model and of the code that moves its parameters."""
-        whole = f"{self.still.digest} {meaning_digest([_CODE])}"
+        whole = f"{self.still.digest} {written('drift', DRIFT)}"
         return hashlib.sha256(whole.encode()).hexdigest()[: len(self.still.digest)]
 
     def preset(self, name: str | Path | Preset | None = None) -> Preset:
@@ -96,11 +94,3 @@ def drifting(model: Model, ramps: tuple[Ramp, ...]) -> DriftingModel:
     presets = tuple(with_numbers(p, ramps) for p in model.presets)
     changes: dict[str, Any] = {"parameters": (*model.parameters, *more), "presets": presets}
     return DriftingModel(**{**own, **changes}, still=model, ramps=ramps)
-
-
-def stilled(parameters: Parameters) -> Parameters:
-    """Return the parameters for the model without the motion of its parameters."""
-    model = parameters.model
-    if not isinstance(model, DriftingModel):
-        return parameters
-    return Parameters(model.still, {name: parameters[name] for name in model.still.parameter_names})

@@ -8,8 +8,6 @@ A model of two functions: begin with it for a system of your own.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from magpend_core.models.model import Mirror, Model, Preset, Quantity, State
 from magpend_core.models.parameters import FINITE, NON_NEGATIVE, Parameter
 
@@ -52,7 +50,6 @@ DUFFING = Model(
     parameters=PARAMETERS,
     presets=tuple(Preset(name, values, dict.fromkeys(values, source)) for name, (values, source) in _SOURCES.items()),
     system_path=f"{__package__}.system:DUFFING",
-    sources=(Path(__file__), Path(__file__).with_name("system.py")),
     section="the drive's maximum",
     quantities=QUANTITIES,
     mirror=Mirror((-1, -1), half_period=True),

@@ -39,7 +39,6 @@ SIDES = Classifier(sides.WORDS, sides.NEUTRAL, "side of the fixed magnet on whic
 
 _ROOM = Path(__file__).parent
 _PRESETS = tuple(Preset.read(path) for path in sorted((_ROOM / "presets").glob("*.toml")))
-_SOURCES = tuple(_ROOM / f"{name}.py" for name in ("equations", "jacobian", "models", "quantities", "systems"))
 _DRIVES: dict[str, tuple[Any, str]] = {
     "": (groups.SQUARE_WAVE, "the drive's rising edge"),
     "-sine": (groups.SINE, "the drive's rising zero"),
@@ -58,7 +57,6 @@ def _model(name: str, title: str, drive: str, magnets: tuple[Any, ...], **more: 
         parameters=(*groups.LINKS, *groups.FRICTION, *driven, *magnets),
         presets=_PRESETS,
         system_path=f"{__package__}.systems:{attribute}",
-        sources=_SOURCES,
         section=section,
         quantities=LINK_QUANTITIES + (MAGNET_QUANTITIES if with_magnets else ()),
         classifier=SIDES if with_magnets else None,

@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.model import Model, ModelError
@@ -16,27 +15,10 @@ from magpend_core.models.text.derive import Derived, derive
 from magpend_core.models.text.generate import Source, source_of
 from magpend_core.models.text.graph import GraphError
 from magpend_core.models.text.scene import classifier_of, drawing_of
+from magpend_core.versions import TEXT, written
 
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
-
-_ROOM = Path(__file__).parent
-SOURCES = tuple(
-    _ROOM / f"{name}.py"
-    for name in (
-        "compiled",
-        "derive",
-        "derivatives",
-        "generate",
-        "graph",
-        "grammar",
-        "layers",
-        "runtime",
-        "sliding",
-        "switching",
-    )
-)
-"""What decides, with the text, what is integrated."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -96,10 +78,8 @@ class TextModel(Model):
         """Digest of a text model: of its equations in normal form, and of the code that translates them for the
         engine.
         """
-        from magpend_core.source_digests import meaning_digest
-
         # the source, too: what is found at the default parameters, edges say, is in it
-        parts = meaning_digest(self.sources), self.definition.meaning(), self.source.text
+        parts = written("text", TEXT), self.definition.meaning(), self.source.text
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
     @cached_property
@@ -120,7 +100,6 @@ def model_of(definition: Definition, shipped: bool = False) -> TextModel:
         parameters=definition.parameters,
         presets=definition.presets,
         system_path="",
-        sources=SOURCES,
         section=definition.section or section or "one instant of every period",
         quantities=definition.described,
         classifier=classifier_of(definition),

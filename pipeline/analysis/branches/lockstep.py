@@ -1,13 +1,8 @@
-"""Run many continuations side by side, so that their trajectories together fill the engine's SIMD lanes.
-
-A computation is a generator: it yields a `Query`, receives the `Value` of its problem, and returns its
-result. A single orbit would fill one lane of sixteen. One call serves all waiting computations, at little
-more than the cost of one. Each gets the same numbers as if it ran alone.
-"""
+"""Run many continuations side by side: each yields a `Query`, and receives the `Value` of its problem."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -15,6 +10,7 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
+from pipeline.analysis import together
 from pipeline.analysis.branches.problems import Ends, Problem, Rows, Value
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.products.reporting import report
@@ -41,30 +37,22 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
     tolerance of the integrations.
     """
     covered = [0.0] * len(computations)
-    results: dict[int, T] = {}
-    waiting: dict[int, Query] = {}
     seen: dict[int, tuple[float, float]] = {}
 
-    def advance(i: int, value: Value | None) -> None:
-        try:
-            waiting[i] = next(computations[i]) if value is None else computations[i].send(value)
-        except StopIteration as stop:
-            results[i], covered[i] = stop.value, 1.0
-
-    for i in range(len(computations)):
-        advance(i, None)
-    while waiting:
-        queries, waiting = waiting, {}
-        for i, value in zip(queries, _evaluate(list(queries.values()), rtol), strict=True):
-            advance(i, value)
-        for i in waiting:
-            last = float(queries[i].u[-1])
+    def answer(queries: dict[int, Query], results: Mapping[int, T]) -> dict[int, Value]:
+        for i, query in queries.items():
+            last = float(query.u[-1])
             low, high = seen.get(i, (last, last))
             seen[i] = min(low, last), max(high, last)
             covered[i] = min(seen[i][1] - seen[i][0], 0.9)
         if what:
-            report(what, round(sum(covered), 1), len(computations))
-    return [results[i] for i in range(len(computations))]
+            report(what, round(len(results) + sum(covered[i] for i in queries), 1), len(computations))
+        return dict(zip(queries, _evaluate(list(queries.values()), rtol), strict=True))
+
+    found = together.run_together(dict(enumerate(computations)), answer)
+    if what:
+        report(what, len(computations), len(computations))
+    return list(found.values())
 
 
 def run_alone(computation: Steps[T]) -> T:

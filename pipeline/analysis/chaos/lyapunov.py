@@ -286,7 +286,7 @@ def spectrum_of_jacobians(jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_tra
     A basis is carried along by the Jacobians and made orthonormal at each by QR; an exponent is the mean
     logarithm of the diagonal of R (Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15, 9 and 21,
     1980; Eckmann and Ruelle, Rev. Mod. Phys. 57, 617, 1985, sec. V). Divided by the time of an iterate they
-    are exponents of the flow: for the stroboscopic map (`magpend_core.orbits.stroboscopic_map`), times
+    are exponents of the flow: for the stroboscopic map (`magpend_core.orbits.section_map`), times
     the frequency.
 
     Parameters

@@ -15,6 +15,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.resilience.shocks import Found, Search, Trials
+from pipeline.analysis.together import run_together
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.products.reporting import report
@@ -159,7 +160,7 @@ class Asked:
     which: np.ndarray
 
 
-def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, Found]:
+def search_together(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, Found]:
     """Run searches for shocks in step, so that their trajectories fill the engine's lanes together.
 
     Returns
@@ -167,25 +168,18 @@ def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, wha
     dict
         Result of each search.
     """
-    labels: dict[str, np.ndarray | None] = dict.fromkeys(asked)
-    results: dict[str, Found] = {}
     n_followed = 0
-    while labels:
+
+    def answer(trials: dict[str, Trials], results: Mapping[str, Found]) -> dict[str, np.ndarray]:
+        nonlocal n_followed
         report(what, n_followed, 0)
-        trials: dict[str, Trials] = {}
-        for key, label in labels.items():
-            try:
-                trials[key] = asked[key].search.send(label)  # type: ignore[arg-type]
-            except StopIteration as stop:
-                results[key] = stop.value
-        if not trials:
-            break
         states, phase = zip(*(_states(trial, asked[key], scales) for key, trial in trials.items()), strict=True)
         found = shocked.labels(np.concatenate(states), np.concatenate(phase))
         n_followed += len(found)
         ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
-        labels = dict(zip(trials, np.split(found, ends), strict=True))
-    return results
+        return dict(zip(trials, np.split(found, ends), strict=True))
+
+    return run_together({key: one.search for key, one in asked.items()}, answer)
 
 
 def _states(trials: Trials, asked: Asked, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ from pipeline.analysis.basins.basins import check_starts
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, rows_at
-from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer, bases_of
+from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, bases_of, search_together
 from pipeline.analysis.resilience.shocks import Found, Settings, ShockSearch, Trials
 from pipeline.analysis.run import Run
 from pipeline.analysis.selection import select_points
@@ -137,7 +137,7 @@ class _Point:
             asked[f"{number} any"] = self._search(number, at_section, every, seeds)
             for i in every:
                 asked[f"{number} {i}"] = self._search(number, at_section, np.array([i]))
-        found = answer(asked, Shocked(self._there), self._scales, "trajectories after shocks")
+        found = search_together(asked, Shocked(self._there), self._scales, "trajectories after shocks")
         keys = {key: key.split() for key in found}
         return {(int(n), what): (found[key], asked[key].bases) for key, (n, what) in keys.items()}
 

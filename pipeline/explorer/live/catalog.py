@@ -30,6 +30,7 @@ from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.limit_cycles import number_of_cycle, tell_cycles
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.spirals import Recurrence
+from pipeline.analysis.ragged import N_IDS, dense, dims_of, isel
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import SAME_SECONDS, STRICT
 from pipeline.explorer.data.series import orbit_series
@@ -103,8 +104,8 @@ class Known:
         """Return the stored attractors of this parameter point; None if there are none."""
         if self.attractors is None or self.index is None or self.cells is None:
             return None
-        dims, _ = split_dims(self.attractors["attractor_id"])
-        return self.attractors.isel(dict(zip(dims, self.index, strict=True)))
+        at = dict(zip(dims_of(self.attractors), self.index, strict=True))
+        return dense(isel(self.attractors, at), points=True)
 
 
 class Catalog:
@@ -132,7 +133,7 @@ class Catalog:
         self._orbits: list[Orbit] = []
         self._orbit_entries: list[int] = []
         self._sets: list[tuple[Entry, Cloud]] = []
-        self.n_ids = 0 if known.attractors is None else known.attractors.sizes["attractor"]
+        self.n_ids = 0 if known.attractors is None else int(known.attractors.attrs[N_IDS])
         if here is not None and known.cells is not None:
             self._take(here, known.cells)
 

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.status import Status
+from pipeline.analysis.ragged import dims_of, isel
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live.catalog import Catalog, Entry
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES
@@ -34,8 +35,7 @@ class Legend:
         self._colours: dict[int, str] = {}
         if attractors is not None:
             index = catalog.place.index
-            dims = [d for d in attractors["kind"].dims if d != "attractor"]
-            part = attractors if index is None else attractors.isel(dict(zip(dims, index, strict=True)))
+            part = attractors if index is None else isel(attractors, dict(zip(dims_of(attractors), index, strict=True)))
             cast = cast_of(attractors, part)
             self._names, self._colours = cast.names, cast.colours
         taken = {self._colours[i] for i in ids}

@@ -17,7 +17,6 @@ import xarray as xr
 from magpend_core.equilibria import newton_steps
 from magpend_core.models.parameters import ParameterError
 from magpend_core.orbits import section_map
-from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.series import orbit_series
 from pipeline.explorer.live.catalog import Catalog, Known
 from pipeline.explorer.live.jobs import PATIENCE_S
@@ -211,8 +210,7 @@ class LiveRun:
         """Attractors that an analysis of the run has stored; None if there are none."""
         with self._lock:
             if self._attractors is None:
-                found = stored(self.run, "attractors")
-                self._attractors = None if found is None else dense(found, points=True)
+                self._attractors = stored(self.run, "attractors")
             return self._attractors
 
     def catalog(self, place: Place) -> Catalog:

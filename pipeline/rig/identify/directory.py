@@ -22,9 +22,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from magpend_core import kernel_version
 from magpend_core.models.imported import is_object_path
-from magpend_core.source_digests import meaning_digest
+from magpend_core.versions import ENGINE
+from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import canonical, differences, digest_of
 from pipeline.layout.writing import sync_folder, write_atomically
 from pipeline.rig.identify.measured_orbits import MeasuredTable
@@ -52,13 +52,8 @@ ORBITS = "orbits-{}.nc"
 
 POSTERIOR = "posterior.nc"
 
-_ROOM = Path(__file__).parent
-_NOT_NUMBERS = (
-    "attractor_spread.py", "bands.py", "check.py", "check_orbits.py", "comparison.py", "directory.py", "figures.py",
-    "log_posterior.py", "orbit_reports.py", "posterior.py", "posterior_files.py", "posterior_runs.py", "reports.py",
-    "residuals.py", "sampling.py",
-)  # fmt: skip
-"""Modules that do not affect the numbers."""
+FIT = 1
+"""Number of the results of identifications, see `magpend_core.versions`."""
 
 
 @dataclass(frozen=True)
@@ -157,17 +152,11 @@ def identity_of(
     for table, measured in zip(tables["orbits"], orbits, strict=True):
         table.pop("file", None)
         table["data"] = measured.as_dict()
-    own = [p for p in _ROOM.glob("*.py") if p.name not in _NOT_NUMBERS]
     return {
         "format": FORMAT,
         "spec": tables,
-        "kernel_version": kernel_version(),
         "model_digest": spec.model.digest,
-        "code": {
-            "identify": meaning_digest(own),
-            "recordings": meaning_digest([_ROOM.parent / "recordings"]),
-            "measured_branch": meaning_digest([_ROOM.parent / "measured_branch"]),
-        },
+        "versions": {"engine": ENGINE, "fit": FIT},
     }
 
 
@@ -239,7 +228,7 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
             )
         return None
     info = read_info(directory)
-    lines = differences(info.identity, identity)
+    lines = differences(numbered(info.identity), identity)
     if lines:
         raise RefusedError(
             f"{directory}: holds another identification. Give another --out, or remove it. Differences:\n  "

@@ -18,7 +18,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magpend_core.source_digests import meaning_digest
 from pipeline.layout.identity import digest_of
 from pipeline.products.reporting import report
 from pipeline.rig.identify.directory import OUTCOMES, Outcomes, read_info
@@ -37,6 +36,9 @@ LONG = 50.0
 
 ALIKE = 1.05
 """Split R-hat up to which the halves of the chain agree. An ensemble that is `LONG` has about 1.02."""
+
+CHAINS = 1
+"""Number of the results of chains, see `magpend_core.versions`."""
 
 LEAST_ACCEPTED = 0.1
 """Least share of accepted moves; with fewer, the walkers hardly move."""
@@ -160,9 +162,8 @@ class _Blocks:
     """Stored blocks of one chain; its key is everything that decides its numbers."""
 
     def __init__(self, directory: str | Path, seed: int, n_walkers: int) -> None:
-        info, room = read_info(directory), Path(__file__).parent
-        code = meaning_digest([room / "log_posterior.py", room / "sampling.py"])
-        key = {"digest": info.digest, "code": code, "seed": seed, "walkers": n_walkers, "block": BLOCK}
+        info = read_info(directory)
+        key = {"digest": info.digest, "version": CHAINS, "seed": seed, "walkers": n_walkers, "block": BLOCK}
         self._outcomes = Outcomes(info.directory / OUTCOMES)
         self._name = f"chain-{digest_of(key)[:8]}"
         self.n_recalled = 0

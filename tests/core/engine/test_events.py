@@ -18,8 +18,9 @@ from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import absolute
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
-from magpend_core.orbits import polish_orbits, stroboscopic_map
+from magpend_core.orbits import polish_orbits
 from magpend_core.sampling import sample
+from tests.core.maps import stroboscopic_map
 
 
 @inline

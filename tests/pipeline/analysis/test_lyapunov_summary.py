@@ -5,9 +5,9 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from magpend_core import Status, load_preset, lyapunov_exponents
-from magpend_core.orbits import stroboscopic_map
 from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
 from pipeline.plots import plot_lyapunov, plot_lyapunov_map
+from tests.core.maps import stroboscopic_map
 
 from .cubes import exponents_cube
 from .maps import henon, slopes_of

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer
+from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, search_together
 from pipeline.analysis.resilience.edge_table import edge_table
 from pipeline.analysis.resilience.shocks import Settings, ShockSearch
 from pipeline.analysis.resilience.table import resilience_table
@@ -251,7 +251,7 @@ def test_shocks__magnetic_pendulum_as_published(magnets):
     for state, least in ((place, 0.3923), (resting[own], 0.40204)):
         bases, which = Bases(state[None], np.zeros(1), np.ones(1, bool)), np.array([0, 1])
         search = ShockSearch(own, 1, 2, settings)
-        one = answer({"it": Asked(search.run(), bases, which)}, Shocked(there), np.ones(4), "")["it"]
+        one = search_together({"it": Asked(search.run(), bases, which)}, Shocked(there), np.ones(4), "")["it"]
         assert one.high == pytest.approx(least, abs=1e-4)
         assert one.leads_to in {0, 1, 2} - {own}
 

@@ -15,7 +15,6 @@ import magpend
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.plots import bifurcation
-from pipeline.products.guide import ANALYSIS_GUIDE, FIGURE_GUIDE
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
@@ -40,7 +39,7 @@ def test_help__names_the_page_of_exit_codes_once(main):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("verb", "guide", "names"), [("analyse", ANALYSIS_GUIDE, COMMANDS), ("plot", FIGURE_GUIDE, tuple(FIGURES))]
+    ("verb", "guide", "names"), [("analyse", ANALYSES.groups, COMMANDS), ("plot", FIGURES.groups, tuple(FIGURES))]
 )
 def test_help__groups_products_by_what_they_need(main, verb, guide, names):
     needs = {name: words for group in guide.values() for name, words in group.items()}

@@ -13,9 +13,10 @@ import pytest
 from pipeline.compute import probe
 from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.clients import Where, connected
-from pipeline.compute.jobqueue import _CLASSES, settings
+from pipeline.compute.jobqueue import settings
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import run
+from pipeline.specification.batch_systems import SYSTEMS
 from pipeline.specification.clusters import load_cluster
 
 SPEC = """
@@ -211,7 +212,7 @@ def test_worker_script(tmp_path, kind):
     dask_jobqueue = pytest.importorskip("dask_jobqueue")
     path = tmp_path / "cluster.toml"
     path.write_text(CLUSTER.replace("KIND", kind))
-    job = getattr(dask_jobqueue, _CLASSES[kind]).job_cls
+    job = getattr(dask_jobqueue, SYSTEMS[kind].jobqueue).job_cls
     options = settings(load_cluster(path), tmp_path / "logs")
     script = job("tls://SCHEDULER:PORT", name="NAME", **options).job_script()
     assert script.startswith("#!")

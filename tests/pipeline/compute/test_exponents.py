@@ -103,7 +103,7 @@ def test_lyapunov__pending_cells_have_none(tmp_path):
     (tmp_path / "spec.toml").write_text(SPEC)
     spec = load_spec(tmp_path / "spec.toml")
     plan = make_plan(spec)
-    create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test"), SPEC)
+    create(tmp_path / "run", spec, plan, identity_of(spec, plan), SPEC)
     found = open_run(tmp_path / "run")
     assert (found.lyapunov_flag == LyapunovFlag.ABSENT).all()
     assert np.isnan(found.lyapunov).all()

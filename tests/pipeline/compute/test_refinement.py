@@ -374,7 +374,7 @@ def test_identity__refinement_counts():
     for change in ("refine = 8\n", "refine = 4\n", ""):
         spec = parse_spec(tomllib.loads(text.replace("refine = 8\n", change)))
         assert parse_spec(spec.as_dict()) == spec
-        found[change] = identity_of(spec, make_plan(spec), "k")
+        found[change] = identity_of(spec, make_plan(spec))
     assert found["refine = 8\n"]["refinement"] == REFINEMENT
     assert "refinement" not in found[""]
     assert "refine" not in found[""]["spec"]["initial_conditions"]

@@ -385,7 +385,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
     (tmp_path / "spec.toml").write_text(text, "utf-8")
     spec = load_spec(tmp_path / "spec.toml")
     plan = make_plan(spec)
-    create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test-kernel"), text)
+    create(tmp_path / "run", spec, plan, identity_of(spec, plan), text)
     explored = ExploredRun.of(tmp_path / "run")
     view = describe_view(explored, False)
     assert view["commands"] == {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -92,14 +91,13 @@ def test_task__out_of_range(sweep_text):
 
 
 def test_identity__what_counts(sweep_text):
-    def digest(text, kernel="k"):
+    def digest(text):
         spec = parse_spec(tomllib.loads(text))
-        return digest_of(identity_of(spec, make_plan(spec), kernel))
+        return digest_of(identity_of(spec, make_plan(spec)))
 
     same = digest(sweep_text)
     assert digest(sweep_text.replace("small sweep", "another title")) == same
     assert digest(sweep_text.replace("stop = 30", "stop = 30.0")) == same
-    assert digest(sweep_text + "\n", "other kernel") != same
     for old, new in [("n_keep = 3", "n_keep = 4"), ("1.6]", "1.7]"), ("= 24", "= 12"), ("rtol = 1e-6", "rtol = 1e-7")]:
         assert digest(sweep_text.replace(old, new)) != same
 
@@ -117,7 +115,7 @@ def test_digest_of__numbers_without_loss():
 def test_identity__other_starts_under_the_same_specification(sweep_text, monkeypatch):
     """Another version of what makes numbers of a specification is another run."""
     spec = parse_spec(tomllib.loads(sweep_text))
-    before = identity_of(spec, make_plan(spec), "k")
+    before = identity_of(spec, make_plan(spec))
     original = identity.coordinates
 
     def moved(spec):
@@ -127,45 +125,18 @@ def test_identity__other_starts_under_the_same_specification(sweep_text, monkeyp
         return tuple(found)
 
     monkeypatch.setattr(identity, "coordinates", moved)
-    lines = differences(before, identity_of(spec, make_plan(spec), "k"))
+    lines = differences(before, identity_of(spec, make_plan(spec)))
     assert [line.split(":")[0] for line in lines] == ["coordinates"]
 
 
-def test_code_version__changes_with_its_meaning(monkeypatch, tmp_path):
-    folder = tmp_path / "pipeline"
-    (folder / "layout").mkdir(parents=True)
-    shutil.copy(ROOT / "pipeline/layout/cells.py", folder / "layout")
-    monkeypatch.setattr(identity, "_PIPELINE", folder)
-
-    def version():
-        identity.code_version.cache_clear()
-        return identity.code_version("layout.cells")
-
-    before = version()
-    cells = folder / "layout/cells.py"
-    text = cells.read_text()
-    cells.write_text('"""Another first sentence."""\n# a comment\n' + text)
-    assert version() == before
-    assert "math.pi / 180" in text
-    cells.write_text(text.replace("math.pi / 180", "math.pi / 181"))
-    assert version() != before
-    identity.code_version.cache_clear()
-
-
-def test_identity__code_of_what_is_computed(sweep_text):
+def test_identity__versions_of_what_is_computed(sweep_text):
     """A product that a run does not ask for bars nobody from completing it."""
     plain = parse_spec(tomllib.loads(sweep_text))
     spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
-    assert identity.code_of(plain) == ["motion.steady", "layout.cells", "compute.integrate", "compute.task"]
-    assert identity.code_of(spectra) == [
-        "motion.steady",
-        "layout.cells",
-        "compute.integrate",
-        "compute.task",
-        "compute.exponents",
-    ]
-    lines = differences(*(identity_of(s, make_plan(s), "k") for s in (plain, spectra)))
-    assert any(line.startswith("code.compute.exponents: (absent)") for line in lines)
+    assert set(identity.versions_of(plain)) == {"engine", "cells"}
+    assert set(identity.versions_of(spectra)) == {"engine", "cells", "lyapunov"}
+    lines = differences(*(identity_of(s, make_plan(s)) for s in (plain, spectra)))
+    assert any(line.startswith("versions.lyapunov: (absent)") for line in lines)
 
 
 def test_differences__key_by_key():

@@ -12,6 +12,7 @@ import pipeline.plots
 from pipeline.layout.attractor_letters import letter
 from pipeline.plots import Frame, plot_basins, plot_coexisting, plot_fractions, plot_gallery
 from pipeline.plots.labels import with_unit
+from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import DUFFING, legend_texts, make_attractors, make_portraits, plot_regimes
 
 CELLS = ("frequency", "initial_condition")
@@ -34,14 +35,14 @@ def test_attractor_figures__without_angles_and_classifier():
 def test_plot_gallery__portraits_that_the_model_names_and_no_path(n):
     found = make_attractors([list(range(n))], CELLS, {"frequency": [2.2]}, attrs=DUFFING)
     portraits = make_portraits(n, ("x", "v"))
-    figure = plot_gallery(found, portraits, frame=Frame(178.0))
+    figure = plot_gallery(rows_of(found), portraits, frame=Frame(178.0))
     assert [ax.get_xlabel() for ax in figure.axes] == ["$x$ [m]"] * n
     assert [ax.get_ylabel() for ax in figure.axes] == [r"$\dot{x}$ [m/s]"] * n
     assert legend_texts(figure) == ["once per drive period"]
     # half of a figure of full width was empty if there was one panel
     assert figure.axes[0].get_position().width > 0.8 / n - 0.05
     with pytest.raises(ValueError, match="portraits of duffing have no angle"):
-        plot_gallery(found, portraits, degrees=True)
+        plot_gallery(rows_of(found), portraits, degrees=True)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from pipeline.plots import (
     plot_trajectory,
 )
 from pipeline.plots.style import COLUMN_MM
+from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import DUFFING, PENDULUM, make_attractors, make_portraits
 from tests.pipeline.plots.test_door import make_cube
 from tests.pipeline.plots.test_trajectory import STATES, make_trajectory
@@ -76,7 +77,7 @@ def test_gallery__no_label_covers_a_panel_or_another_label(n, width):
     """Labels of paths, which have many digits, covered each other and the panel on the left."""
     portraits = make_portraits(n)
     portraits["orbit"] = 0.05 * portraits["orbit"] + 0.2
-    figure = plot_gallery(make_attractors(np.arange(n), ("initial_condition",)), portraits, frame=Frame(width))
+    figure = plot_gallery(rows_of(make_attractors(np.arange(n), ("initial_condition",))), portraits, frame=Frame(width))
     is_clear(figure)
     panels = [ax.get_window_extent() for ax in figure.axes]
     for text, box in texts_of(figure):

@@ -23,10 +23,12 @@ from pipeline.analysis.branches.curves_dataset import curves_dataset
 from pipeline.analysis.branches.problems import Family, Value
 from pipeline.analysis.branches.table import curves_table
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.layout import vocabulary
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS
 from pipeline.plots import palette, plot_basins, plot_coexisting, plot_curves, plot_fractions, plot_gallery, save_figure
+from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import (
     VALUES,
     by_gid,
@@ -415,7 +417,7 @@ def test_attractor_figures__say_how_many_cells_are_left_out_and_why(map_of_two, 
     assert "cells end on attractors" not in caption_of(plot_coexisting(sweep.isel(frequency=[0])))
     attractors = make_attractors([0, 1, -1, -1, -1, -1], ("initial_condition",))
     attractors["status"][2:] = [vocabulary.DIVERGED] * 3 + [vocabulary.UNREACHED]
-    head = " ".join(plot_gallery(attractors, make_portraits(2)).texts[0].get_text().split())
+    head = " ".join(plot_gallery(rows_of(attractors), make_portraits(2)).texts[0].get_text().split())
     assert head.endswith("2 of 6 cells end on attractors; 3 diverged, 1 unreached")
 
 
@@ -473,7 +475,7 @@ def test_plot_regimes__not_periodic_and_one_parameter(map_of_two, sweep):
 def test_plot_gallery__orbits_sections_and_paths():
     attractors = make_attractors(range(3), ("initial_condition",))
     drawn = make_portraits(3, turning=(2,))
-    fig = plot_gallery(attractors, drawn)
+    fig = plot_gallery(rows_of(attractors), drawn)
     lines = by_gid(fig)
     for i, mark in enumerate("AB"):
         orbit = drawn["orbit"].values[i]
@@ -499,11 +501,11 @@ def test_plot_gallery__largest_shares_are_drawn():
     attractors = make_attractors(range(11), ("initial_condition",))
     portraits = make_portraits(11)
     portraits["share"][0] = 0.0
-    fig = plot_gallery(attractors, portraits)
+    fig = plot_gallery(rows_of(attractors), portraits)
     assert fig.data["attractor"].values.tolist() == list(range(1, 9))
     assert any("3 more sets" in t.get_text() for t in fig.texts)
     with pytest.raises(ValueError, match="no attractor at this parameter point"):
-        plot_gallery(attractors, portraits.isel(attractor=[]))
+        plot_gallery(rows_of(attractors), portraits.isel(attractor=[]))
 
 
 def test_greys__every_cell_without_an_attractor_has_one():
@@ -562,7 +564,7 @@ def test_plot_fractions__branches_are_no_sample(walk):
 @pytest.mark.slow
 def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
     fig = plot_regimes(map_of_two)
-    here = fig.data.sel(frequency=2.0, q=1.5)
+    here = dense(fig.data).sel(frequency=2.0, q=1.5)
     assert here["share"].values.tolist() == [0.5, 0.5]
     within = (fig.data["low"] <= fig.data["share"]) & (fig.data["share"] <= fig.data["high"])
     assert (within == (fig.data["share"] > 0)).all()

@@ -9,6 +9,7 @@ from matplotlib.colors import to_rgb
 
 from pipeline.layout.vocabulary import BOUNDED, CHAOTIC_SET, TRANSIENT
 from pipeline.plots import Frame, palette, pixels, plot_bifurcation, plot_section
+from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import DUFFING, make_attractors
 
 
@@ -87,7 +88,7 @@ def test_plot_section__colours_of_attractors():
     ds = make_sections()
     ids = make_attractors([0, 1, 1, -1], ("initial_condition",), attrs=DUFFING, status=np.full(4, BOUNDED, np.int8))
     ids["kind"][:], ids["orbit_period"][:] = CHAOTIC_SET, 0
-    figure = plot_section(ds, ids)
+    figure = plot_section(ds, rows_of(ids))
     lines = {line.get_gid(): line for line in figure.axes[0].get_lines()}
     assert set(lines) == {"points:A: chaotic", "points:B: chaotic", "points:not settled"}
     np.testing.assert_array_equal(np.sort(lines["points:A: chaotic"].get_xdata()), np.sort(ds["section"][0, :, 0]))
@@ -95,7 +96,7 @@ def test_plot_section__colours_of_attractors():
     assert len(set(colours)) == 3
     # what does not attract has no colour of its own
     ids["stability"][0] = TRANSIENT
-    lines = {line.get_gid(): line for line in plot_section(ds, ids).axes[0].get_lines()}
+    lines = {line.get_gid(): line for line in plot_section(ds, rows_of(ids)).axes[0].get_lines()}
     assert set(lines) == {"points:on a transient set", "points:B: chaotic", "points:not settled"}
     assert lines["points:on a transient set"].get_color() == to_rgb(palette.GREYS["on a transient set"])
 

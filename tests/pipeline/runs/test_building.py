@@ -114,7 +114,7 @@ def built():
 
 
 def identity(spec):
-    return identity_of(spec, make_plan(spec), "kernel")
+    return identity_of(spec, make_plan(spec))
 
 
 def same_run(spec, text):

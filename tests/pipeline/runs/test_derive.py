@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import json
 import multiprocessing
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
+from magpend_core.versions import ENGINE
 from pipeline.products.product import Analysis, Options, option
 from pipeline.products.registry import ANALYSES
 from pipeline.runs import derive as deriving
@@ -32,11 +34,11 @@ class MeanOptions(Options):
 def register(patch, compute):
     """Put an analysis named ``mean`` beside the others, computed by a function."""
     mean = Analysis("mean", "A mean.", MeanOptions, compute="tests:mean", table="tests:none")
-    real, version = deriving.function_of, versions.code_version
+    real, version = deriving.function_of, versions.version_of
     patch.setattr(deriving, "function_of", lambda name: compute if name == "tests:mean" else real(name))
     for module in (deriving, versions):
         patch.setattr(module, "ANALYSES", {**ANALYSES, "mean": mean})
-    patch.setattr(versions, "code_version", lambda name: "test" if name == "mean" else version(name))
+    patch.setattr(versions, "version_of", lambda name: "test" if name == "mean" else version(name))
     return compute
 
 
@@ -123,30 +125,23 @@ def test_derive__other_options_cells_and_code_compute_again(made, compute, monke
     withdraw(made.info, ["000001.json"])
     xr.testing.assert_identical(derive(directory, "mean", {"a": 1}), before)
     assert compute.calls == 3
-    monkeypatch.setattr(versions, "code_version", lambda name: "another")
+    monkeypatch.setattr(versions, "version_of", lambda name: "another")
     derive(directory, "mean", {"a": 1})
     assert compute.calls == 4
 
 
-def test_code_version__follows_what_an_analysis_imports(monkeypatch):
-    """An edit of one analysis makes those stale that build on it, and no other."""
-    edited = versions._file("pipeline.analysis.basins.wada")
-    before = {name: versions.code_version(name) for name in ANALYSES}
-    real = versions.meaning_digest
-    monkeypatch.setattr(
-        versions, "meaning_digest", lambda paths: "edited" if list(paths) == [edited] else real(list(paths))
-    )
-    versions.code_version.cache_clear()
-    after = {name: versions.code_version(name) for name in ANALYSES}
-    versions.code_version.cache_clear()
-    assert [name for name in ANALYSES if before[name] != after[name]] == ["basins", "overlaps", "resilience", "edge"]
+def test_version_of__names_what_an_analysis_builds_on():
+    assert versions.version_of("basins").startswith(f"engine {ENGINE}, ")
+    assert f"attractors {ANALYSES['attractors'].version}" in versions.version_of("basins")
+    assert f"basins {ANALYSES['basins'].version}" in versions.version_of("basins")
+    assert "basins" not in versions.version_of("attractors")
 
 
 def test_builds_on__is_what_the_code_derives():
     """Every analysis that a function derives is declared, so that an edit of it is seen."""
     for name, analysis in ANALYSES.items():
         module, _, function = analysis.compute.partition(":")
-        tree = ast.parse(versions._file(module).read_text())
+        tree = ast.parse(Path(find_spec(module).origin).read_text())
         (body,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
         derived = {
             node.args[0].value

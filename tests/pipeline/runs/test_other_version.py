@@ -37,7 +37,7 @@ def made_by(directory, **changes):
     """Let another version have made a run: rewrite its identity, and the digest in all its files."""
     data = unseal((directory / "run.json").read_bytes())
     before = data["digest"]
-    data["identity"] |= changes
+    data["identity"] = {key: value for key, value in (data["identity"] | changes).items() if value is not None}
     after = data["digest"] = digest_of(data["identity"])
     group = directory / "cube.zarr/zarr.json"
     group.write_text(group.read_text().replace(before, after))
@@ -50,13 +50,48 @@ def made_by(directory, **changes):
     (directory / "records.jsonl").unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("key", ["kernel_version", "code"])
-def test_run__of_another_version(main, write_spec, tmp_path, key):
-    spec = write_spec(SPEC)
-    directory = tmp_path / "begun"
+FIRST = {
+    "kernel_version": "433ffff3fca2c718",
+    "code": {
+        "compute.integrate": "8d946736bc2d348c",
+        "compute.task": "e9ce1f0744f9cc3c",
+        "layout.cells": "8f83262db4988cca",
+    },
+}
+"""Versions as runs had them when they were digests of source code."""
+
+
+def begun_by(write_spec, tmp_path, **versions):
+    """Return the specification and the directory of a run that code of other versions has begun, without its last task;
+    and the bytes of that task.
+    """
+    spec, directory = write_spec(SPEC), tmp_path / "begun"
     run(spec, directory, workers=0, echo=lambda _: None)
-    (directory / marker_key(2)).unlink()
-    made_by(directory, **{key: "earlier" if key == "kernel_version" else {"compute.task": "earlier"}})
+    made_by(directory, **versions)
+    last = directory / marker_key(2)
+    content = last.read_bytes()
+    last.unlink()
+    return spec, directory, content
+
+
+def test_run__of_versions_that_were_digests_goes_on(write_spec, tmp_path):
+    spec, directory, last = begun_by(write_spec, tmp_path, versions=None, **FIRST)
+    before = (directory / "run.json").read_bytes()
+    run(spec, directory, workers=0, echo=lambda _: None)
+    assert (directory / marker_key(2)).read_bytes() == last
+    assert (directory / "run.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "versions",
+    [
+        {"versions": {"engine": 1000, "cells": 1}},
+        {"versions": None, **FIRST, "kernel_version": "0123456789abcdef"},
+        {"versions": None, **FIRST, "code": FIRST["code"] | {"compute.task": "0123456789abcdef"}},
+    ],
+)
+def test_run__of_another_version(main, write_spec, tmp_path, versions):
+    spec, directory, _ = begun_by(write_spec, tmp_path, **versions)
     code, _, err = main("run", spec, "--out", directory, "--workers", "0")
     assert code == Exit.REFUSED
     for words in (

@@ -19,6 +19,7 @@ from magpend_core import load_preset, run_branches
 from pipeline import open_run
 from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
+from pipeline.layout import identity
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import InterruptedRunError, run
@@ -191,12 +192,10 @@ def test_run__changed_spec_is_refused(write_spec, sweep_text, tmp_path, bytes_of
 
 
 def test_run__other_kernel_is_refused(write_spec, sweep_text, tmp_path, monkeypatch):
-    import magpend_core
-
     path = write_spec(sweep_text)
     run(path, tmp_path / "run", workers=0, echo=silent)
-    monkeypatch.setattr(magpend_core, "kernel_version", lambda: "newer")
-    with pytest.raises(RefusedError, match=r"kernel_version: \w+ in the directory, newer now"):
+    monkeypatch.setattr(identity, "ENGINE", 1000)
+    with pytest.raises(RefusedError, match=r"versions.engine: \d+ in the directory, 1000 now"):
         run(path, tmp_path / "run", workers=0, echo=silent)
 
 
@@ -204,7 +203,7 @@ def test_task__other_kernel_on_a_worker_is_refused(write_spec, sweep_text, tmp_p
     run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
     digest = read_run(tmp_path / "run").digest
     task._prepare.cache_clear()
-    monkeypatch.setattr(task, "kernel_version", lambda: "older")
+    monkeypatch.setattr(identity, "ENGINE", 1000)
     with pytest.raises(RefusedError, match="would not compute the same run"):
         task.run_task(str(tmp_path / "run"), digest, 0)
 

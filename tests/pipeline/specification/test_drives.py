@@ -132,7 +132,7 @@ def test_parse_spec__keeps_the_drive_and_reads_back_without_its_file(tmp_path):
 
 def test_identity__is_of_the_values_and_not_of_the_name(tmp_path):
     def digest(spec):
-        return digest_of(identity_of(spec, make_plan(spec), "kernel"))
+        return digest_of(identity_of(spec, make_plan(spec)))
 
     first = parsed(tmp_path)
     write(tmp_path, EDGES, "other.csv")

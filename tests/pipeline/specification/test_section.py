@@ -62,7 +62,7 @@ def test_identity__every_key_of_the_section():
     spec = parse_spec(SPEC)
     for change in ({"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}):
         other = parse_spec({**SPEC, "section": {**SPEC["section"], **change}})
-        assert identity_of(spec, make_plan(spec), "0") != identity_of(other, make_plan(other), "0"), change
+        assert identity_of(spec, make_plan(spec)) != identity_of(other, make_plan(other)), change
 
 
 def test_parse_spec__swept_level():

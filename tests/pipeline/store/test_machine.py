@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from magpend_core.status import Status
-from pipeline.compute import task
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
@@ -77,7 +76,7 @@ class Directory:
         (folder / "spec.toml").write_text(text)
         self.spec = load_spec(folder / "spec.toml")
         self.plan = make_plan(self.spec)
-        self.identity = identity_of(self.spec, self.plan, task.kernel_version())
+        self.identity = identity_of(self.spec, self.plan)
         self.info = create(self.path, self.spec, self.plan, self.identity, text)
 
     def values(self, index: int) -> dict[str, np.ndarray]:

@@ -108,11 +108,11 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
         f"{name} = {{ values = [1.5, 1.6] }}\n" for name in ("q", "frequency_hz", "eps_drive")
     )
     spec = load_spec(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
-    identity = identity_of(spec, make_plan(spec), "k")
+    identity = identity_of(spec, make_plan(spec))
     create(tmp_path / "run", spec, make_plan(spec), identity, text)
     again = parse_spec(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
-    assert digest_of(identity_of(again, make_plan(again), "k")) == digest_of(identity)
+    assert digest_of(identity_of(again, make_plan(again))) == digest_of(identity)
 
 
 # ---- packs -------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from pipeline.analysis.attractors.finding.cell_blocks import Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
+from pipeline.analysis.together import run_together
 from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
 from pipeline.products.reporting import UNTOLD, report
 
@@ -165,28 +166,26 @@ def answer_all(
     Progress is the number of points that are decided, and of a point whose cells are extended the part of its budget
     that is spent. A point may take a thousand times longer than another, so this number does not tell the time left.
     """
-    results: dict[tuple[int, ...], T] = {}
-    answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     what = FINDING
-    while answers:
-        report(what, len(results), len(works), UNTOLD)
-        asked: dict[tuple[int, ...], Request] = {}
-        for index, value in answers.items():
-            try:
-                asked[index] = works[index].send(value)
-            except StopIteration as stop:
-                results[index] = stop.value
+
+    def answer(asked: dict[tuple[int, ...], Request], results: Mapping[tuple[int, ...], T]) -> dict[Any, Any]:
+        nonlocal what
         legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
         guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
         slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
         what = EXTENDING if legs else what
         spent = sum(leg.spent for leg in legs.values())
         report(what, round(len(results) + spent, 2), len(works), UNTOLD)
-        answers = _legs(legs, points, settings) if legs else {}
+        answers: dict[Any, Any] = _legs(legs, points, settings) if legs else {}
         answers |= _polished(guesses, points, settings) if guesses else {}
         answers |= _slopes(slopes, points, settings) if slopes else {}
-    report(what, len(results), len(works), UNTOLD)
-    return {index: results[index] for index in works}
+        report(what, len(results), len(works), UNTOLD)
+        return answers
+
+    report(what, 0, len(works), UNTOLD)
+    found = run_together(works, answer)
+    report(what, len(works), len(works), UNTOLD)
+    return found
 
 
 def _gathered(

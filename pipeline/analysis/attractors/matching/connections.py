@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,10 +140,10 @@ def grouped(web: Web, n: int) -> tuple[np.ndarray, np.ndarray]:
     level = _distance_from_crowds(web)
     ends = np.sort(level[plain], axis=1)
     order = np.lexsort((plain.max(axis=1), plain.min(axis=1), ends[:, 0], ends[:, 1]))
-    branch = _united(np.arange(len(web.place)), plain[order].tolist(), dict(enumerate(web.place.tolist())))
+    branch = _united(np.arange(len(web.place)), plain[order], web.place)
     links = web.links[doubled]
     order = np.lexsort((links[:, :2].max(axis=1), links[:, :2].min(axis=1), links[:, 2]))
-    group = _united(branch, links[order, :2].tolist(), dict(enumerate(web.place[:n].tolist())))
+    group = _united(branch, links[order, :2], np.where(np.arange(len(web.place)) < n, web.place, -1))
     return group, branch
 
 
@@ -169,14 +168,15 @@ def _distance_from_crowds(web: Web) -> np.ndarray:
     return np.asarray(dijkstra(_graph(web).tocsr(), directed=False, indices=crowded, unweighted=True, min_only=True))
 
 
-def _united(start: np.ndarray, links: Iterable[Sequence[int]], place: dict[int, int]) -> np.ndarray:
-    """Unite the groups of linked orbits in the order of the links, unless both have one of the places."""
+def _united(start: np.ndarray, links: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Unite the groups of linked orbits in the order of the links, unless both have one of the places; -1 is none."""
     group = start.copy()
-    members: dict[int, list[int]] = {}
-    taken: dict[int, set[int]] = {}
-    for i, own in enumerate(group.tolist()):
-        members.setdefault(own, []).append(i)
-        taken.setdefault(own, set()).update([place[i]] if i in place else [])
+    linked = np.unique(start[links])
+    rows = np.flatnonzero(np.isin(start, linked))
+    members: dict[int, list[int]] = {own: [] for own in linked.tolist()}
+    for i, own in zip(rows.tolist(), start[rows].tolist(), strict=True):
+        members[own].append(i)
+    taken = {own: {int(place[i]) for i in one if place[i] >= 0} for own, one in members.items()}
     for first, second in links:
         a, b = sorted((int(group[first]), int(group[second])), key=lambda one: (-len(members[one]), one))
         if a == b or taken[a] & taken[b]:

@@ -138,11 +138,10 @@ def match(
         raise ValueError(f"threshold = {threshold!r} is out of bounds: it must be greater than 0.")
     if look_back < 1:
         raise ValueError(f"look_back = {look_back!r} is out of bounds: it must be 1 or more.")
+    # first, as it takes the most memory
+    links = _connections(attractors, parameters, system) if connect else Connections.none(attractors.sizes[SET])
     appearances, rows = seen_in(attractors), rows_at(attractors)
     where = [index for index, own in rows.items() for _ in own]
-    links = Connections.none(len(where))
-    if connect:
-        links = _connections(attractors, parameters, system)
     rule = Rule(threshold, geometry_of(attractors, system), neutral_sides(attractors), links)
     ids = _Ids(where, rule)
     seen: dict[tuple[int, ...], dict[int, Seen]] = {}
