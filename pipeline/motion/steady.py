@@ -152,9 +152,7 @@ class Steady:
         return Sections(**{name: _spread(name, array, alive) for name, array in found.items()}), {}
 
     def no_extension(self) -> str:
-        """Return the reason why cells with fewer sections cannot be integrated further for this run; empty if they
-        can.
-        """
+        """Return the reason why cells with fewer sections cannot be integrated further; empty if they can."""
         if self.integration.stop_when_closed or self.integration.n_keep >= self._judged:
             return ""
         return f"what closes is judged by the last {self._judged} sections: keep as many"
@@ -223,9 +221,7 @@ class Steady:
     def _more(
         self, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_more: int, quantities: Sequence[str] | None
     ) -> Values:
-        """Integrate cells from their stored last states over the missing periods; return the variables of these
-        periods.
-        """
+        """Integrate cells further from their stored last states; return the variables of these periods."""
         from magpend_core.extension import more_sections
 
         cells = more_sections(
