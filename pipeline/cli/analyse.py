@@ -11,16 +11,7 @@ from pipeline.cli.analysing import show
 from pipeline.cli.common import Csv, Directory, Json, check_csv
 from pipeline.cli.groups import Groups, add_command, command_group, made, registry_group
 from pipeline.cli.options import taking
-from pipeline.cli.running import ClusterFile, Workers
-
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        metavar="WHERE",
-        help="Where blocks of parameter points are analysed, as for magpend run. Default: $DASK_SCHEDULER_ADDRESS, or "
-        "processes.",
-    ),
-]
+from pipeline.cli.running import ClusterFile, Scheduler, Workers
 
 
 def _groups() -> Groups:

@@ -44,7 +44,7 @@ Scheduler = Annotated[
     typer.Option(
         metavar="WHERE",
         help="threads; processes; none (the calling thread); a dask scheduler's tcp:// or tls:// address or FILE.json; "
-        "or jobs of slurm, pbs, torque, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or threads.",
+        "or jobs of slurm, pbs, torque, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or threads (analyses: processes).",
     ),
 ]
 ClusterFile = Annotated[

@@ -18,7 +18,7 @@ from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.selection import at_points
-from pipeline.products.figures import RotationFigureOptions
+from pipeline.products.product import FigureOptions
 
 NAMED = 5
 """Largest denominator of the steps p/q that a staircase names."""
@@ -166,7 +166,7 @@ def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]
     style.style_bar(bar, "rotation number\n[turns per drive period]")
 
 
-def draw(run: Run, options: RotationFigureOptions) -> style.DataFigure:
+def draw(run: Run, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``rotation`` of a run."""
     at, notes = values_of(run, options)
     return noted(plot_rotation(run.cube(), at=at, frame=frame_of(options)), notes)

@@ -86,17 +86,7 @@ class DimensionFigureOptions(DimensionOptions, FigureOptions):
     """Options of a figure of a correlation sum and its fit."""
 
 
-class _AlongOptions(BranchOptions, FigureOptions):
-    """Options of a figure of branches along a continuation parameter."""
-
-    def label(self) -> str:
-        """Return the part of the figure's file name that lists the options. It omits the continuation parameter if that
-        is the drive frequency.
-        """
-        return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
-
-
-class BranchFigureOptions(_AlongOptions, StateOptions):
+class BranchFigureOptions(BranchOptions, StateOptions):
     """Options of a figure of branches of periodic orbits over a bifurcation diagram."""
 
     over: str = option("", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR.")
@@ -104,31 +94,21 @@ class BranchFigureOptions(_AlongOptions, StateOptions):
     shown: int | None = option(None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1)
 
 
-class MultiplierOptions(_AlongOptions):
+class MultiplierOptions(BranchOptions, FigureOptions):
     """Options of a figure of Floquet multipliers along a branch."""
 
     branch: int = option(0, "Index of the branch, as in the table.", ge=0)
 
 
-class CurveFigureOptions(CurveOptions, _AlongOptions):
+class CurveFigureOptions(CurveOptions, FigureOptions):
     """Options of a figure of bifurcation curves."""
 
     over: str = option("", "Run over both parameters whose map of regimes is drawn below.")
     show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
 
 
-class RotationFigureOptions(FigureOptions):
-    """Options of a figure of rotation numbers over one parameter, or in the plane of two."""
-
-
 class TongueFigureOptions(TongueOptions, FigureOptions):
     """Options of a figure of Arnold tongues."""
-
-    def label(self) -> str:
-        """Return the part of the figure's file name that lists the options. It omits the continuation parameter if that
-        is the drive frequency.
-        """
-        return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
 
 
 class ManifoldFigureOptions(ManifoldOptions, FigureOptions):
@@ -154,12 +134,6 @@ class EscapeFigureOptions(EscapeOptions, FigureOptions):
     """Options of a figure of escapes."""
 
     show: Literal["rates", "paths"] = option("rates", "Rates over the axis, or the last stretch before leaving.")
-
-    def label(self) -> str:
-        """Return the part of the figure's file name that lists the options, with the name of each bound of the set."""
-        sets = {"low": self.low, "high": self.high, "centre": self.centre}
-        bounds = "".join(f"_{name}_{s}_{value:.15g}" for name, given in sets.items() for s, value in given.items())
-        return FigureOptions.label(self.model_copy(update={key: {} for key in sets})) + bounds
 
 
 class DensityFigureOptions(DensityOptions, FigureOptions):
@@ -271,7 +245,7 @@ CURVES = Figure(
 ROTATION = Figure(
     "rotation",
     "Draw rotation numbers over a parameter, with the steps p/q (the devil's staircase), or as a map over two.",
-    RotationFigureOptions,
+    FigureOptions,
     "pipeline.plots.rotation:draw",
 )
 

@@ -255,8 +255,13 @@ class FigureOptions(Options):
         return json.loads(json.dumps(style, default=str))
 
     def label(self) -> str:
-        """Return the part of the figure's file name that lists the options with non-default values."""
+        """Return the part of the figure's file name that lists the options with non-default values.
+
+        The drive frequency as the continuation parameter is left out.
+        """
         given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
+        if given.get("parameter") == "frequency_hz":
+            del given["parameter"]
         if self.style:
             given["style"] = re.sub(r"[^\w.]+", "-", str(given["style"])).strip("-")
         first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
@@ -277,7 +282,8 @@ def _words(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return name if value else f"no_{name}"
     if isinstance(value, dict):
-        return "_".join(f"{key}_{_word(number)}" for key, number in value.items())
+        bound = "" if name == "at" else f"{name}_"
+        return "_".join(f"{bound}{key}_{_word(number)}" for key, number in value.items())
     if isinstance(value, list):
         return "_".join([name, *(_word(part) for part in value)])
     return _word(value) if name in _SPEAKS_FOR_ITSELF else f"{name}_{_word(value)}"

@@ -36,7 +36,7 @@ class Plots:
     branches = OnePanel(options.BranchFigureOptions)
     multipliers = OnePanel(options.MultiplierOptions)
     curves = OnePanel(options.CurveFigureOptions)
-    rotation = OnePanel(options.RotationFigureOptions)
+    rotation = OnePanel(FigureOptions)
     tongues = OnePanel(options.TongueFigureOptions)
     manifolds = OnePanel(options.ManifoldFigureOptions)
     drift = OnePanel(options.DriftFigureOptions)
