@@ -105,6 +105,36 @@ def test_reference__names_everything():
     assert f"`{FREQUENCY_DIM}`" in PAGES["docs/reference/cube.md"]
 
 
+@pytest.mark.slow
+def test_reference__has_every_option_of_every_command():
+    """It stands with the command, with one whose options the command takes, or among those of several commands."""
+    lines = [line.replace("\\|", "/") for line in PAGES["docs/reference/commands.md"].splitlines()]
+    rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines if line.startswith("| `")]
+    found = dict(reference._commands())
+
+    def told(name):
+        of_base = set()
+        for row in rows:
+            if len(row) == 2 and re.match(rf"`magpend {name}[ `]", row[0]):
+                of_base = {
+                    flag
+                    for other in re.findall(r"Takes the options of (.*)\.", row[1])
+                    for base in re.findall(r"`([^`]+)`", other)
+                    for flag in told(base)
+                }
+        own = {row[1] for row in rows if len(row) == 3 and row[0] == f"`{name}`"}
+        shared = {row[0] for row in rows if len(row) == 3 and row[0].startswith("`-") and takes(row[1], name)}
+        return own | shared | of_base
+
+    def takes(words, name):
+        group = name.partition(" ")[0]
+        (but,) = re.findall(rf"all of `{group}`(?: but ((?:`{group} [\w-]+`(?:, )?)+))?", words) or [None]
+        return f"`{name}`" in words if but is None else f"`{name}`" not in but
+
+    for name, command in found.items():
+        assert {flag.replace("|", "/") for flag, _ in reference._options(command)} <= told(name), name
+
+
 @pytest.mark.parametrize("name", ["main job", "tests", "whole suite"])
 def test_readme__commands_for_ci_are_one_line(name):
     (command,) = re.findall(rf"<!-- run: {name} -->\n```sh\n(.*?)\n```", README, re.DOTALL)

@@ -167,12 +167,9 @@ def _metavar(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    has_default = (
-        parameter.default != ""
-        and isinstance(parameter.default, (int, float, str, Path))
-        and parameter.default is not False
-    )
-    return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
+    default = parameter.default
+    has_default = isinstance(default, (int, float, str, Path)) and default is not False and default != ""
+    return _text(parameter.help or "") + (f" Default: {default}." if has_default else "")
 
 
 def _text(text: str) -> str:
