@@ -32,6 +32,17 @@ IMPORT = Annotated[
         metavar="MODULE:NAME", help="Import this Python object, the model of a run; otherwise nothing is imported."
     ),
 ]
+# as in `FigureOptions`, whose import would make every help wait for pydantic
+STYLE = Annotated[
+    str | None,
+    typer.Option(metavar="TEXT", help="Style of matplotlib that changes magpend's: its name, or a style file."),
+]
+DPI = Annotated[
+    float | None,
+    typer.Option(
+        metavar="X", help="Resolution; by default 200, or that of the style [1/in]; 20 or more, at most 2400."
+    ),
+]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
 _IMPORTED = "import_model"
@@ -62,17 +73,18 @@ def speaking(command: Command) -> Command:
 
 def drawing(command: Command) -> Command:
     """Wrap a command that draws figures so that it has the options ``--style`` and ``--dpi``."""
-    from pipeline.products.product import FigureOptions
 
     def run(*args: Any, style: str | None, dpi: float | None, **given: Any) -> None:
         from pipeline.plots import looks
+        from pipeline.products.product import FigureOptions
         from pipeline.specification.problems import validated
 
         looked = validated(FigureOptions, {"style": style or "", "dpi": dpi})
         with looks.given(looked.style, looked.dpi):
             command(*args, **given)
 
-    return _signed(run, command, [*_own(command), *(_parameter(FigureOptions, name) for name in ("style", "dpi"))])
+    looks_options = [_keyword("style", STYLE, None), _keyword("dpi", DPI, None)]
+    return _signed(run, command, [*_own(command), *looks_options])
 
 
 def taking(model: type[Options], command: Command) -> Command:
