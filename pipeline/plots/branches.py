@@ -33,8 +33,8 @@ NAMES = {
     "pitchfork": "pitchfork",
     "transcritical": "transcritical",
 }
-_STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
-_UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
+STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
+UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
 _NAME_PT = 7.0
 _LEADER = {"arrowstyle": "-", "linewidth": 0.4, "color": "0.4", "shrinkA": 4.0, "shrinkB": 2.5}
 
@@ -127,7 +127,7 @@ def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
     for i in chosen:
         for x, y, stable in pieces(ds, i, measure):
-            ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))
+            ax.plot(x, y, scalex=scale, scaley=scale, **(STABLE if stable else UNSTABLE))
     return _mark(ax, ds, chosen, measure, scale)
 
 
@@ -143,29 +143,36 @@ def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.n
     """Yield the lines of a branch to draw: one for each section point and each range of equal stability, cut where an
     angle wraps.
     """
-    n = int(ds["n_points"][branch])
     period = max(int(ds["orbit_period"][branch]), 1)
-    x = ds["parameter"].values[branch, :n]
-    y = ds["section"].sel(state=measure.name).values[branch, :n, :period]
-    stable = ds["n_unstable"].values[branch, :n] == 0
-    here = np.flatnonzero(ds["of_branch"].values == branch)
-    own = ds.isel(bifurcation=here)
-    after = own["after"].values
-    # located points end one piece and begin the next
-    x = np.insert(x, after + 1, own["value"].values)
-    y = np.insert(y, after + 1, own["bifurcation_section"].sel(state=measure.name).values[:, :period], axis=0)
+    x = with_located(ds, branch, ds["parameter"], ds["value"])
+    both = (ds[name].sel(state=measure.name) for name in ("section", "bifurcation_section"))
+    y = with_located(ds, branch, *both)
+    for first, stop, solid in stretches(ds, branch):
+        for k in range(period):
+            values = measure.shown(y[first:stop, k])
+            jumps = np.flatnonzero((np.abs(np.diff(values)) > measure.half_turn) & measure.on_circle) + 1
+            yield np.insert(x[first:stop], jumps, np.nan), np.insert(values, jumps, np.nan), solid
+
+
+def with_located(ds: xr.Dataset, branch: int, of_points: xr.DataArray, of_bifurcations: xr.DataArray) -> np.ndarray:
+    """Return the values along a branch, with those of its located bifurcations in their places."""
+    n, own = int(ds["n_points"][branch]), ds["of_branch"].values == branch
+    after = ds["after"].values[own]
+    return np.insert(of_points.values[branch, :n], after + 1, of_bifurcations.values[own], axis=0)
+
+
+def stretches(ds: xr.Dataset, branch: int) -> Iterator[tuple[int, int, bool]]:
+    """Yield the first index, the end and the stability of each stretch of equal stability of a branch, among the values
+    of `with_located`. A located point ends one stretch and begins the next.
+    """
+    n, after = int(ds["n_points"][branch]), ds["after"].values[ds["of_branch"].values == branch]
     located = np.insert(np.zeros(n, bool), after + 1, True)
-    stable = np.insert(stable, after + 1, False)
+    stable = np.insert(ds["n_unstable"].values[branch, :n] == 0, after + 1, False)
     is_solid = (stable[:-1] | located[:-1]) & (stable[1:] | located[1:]) & (stable[:-1] | stable[1:])
     edges = np.flatnonzero(np.diff(is_solid)) + 1
     for first, stop in zip([0, *edges], [*edges, len(is_solid)], strict=True):
-        if stop <= first:
-            continue
-        solid = bool(is_solid[first])
-        for k in range(period):
-            values = measure.shown(y[first : stop + 1, k])
-            jumps = np.flatnonzero((np.abs(np.diff(values)) > measure.half_turn) & measure.on_circle) + 1
-            yield np.insert(x[first : stop + 1], jumps, np.nan), np.insert(values, jumps, np.nan), solid
+        if stop > first:
+            yield first, stop + 1, bool(is_solid[first])
 
 
 @dataclass(frozen=True)
@@ -285,8 +292,8 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
     own = np.isin(ds["of_branch"].values, chosen)
     present = {KINDS[int(code)] for code in ds["kind"].values[own]}
     return [
-        Line2D([], [], label="stable", **{k: v for k, v in _STABLE.items() if k != "zorder"}),
-        Line2D([], [], label="unstable", **{k: v for k, v in _UNSTABLE.items() if k != "zorder"}),
+        Line2D([], [], label="stable", **{k: v for k, v in STABLE.items() if k != "zorder"}),
+        Line2D([], [], label="unstable", **{k: v for k, v in UNSTABLE.items() if k != "zorder"}),
         *(
             Line2D(
                 [],

@@ -10,6 +10,7 @@ from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
+from pipeline.products.response import ResponseOptions
 from pipeline.products.tongues import TongueOptions
 
 Per = Literal["s", "period"]
@@ -105,6 +106,14 @@ class CurveFigureOptions(CurveOptions, FigureOptions):
 
     over: str = option("", "Run over both parameters whose map of regimes is drawn below.")
     show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
+
+
+class ResponseFigureOptions(ResponseOptions, FigureOptions):
+    """Options of a figure of frequency responses."""
+
+    channel: str = option("", "State or quantity to draw; by default the model's first state.")
+    harmonic: int = option(0, "Draw the amplitude of this harmonic; 0 draws half of peak to peak.", ge=0)
+    points: str = option("", "CSV file of measured points: columns of the parameter, amplitude and, if known, phase.")
 
 
 class TongueFigureOptions(TongueOptions, FigureOptions):
@@ -247,6 +256,14 @@ ROTATION = Figure(
     "Draw rotation numbers over a parameter, with the steps p/q (the devil's staircase), or as a map over two.",
     FigureOptions,
     "pipeline.plots.rotation:draw",
+)
+
+RESPONSE = Figure(
+    "response",
+    "Draw amplitude and phase along a parameter: stable solid, unstable dashed, one colour for each level of the force.",
+    ResponseFigureOptions,
+    "pipeline.plots.response:draw",
+    panels="several",
 )
 
 TONGUES = Figure(

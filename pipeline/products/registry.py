@@ -67,6 +67,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "Chaos": {"chaos": ("chaos", ""), "dimension": ("chaos", "")},
         "Orbits and branches, stable or not": {
             "branches": ("branches", ""),
+            "response": ("response", ""),
             "bands": ("branches", "a posterior of magpend identify"),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
@@ -106,6 +107,7 @@ _FIGURES = {
         "branches": "",
         "multipliers": "",
         "curves": "",
+        "response": "",
         "rotation": f"{_ROTATION}, and {_ONE}, or {_TWO}",
         "tongues": f"{_ROTATION}, and {_ONE}",
         "manifolds": _POINT,

@@ -37,6 +37,7 @@ class Plots:
     multipliers = OnePanel(options.MultiplierOptions)
     curves = OnePanel(options.CurveFigureOptions)
     rotation = OnePanel(FigureOptions)
+    response = SeveralPanels(options.ResponseFigureOptions)
     tongues = OnePanel(options.TongueFigureOptions)
     manifolds = OnePanel(options.ManifoldFigureOptions)
     drift = OnePanel(options.DriftFigureOptions)

@@ -17,6 +17,7 @@ from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
+from pipeline.products.response import ResponseOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
 from pipeline.products.tongues import TongueOptions
 from pipeline.runs import python
@@ -72,6 +73,7 @@ class Run(StoredRun):
     curves = AnalysisMethod(CurveOptions)
     orbits = AnalysisMethod(OrbitOptions)
     tongues = AnalysisMethod(TongueOptions)
+    response = AnalysisMethod(ResponseOptions)
     manifolds = AnalysisMethod(ManifoldOptions)
     tangency = AnalysisMethod(TangencyOptions)
     tipping = AnalysisMethod(TippingOptions)

@@ -1,0 +1,1 @@
+"""Frequency responses: amplitudes, phases and harmonics along branches of periodic orbits."""

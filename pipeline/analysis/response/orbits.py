@@ -1,0 +1,200 @@
+"""Measure periodic orbits over their period: half of peak to peak, mean, rms and harmonics of states and quantities."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from magpend_core.models.model import Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.pointwise import drive_level, evaluate
+from magpend_core.sampling import Drive, sample
+from pipeline.analysis.tolerances import BRANCH_RTOL
+
+FEWEST, MOST = 512, 8192
+"""Samples per drive period or return: at first, and at most."""
+
+SETTLED = 1e-9
+"""Relative change of all measures, from half of the samples to all of them, at which these suffice."""
+
+AT_ONCE = 2_000_000
+"""Samples of all orbits that are integrated in one call, which bounds the memory."""
+
+NOTHING = 1e-10
+"""Amplitude of a harmonic, as a share of the largest value, below which it has no phase."""
+
+Array = np.ndarray
+
+
+class Orbit(NamedTuple):
+    """A periodic orbit: its parameters, its section point, its period [s] and in drive periods or returns (0: an
+    equilibrium).
+    """
+
+    parameters: Parameters
+    state: Array
+    seconds: float
+    period: int
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether harmonics are those of a drive."""
+        return not of_flow(self.parameters).model.autonomous
+
+    @property
+    def frequency_hz(self) -> float:
+        """Frequency of the drive, or of returns [Hz]."""
+        return max(self.period, 1) / self.seconds
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Measures of orbits, each of shape (orbit, channel), harmonics (orbit, channel, harmonic).
+
+    Channels are the model's states, then its quantities. A harmonic is the complex amplitude c of
+    Re(c exp(i n w t)), with t from the section on. `dominant` is the order of the largest component, in units of the
+    drive's frequency, or of the orbit's. The error is the largest change from half of the samples to all of them.
+    """
+
+    amplitude: Array
+    mean: Array
+    rms: Array
+    harmonics: Array
+    dominant: Array
+    error: Array
+
+
+def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
+    """Integrate orbits over one period each, and measure them. Samples are doubled until the measures settle.
+
+    Parameters
+    ----------
+    orbits
+        Of one model.
+    n_harmonics
+        Number of harmonics.
+
+    Returns
+    -------
+    Measures
+        NaN for orbits that could not be integrated.
+    """
+    model = of_flow(orbits[0].parameters).model if orbits else None
+    n_channels = 0 if model is None else len(model.states) + len(model.quantities)
+    shape = (len(orbits), n_channels)
+    found = Measures(
+        *(np.full(shape, np.nan) for _ in range(3)),
+        np.full((*shape, n_harmonics), np.nan, np.complex128),
+        *(np.full(shape, np.nan) for _ in range(2)),
+    )
+    left, n = np.arange(len(orbits)), FEWEST
+    while len(left) and n <= MOST:
+        for rows in _blocks(orbits, left, n):
+            values = _sampled([orbits[i] for i in rows], n)
+            base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven else 1
+            _measure(found, rows, values, base, n_harmonics)
+        scale = np.abs(found.mean[left]) + found.amplitude[left]
+        left, n = left[(found.error[left] > SETTLED * scale).any(axis=1)], 2 * n
+    return found
+
+
+def _blocks(orbits: Sequence[Orbit], rows: Array, n: int) -> Iterator[Array]:
+    """Yield rows of orbits of equal period, some at a time."""
+    periods = np.array([orbits[i].period for i in rows])
+    for period in np.unique(periods):
+        own = rows[periods == period]
+        step = max(1, AT_ONCE // (n * max(period, 1)))
+        yield from (own[k : k + step] for k in range(0, len(own), step))
+
+
+def _sampled(orbits: Sequence[Orbit], n: int) -> Array:
+    """Return states and quantities at even instants of a period, (orbit, sample, channel), without an angle's turns."""
+    period = max(orbits[0].period, 1)
+    flows = [of_flow(orbit.parameters) for orbit in orbits]
+    share = np.arange(n * period + 1) / (n * period)
+    times = [share * orbit.seconds for orbit in orbits]
+    starts = np.array([orbit.state for orbit in orbits])
+    if orbits[0].period:
+        states = sample(
+            flows[0].model.system,
+            np.array([flow.pack() for flow in flows]),
+            starts,
+            times,
+            drives=[Drive(np.full(period, orbit.seconds / period)) for orbit in orbits],
+            rtol=BRANCH_RTOL,
+            atol=BRANCH_RTOL,
+            limits_first_step=False,
+        ).states
+    else:
+        states = np.repeat(starts[:, None], len(share), axis=1)
+    names = [q.name for q in flows[0].model.quantities]
+    quantities = [
+        evaluate(names, time, own, flow, orbit.frequency_hz)
+        if np.isfinite(own).all()
+        else np.full((len(time), len(names)), np.nan)
+        for orbit, flow, time, own in zip(orbits, flows, times, states, strict=True)
+    ]
+    is_angle = np.asarray(flows[0].model.system.is_angle, bool)
+    turns = np.where(is_angle, np.round((states[:, -1] - states[:, 0]) / (2.0 * np.pi)), 0.0)
+    states = states - 2.0 * np.pi * turns[:, None] * share[:, None]
+    return np.concatenate([states, np.array(quantities)], axis=-1)[:, :-1]
+
+
+def _measure(found: Measures, rows: Array, values: Array, base: int, n_harmonics: int) -> None:
+    """Measure sampled values; the error compares with every second sample."""
+    amplitude, harmonics = _amplitude(values), _harmonics(values, base, n_harmonics)
+    found.amplitude[rows], found.harmonics[rows] = amplitude, harmonics
+    found.mean[rows] = values.mean(axis=1)
+    found.rms[rows] = np.sqrt((values**2).mean(axis=1))
+    coarse = values[:, ::2]
+    change = np.abs(harmonics - _harmonics(coarse, base, n_harmonics)).max(axis=-1)
+    found.error[rows] = np.maximum(np.abs(amplitude - _amplitude(coarse)), change)
+    parts = np.abs(np.fft.rfft(values, axis=1)[:, 1:])
+    found.dominant[rows] = np.where(parts.max(axis=1) > 0.0, (1 + parts.argmax(axis=1)) / base, 0.0)
+
+
+def _amplitude(values: Array) -> Array:
+    """Return half of peak to peak, each extreme being that of a parabola through three samples."""
+    return 0.5 * (_highest(values) + _highest(-values))
+
+
+def _highest(values: Array) -> Array:
+    at = values.argmax(axis=1)[:, None]
+    n = values.shape[1]
+    before, here, after = (np.take_along_axis(values, (at + k) % n, axis=1)[:, 0] for k in (-1, 0, 1))
+    bend = before - 2.0 * here + after
+    slope = 0.5 * (after - before)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return here - np.where(bend < 0.0, 0.5 * slope**2 / bend, 0.0)
+
+
+def _harmonics(values: Array, base: int, n_harmonics: int) -> Array:
+    """Return the complex amplitudes of the multiples of `base`, (orbit, channel, harmonic)."""
+    parts = 2.0 * np.fft.rfft(values, axis=1) / values.shape[1]
+    order = base * np.arange(1, n_harmonics + 1)
+    return np.moveaxis(parts[:, order], 1, -1)
+
+
+def lags_of(orbits: Sequence[Orbit], harmonics: Array) -> Array:
+    """Return the phases by which harmonics lag behind the drive's first harmonic [rad], from -pi to pi.
+
+    A harmonic is cos(n (w t + a) - lag), where the drive's first harmonic is cos(w t + a). A model whose time
+    dependence is no single forcing has a = 0. NaN where a harmonic vanishes.
+    """
+    order = np.arange(1, harmonics.shape[-1] + 1)
+    shift = np.array([_drive_phase(orbit) for orbit in orbits])[:, None, None]
+    lag = np.angle(np.exp(1j * (order * shift - np.angle(harmonics))))
+    size = np.abs(harmonics)
+    return np.where(size > NOTHING * np.fmax(size.max(axis=-1, keepdims=True, initial=0.0), NOTHING), lag, np.nan)
+
+
+def _drive_phase(orbit: Orbit) -> float:
+    flow = of_flow(orbit.parameters)
+    if not orbit.is_driven or flow.model.system.forcing_is_time:
+        return 0.0
+    level = drive_level(np.arange(MOST) / (MOST * orbit.frequency_hz), flow, orbit.frequency_hz)
+    first = np.fft.rfft(level)[1]
+    return float(np.angle(first)) if abs(first) > 1e-9 * np.abs(level).sum() else 0.0

@@ -1,0 +1,229 @@
+"""Draw frequency responses: amplitude and phase along a parameter."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from pipeline.analysis.branches.table import fixed_of
+from pipeline.layout.vocabulary import parameter_name
+from pipeline.plots import labels, style
+from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT, STABLE, UNSTABLE, stretches, with_located
+from pipeline.plots.figure import Run, frame_of
+from pipeline.plots.labels import Measure
+from pipeline.products.figures import ResponseFigureOptions
+from pipeline.products.response import ResponseOptions
+from pipeline.specification.problems import SpecError
+
+_POINTS: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markersize": 3.0,
+    "markerfacecolor": "black",
+    "markeredgecolor": "white",
+    "markeredgewidth": 0.4,
+    "zorder": 9.0,
+}
+_ARROW: dict[str, Any] = {"arrowstyle": "->", "linewidth": 0.7, "shrinkA": 3.0, "shrinkB": 0.0, "mutation_scale": 7.0}
+
+
+@style.drawn
+def plot_response(
+    ds: xr.Dataset,
+    *,
+    channel: str = "",
+    harmonic: int = 0,
+    points: Mapping[str, np.ndarray] | None = None,
+    degrees: bool = False,
+    frame: style.Frame = style.WIDE,
+) -> style.DataFigure:
+    """Draw the amplitude along a parameter, and below it the phase of a driven system: stable solid, unstable dashed.
+
+    Each value of a further swept parameter, such as the level of the force, has its colour. All bifurcations are
+    marked. Arrows lead from the end of a stable orbit to the amplitude of the orbit on which a trajectory lands.
+
+    Parameters
+    ----------
+    ds
+        From the analysis ``response``.
+    channel
+        State or quantity; by default the first state.
+    harmonic
+        Harmonic whose amplitude is drawn; 0 draws half of peak to peak, and the phase of the first harmonic.
+    points
+        Measured points: values of the parameter, ``amplitude`` and perhaps ``phase`` [rad], of equal shape.
+    degrees
+        Degrees for angles and phases.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        Its `data` are the response; measured points are ``measured_parameter``, ``measured_amplitude``,
+        ``measured_phase``.
+
+    Raises
+    ------
+    ValueError
+        If there is no such channel or harmonic.
+    """
+    channel = channel or str(ds["channel"].values[0])
+    style.check_choice("channel", channel, [str(c) for c in ds["channel"].values])
+    if harmonic > ds.sizes["harmonic"]:
+        raise ValueError(f"harmonic {harmonic} was not computed; it must be at most {ds.sizes['harmonic']}")
+    measure = labels.quantity_measure(ds, channel, degrees)
+    has_phase = labels.model_of(ds).crossing is None and not labels.model_of(ds).autonomous
+    fig = style.new_figure(5.2 if has_phase else 4.0, _stored(ds, points), frame)
+    axes = np.atleast_1d(fig.subplots(2 if has_phase else 1, 1, sharex=True, height_ratios=[2, 1][: 1 + has_phase]))
+    levels = _levels(ds)
+    chosen = [_amplitude(ds, channel, harmonic), _phase(ds, channel, max(harmonic, 1))][: len(axes)]
+    phase = Measure("phase", "lag", "deg" if degrees else "rad", 180.0 / np.pi if degrees else 1.0, True)
+    for ax, (of_points, of_bifurcations), shown in zip(axes, chosen, (measure, phase), strict=False):
+        style.style_axes(ax)
+        for i in range(ds.sizes["branch"]):
+            _draw_branch(ax, ds, i, of_points, of_bifurcations, shown, levels)
+    if not harmonic:
+        _draw_jumps(axes[0], ds, channel, measure, levels)
+    _draw_points(axes, points, (measure, phase))
+    name = str(ds.attrs["parameter"])
+    what = "amplitude" if not harmonic else f"harmonic {harmonic}"
+    style.label_axes(axes[-1], labels.swept_label(name, ds.attrs["parameter_units"]), "")
+    axes[0].set_ylabel(labels.with_unit(f"{what} of {measure.symbol}", measure.unit))
+    style.limits(axes[0], frame)
+    if has_phase:
+        axes[1].set_ylabel(labels.with_unit(f"lag of harmonic {max(harmonic, 1)}", phase.unit))
+        labels.angle_ticks(axes[1], phase)
+    style.caption(axes[0], labels.caption(ds, with_start=False))
+    style.legend_above(fig, _handles(ds, levels, points is not None), size=fig.look.tick)
+    style.finish(fig)
+    return fig
+
+
+def _stored(ds: xr.Dataset, points: Mapping[str, np.ndarray] | None) -> xr.Dataset:
+    plain = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object]).assign_attrs(
+        title="frequency response"
+    )
+    if points is None:
+        return plain
+    return plain.assign({f"measured_{name}": ("measured", values) for name, values in points.items()})
+
+
+def _levels(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
+    """Return the colour of each combination of fixed parameters: black if there is one."""
+    found = sorted({tuple(fixed_of(ds, i).items()) for i in range(ds.sizes["branch"])})
+    if len(found) <= 1:
+        return dict.fromkeys(found, "black")
+    return {level: style.PALETTE[k % len(style.PALETTE)] for k, level in enumerate(found)}
+
+
+def _amplitude(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:
+    name, where = ("harmonic_amplitude", {"harmonic": harmonic}) if harmonic else ("amplitude", {})
+    return ds[name].sel(channel=channel, **where), ds[f"bifurcation_{name}"].sel(channel=channel, **where)
+
+
+def _phase(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:
+    where: Any = {"channel": channel, "harmonic": harmonic}
+    return ds["phase"].sel(where), ds["bifurcation_phase"].sel(where)
+
+
+def _draw_branch(
+    ax: Axes,
+    ds: xr.Dataset,
+    branch: int,
+    of_points: xr.DataArray,
+    of_bifurcations: xr.DataArray,
+    measure: Measure,
+    levels: Mapping[Any, str],
+) -> None:
+    x = with_located(ds, branch, ds["parameter"], ds["value"])
+    y = measure.shown(with_located(ds, branch, of_points, of_bifurcations))
+    colour = levels[tuple(fixed_of(ds, branch).items())]
+    for first, stop, solid in stretches(ds, branch):
+        piece = y[first:stop]
+        jumps = np.flatnonzero((np.abs(np.diff(piece)) > measure.half_turn) & measure.on_circle) + 1
+        look = {**(STABLE if solid else UNSTABLE), "color": colour}
+        ax.plot(np.insert(x[first:stop], jumps, np.nan), np.insert(piece, jumps, np.nan), **look)
+    for k in np.flatnonzero(ds["of_branch"].values == branch):
+        stable = min(int(ds["n_unstable_before"][k]), int(ds["n_unstable_after"][k])) == 0
+        ax.plot(
+            float(ds["value"][k]),
+            measure.shown(of_bifurcations.values[k]),
+            linestyle="none",
+            marker=MARKERS[KINDS[int(ds["kind"][k])]],
+            markersize=4.5 if stable else 2.8,
+            markerfacecolor="white" if stable else "0.75",
+            markeredgecolor=colour,
+            markeredgewidth=0.7,
+            zorder=8.0,
+        )
+
+
+def _draw_jumps(ax: Axes, ds: xr.Dataset, channel: str, measure: Measure, levels: Mapping[Any, str]) -> None:
+    """Draw arrows from where a stable orbit ends to the amplitude of the orbit on which a trajectory lands."""
+    to = measure.shown(ds["jump_amplitude"].sel(channel=channel).values)
+    ends = ds.isel(bifurcation=ds["jump_bifurcation"])
+    before = measure.shown(ends["bifurcation_amplitude"].sel(channel=channel).values)
+    for k in np.flatnonzero(np.isfinite(to)):
+        x, colour = float(ends["value"][k]), levels[tuple(fixed_of(ds, int(ends["of_branch"][k])).items())]
+        ax.annotate("", (x, to[k]), (x, before[k]), arrowprops={**_ARROW, "color": colour}, zorder=7.0)
+
+
+def _draw_points(axes: np.ndarray, points: Mapping[str, np.ndarray] | None, measures: tuple[Measure, Measure]) -> None:
+    for ax, name, measure in zip(axes, ("amplitude", "phase"), measures, strict=False):
+        if points is not None and name in points:
+            ax.plot(points["parameter"], measure.shown(points[name]), **_POINTS)
+
+
+def _handles(ds: xr.Dataset, levels: Mapping[Any, str], has_points: bool) -> list[Line2D]:
+    lines = [{**STABLE, "label": "stable"}, {**UNSTABLE, "label": "unstable"}]
+    if len(levels) > 1:
+        lines += [{"color": c, "label": ", ".join(f"{n} = {v:g}" for n, v in level)} for level, c in levels.items()]
+    kinds = [KINDS[k] for k in sorted({int(k) for k in ds["kind"].values})]
+    mark = {"linestyle": "none", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": "black"}
+    lines += [{**mark, "marker": MARKERS[k], "label": f"{SHORT[k]} {NAMES[k]}"} for k in kinds]
+    if has_points:
+        lines.append({**_POINTS, "label": "measured"})
+    return [Line2D([], [], **{k: v for k, v in look.items() if k != "zorder"}) for look in lines]
+
+
+def read_points(path: str | Path, parameter: str) -> dict[str, np.ndarray]:
+    """Read measured points from a CSV file with a header: the parameter's name, ``amplitude`` and perhaps ``phase``.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, or a column is missing or no number.
+    """
+    name = parameter_name(parameter)
+    try:
+        with Path(path).open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        columns = {n: [row[n] for row in rows] for n in (name, "amplitude", "phase") if rows and n in rows[0]}
+        found = {n: np.array(values, dtype=np.float64) for n, values in columns.items()}
+    except (OSError, ValueError, TypeError) as error:
+        raise SpecError(f"--points {path}: {error}.") from None
+    if missing := [n for n in (name, "amplitude") if n not in found]:
+        raise SpecError(f"--points {path}: has no column {missing[0]}; the first line names the columns.")
+    return {"parameter": found.pop(name), **found}
+
+
+def draw(run: Run, options: ResponseFigureOptions) -> style.DataFigure:
+    """Draw the figure ``response`` of a run."""
+    points = read_points(options.points, options.parameter) if options.points else None
+    found = run.derive("response", **options.part(ResponseOptions))
+    return plot_response(
+        found,
+        channel=options.channel,
+        harmonic=options.harmonic,
+        points=points,
+        degrees=options.degrees,
+        frame=frame_of(options),
+    )

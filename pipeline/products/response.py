@@ -1,0 +1,29 @@
+"""Declare the analysis of frequency responses: amplitudes and harmonics along branches of periodic orbits."""
+
+from __future__ import annotations
+
+from pipeline.products.branches import BranchOptions
+from pipeline.products.product import Analysis, option
+
+
+class ResponseOptions(BranchOptions):
+    """Options of a frequency response."""
+
+    harmonics: int = option(5, "Number of harmonics of the drive, or of the orbit of a flow.", ge=1, le=200)
+
+
+RESPONSE = Analysis(
+    "response",
+    """Measure the response along a parameter: amplitude, mean, rms and harmonics of every state and quantity, stable
+    or not, and the jumps.
+
+    Follows branches of periodic orbits and integrates each orbit over its period. The amplitude is half of peak to
+    peak; a phase is the lag behind the drive. Where a stable orbit ends, a trajectory is integrated on beyond to see
+    where it lands.""",
+    ResponseOptions,
+    compute="pipeline.analysis.response.response:response",
+    table="pipeline.analysis.response.table:response_table",
+    settle="pipeline.analysis.branches.product:settle_branches",
+    builds_on=("branches",),
+    figure="response",
+)
