@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import xarray as xr
 
 from magpend_core.models.model import Model
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 
 class Run(Protocol):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def workflow_names() -> Iterable[str]:
     """Return the names of the workflows (specifications) that ship with magpend."""
-    from pipeline.runs.workflows import shipped_workflows
+    from pipeline.specification.files import shipped_workflows
 
     return shipped_workflows()
 

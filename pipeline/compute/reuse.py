@@ -24,7 +24,8 @@ from pipeline.layout.schema import base_variables
 from pipeline.motion.inputs import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.run import Run
 from pipeline.store.runfile import read_run
@@ -307,4 +308,4 @@ def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
         if run.info.digest != expected:
             raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
         runs.append(run)
-    return Pool(kept_spec(read_run(directory).spec), runs)
+    return Pool(Spec.parse(read_run(directory).spec, KEPT), runs)

@@ -12,7 +12,7 @@ import numpy as np
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
 from pipeline.motion.inputs import Inputs
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
 from pipeline.specification.tables import FREQUENCY, Range
 

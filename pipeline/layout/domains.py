@@ -12,8 +12,8 @@ from magpend_core.models import load_model
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of
 from pipeline.layout.cells import initial_states, parameter_axes
-from pipeline.specification.parsing import Spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:

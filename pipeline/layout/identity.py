@@ -17,7 +17,7 @@ from pipeline.layout.cells import coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.schema import FORMAT, REFINEMENT
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 CELLS = 1
 """Number of what turns a specification into cells: inputs, motions, refined grids. See `magpend_core.versions`."""

@@ -18,7 +18,7 @@ from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import differences
 from pipeline.motion.inputs import Inputs
 from pipeline.specification.noise import NoiseTable
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 NOWHERE = -1

@@ -7,7 +7,7 @@ import numpy as np
 from magpend_core.models.drift.ramps import Motion, Ramp, motion_of
 from magpend_core.models.model import Model
 from pipeline.layout.cells import Coordinate, ParameterAxis, parameter_axes
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 

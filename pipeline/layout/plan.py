@@ -21,7 +21,7 @@ from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 LEAST_LATTICE = 64

@@ -23,7 +23,8 @@ from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.natural import natural_size
 from pipeline.layout.cells import initial_states
 from pipeline.layout.domains import parameter_points
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 MOST_CELLS, MOST_POINTS = 32, 8
@@ -65,7 +66,7 @@ def with_sizes(spec: Spec, kept: Spec | None = None) -> Spec:
     if not changed:
         return spec
     states = {name: {**_entry(given[name]), "size": size} for name, size in changed.items()}
-    return kept_spec({**spec.as_dict(), "model": {**model.definition.table, "states": {**given, **states}}})
+    return Spec.parse({**spec.as_dict(), "model": {**model.definition.table, "states": {**given, **states}}}, KEPT)
 
 
 def size_remarks(spec: Spec) -> list[str]:

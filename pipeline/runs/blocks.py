@@ -32,7 +32,7 @@ from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import report
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.versions import current, key_of
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.blocks import read_block, write_block
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files

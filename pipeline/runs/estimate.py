@@ -20,7 +20,7 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell
 from pipeline.motion.inputs import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
 """Size of a sample: branches (two groups of lanes or more), most branches, points of each branch."""
@@ -75,7 +75,7 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
     most, products = periods_per_cell(spec)
     # products that the engine computes while integrating are measured with it
     watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].watches(o)}
-    spec = replace(spec, products=watched)
+    spec = spec.replace(products=watched)
     products -= periods_per_cell(spec)[1]
     inputs = _sample(spec, plan, np.random.default_rng(0), BRANCHES, pairs=False)
     ratio, measured, seconds = _speed(spec, inputs, most)
@@ -202,7 +202,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
         update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": NEVER_CLOSES}
     )
     started = time.process_time()
-    values = integrate(replace(spec, integration=integration), inputs)
+    values = integrate(spec.replace(integration=integration), inputs)
     seconds = time.process_time() - started
     ends = values["section"][:, -1, -1]
     a_period = spec.motion.seconds_per_period(inputs.frequency_hz)
@@ -227,7 +227,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
             cap = int(min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))
             integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})
         started = time.process_time()
-        values = integrate(replace(spec, integration=integration), inputs)
+        values = integrate(spec.replace(integration=integration), inputs)
         left -= time.process_time() - started
         periods = values["n_periods"]
         found = np.append(found, periods[:, 1::2] if periods.shape[1] > 1 else periods)

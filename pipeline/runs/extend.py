@@ -26,10 +26,10 @@ from pipeline.runs.progress import size
 from pipeline.runs.run import Echo, carry_out, identity_here
 from pipeline.runs.status import State, state
 from pipeline.runs.widen import Widening, widened
-from pipeline.runs.workflows import find_spec
 from pipeline.runs.zoom import derived_toml
-from pipeline.specification.parsing import Spec, load_spec
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files
 from pipeline.store.places import open_files
@@ -138,7 +138,7 @@ def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, 
         raise SpecError("extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM.")
     if spec is not None:
         path = find_spec(spec)
-        parsed = with_sizes(load_spec(path), run.spec)
+        parsed = with_sizes(Spec.read(path), run.spec)
         if not widening:
             return parsed, path.read_text("utf-8")
         wide, origin = widened(parsed, widening), f"specification {path.name}"

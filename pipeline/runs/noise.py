@@ -11,8 +11,8 @@ from pipeline.layout.cells import CellMap
 from pipeline.motion.inputs import Inputs
 from pipeline.motion.noisy import Noisy
 from pipeline.specification.noise import STEPS, NoiseTable
-from pipeline.specification.parsing import Spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.files import Files
 from pipeline.store.run import Run
 

@@ -19,8 +19,7 @@ from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
 from pipeline.runs.scaling import in_scales
-from pipeline.runs.workflows import read_given
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
 from pipeline.store.places import open_files
@@ -202,7 +201,7 @@ class Preview:
 
 
 def preview(
-    spec: str | Path | Mapping[str, Any],
+    spec: str | Path | Mapping[str, Any] | Spec,
     out: str | Path | None = None,
     *,
     workers: int | None = None,
@@ -220,9 +219,9 @@ def preview(
     SpecError, RefusedError
         See `pipeline.runs.run.run`.
     """
-    parsed, _, default = read_given(spec, smoke=smoke)
+    parsed = Spec.read(spec, smoke=smoke)
     check_starts(parsed)
-    files = open_files(out if out is not None else default)
+    files = open_files(out if out is not None else parsed.directory)
     parsed = in_scales(parsed, files)
     check_steps(parsed)
     plan = make_plan(parsed)
@@ -233,7 +232,11 @@ def preview(
 
 
 def describe_plan(
-    spec: str | Path | Mapping[str, Any], out: str | Path | None, *, workers: int | None = None, smoke: bool = False
+    spec: str | Path | Mapping[str, Any] | Spec,
+    out: str | Path | None,
+    *,
+    workers: int | None = None,
+    smoke: bool = False,
 ) -> Iterator[str]:
     """Yield the text lines that a dry run prints, the measured time last. See `preview`."""
     yield from preview(spec, out, workers=workers, smoke=smoke).lines

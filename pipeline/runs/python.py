@@ -12,7 +12,7 @@ from pipeline.runs import notebook
 from pipeline.runs.arguments import names_arguments
 from pipeline.runs.run import run as complete
 from pipeline.runs.stopping import InterruptedRunError, interrupt
-from pipeline.runs.workflows import read_given
+from pipeline.specification.spec import Spec
 from pipeline.store.run import Run
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def run(
-    spec: str | Path | Mapping[str, Any],
+    spec: str | Path | Mapping[str, Any] | Spec,
     out: str | Path | None = None,
     *,
     smoke: bool = False,
@@ -63,11 +63,12 @@ def run(
     --------
     >>> run("quickstart").cube().section.sel(frequency=2.2)  # doctest: +SKIP
     """
+    parsed = Spec.read(spec, smoke=smoke)
     if out is None:
-        _, _, out = read_given(spec, smoke=smoke)
+        out = parsed.directory
     try:
         with notebook.progress():
-            names_arguments(complete)(spec, out, smoke=smoke, echo=echo, **options)
+            names_arguments(complete)(parsed, out, smoke=smoke, echo=echo, **options)
     except InterruptedRunError:
         raise interrupt(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
     return Run.open(out)

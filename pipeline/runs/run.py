@@ -23,8 +23,7 @@ from pipeline.runs.progress import Progress, duration
 from pipeline.runs.scaling import in_scales
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
-from pipeline.runs.workflows import read_given
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import log_timing, sweep
@@ -48,7 +47,7 @@ Sources = Sequence[tuple[str, str]]
 
 
 def run(
-    spec: str | Path | Mapping[str, Any],
+    spec: str | Path | Mapping[str, Any] | Spec,
     out: str | Path | None = None,
     *,
     workers: int | None = None,
@@ -102,8 +101,9 @@ def run(
     """
     from pipeline.compute.clients import Where
 
-    parsed, text, default = read_given(spec, smoke=smoke)
-    files = open_files(out if out is not None else default)
+    parsed = Spec.read(spec, smoke=smoke)
+    text = parsed.text
+    files = open_files(out if out is not None else parsed.directory)
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)

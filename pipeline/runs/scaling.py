@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.layout.scales import with_sizes
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import Files
 from pipeline.store.runfile import is_run, read_run

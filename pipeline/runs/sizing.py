@@ -11,7 +11,7 @@ from pipeline.layout.plan import Plan, periods_per_cell
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import size, whole
 from pipeline.specification.clusters import Cluster, clock
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 AIM_S = 1800.0
 """Time that a job is given enough cores for [s]: short enough to start soon, long enough to be worth a job."""

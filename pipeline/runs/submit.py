@@ -23,12 +23,12 @@ from pipeline.runs.noise import check_steps
 from pipeline.runs.run import identity_here
 from pipeline.runs.scaling import in_scales
 from pipeline.runs.sizing import Work, complete, measure
-from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.specification.batch_systems import SYSTEMS
 from pipeline.specification.clusters import Cluster, cluster_of
-from pipeline.specification.inputs import toml_of
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.files import default_directory, find_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
+from pipeline.specification.writing import specification_toml
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
 from pipeline.store.places import open_files
@@ -101,7 +101,7 @@ class Submission:
     def table(self) -> str:
         """Return the complete ``[cluster]`` table as TOML text."""
         values = self.cluster.model_dump(exclude_defaults=True)
-        return f"[cluster]\n{toml_of({'kind': self.cluster.kind, **values})}"
+        return f"[cluster]\n{specification_toml({'kind': self.cluster.kind, **values})}"
 
 
 def prepare(
@@ -135,7 +135,7 @@ def prepare(
         If the run cannot be done in the directory.
     """
     path = find_spec(spec)
-    parsed = load_spec(path, smoke=smoke)
+    parsed = Spec.read(path, smoke=smoke)
     analyses_in(analyse)
     more = [*(["--smoke"] if smoke else []), *(["--analyse", analyse] if analyse else [])]
     retry = shlex.join([str(spec), *(["--out", str(out)] if out else []), *more])

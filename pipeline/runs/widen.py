@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.runs.zoom import put_value
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, RandomStarts, state_keys, state_of_key
 from pipeline.specification.tables import FREQUENCY
 
@@ -57,7 +58,7 @@ def widened(spec: Spec, widening: Widening) -> Spec:
     if widening.keep is not None:
         data["integration"]["n_keep"] = widening.keep
     data["products"] |= {name: dict(options) for name, options in widening.products.items()}
-    return kept_spec(data)
+    return Spec.parse(data, KEPT)
 
 
 def _problems(spec: Spec, widening: Widening) -> list[str]:

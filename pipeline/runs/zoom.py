@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.models.imported import KEY
-from pipeline.specification.files import check_new_file, merged, nested, write_new
-from pipeline.specification.parsing import Spec, kept_spec, load_spec
+from pipeline.specification.files import check_new_file, find_spec, merged, nested, write_new
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
 from pipeline.specification.tables import FREQUENCY, Range
 from pipeline.specification.writing import specification_toml
@@ -75,7 +76,6 @@ def read_source(path: str | Path) -> Source:
     SpecError, store.RefusedError
         If there is no specification, or it is not valid.
     """
-    from pipeline.runs.workflows import find_spec
     from pipeline.store.files import is_url, local_path
     from pipeline.store.runfile import read_run
 
@@ -83,8 +83,8 @@ def read_source(path: str | Path) -> Source:
         info = read_run(path)
         name = info.files.local.resolve().name if info.files.local else info.name
         return Source(info.parsed_spec(), f"run {name}, digest {info.digest}", _smoke_in(info.spec_text))
-    found = find_spec(path)
-    return Source(load_spec(found), f"specification {found.name}", _smoke_in(found.read_text("utf-8")))
+    spec = Spec.read(path)
+    return Source(spec, f"specification {find_spec(path).name}", spec.tables.get("smoke", {}))
 
 
 def _smoke_in(text: str) -> Mapping[str, Any]:
@@ -124,7 +124,7 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
     if changes.samples is not None:
         data["initial_conditions"]["n"] = changes.samples
     data["title"] = spec.title if spec.title.endswith(MARK) else f"{spec.title} {MARK}".strip()
-    return kept_spec(data), notes
+    return Spec.parse(data, KEPT), notes
 
 
 def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
@@ -140,7 +140,7 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
     spec, notes = zoom(source.spec, changes)
     smoke = source.smoke
     try:
-        kept_spec(merged(spec.as_dict(), nested(smoke)))
+        Spec.parse(merged(spec.as_dict(), nested(smoke)), KEPT)
     except SpecError:
         smoke = {}
         notes = [*notes, "[smoke]: is left out, since it does not fit the new ranges."]
@@ -272,7 +272,7 @@ def to_toml(spec: Spec, smoke: Mapping[str, Any] | None = None) -> str:
     read = tomllib.loads(text)
     read.pop("smoke", None)
     assert not isinstance(read["model"], dict) or read["model"] == spec.reference
-    assert kept_spec({**read, "model": spec.reference}) == spec
+    assert Spec.parse({**read, "model": spec.reference}, KEPT) == spec
     return text
 
 

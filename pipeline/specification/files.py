@@ -21,6 +21,11 @@ STUDY = "study.toml"
 """File name of a study that ships; its folder has the study's name."""
 WHOLE_NUMBERS = range(-(2**63), 2**63)
 
+IDENTIFICATION = "identification"
+"""Kind of the specifications that `pipeline.rig.identify` reads."""
+GALLERY = "gallery"
+"""Folder of the shipped specifications that are named with their folder, ``gallery/NAME``: one per published figure."""
+
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
@@ -78,6 +83,41 @@ def find_file(what: str, name: str | Path, shipped: Mapping[str, Path]) -> Path:
     if len(path.parts) > 1 and path.parts[0] not in folders:
         return path
     raise SpecError(f"{name}: no such file; {unknown_name(what, str(name), shipped)}")
+
+
+def find_spec(name: str | Path) -> Path:
+    """Return the path of a specification, given as a path or by the name of a shipped workflow.
+
+    Raises
+    ------
+    SpecError
+        If neither a file nor a workflow has the name.
+    """
+    return find_file("workflow", name, _shipped())
+
+
+def shipped_workflows() -> dict[str, Path]:
+    """Return the paths of the run specifications that ship with magpend, by name."""
+    return {name: path for name, path in _shipped().items() if not _identifies(path)}
+
+
+def shipped_identifications() -> dict[str, Path]:
+    """Return the paths of the specifications of identifications that ship with magpend, by name."""
+    return {name: path for name, path in _shipped().items() if _identifies(path)}
+
+
+def _identifies(path: Path) -> bool:
+    return tomllib.loads(path.read_text("utf-8")).get("kind") == IDENTIFICATION
+
+
+def _shipped() -> dict[str, Path]:
+    figures = {f"{GALLERY}/{path.stem}": path for path in shipped_files(f"{GALLERY}/*.toml") if path.name != STUDY}
+    return {path.stem: path for path in shipped_files("*.toml")} | figures
+
+
+def default_directory(spec_path: Path, smoke: bool) -> Path:
+    """Return the default run directory of a specification file: ``runs/NAME``."""
+    return Path("runs") / (spec_path.stem + ("-smoke" if smoke else ""))
 
 
 def check_new_file(path: str | Path, suffixes: Sequence[str]) -> Path:

@@ -18,7 +18,6 @@ from magpend_core.models.text.lines import is_equations, read_lines
 from pipeline.specification.files import read_toml, toml_tables
 from pipeline.specification.models import find_model, is_model_file, kept_reference
 from pipeline.specification.problems import SpecError, shown
-from pipeline.specification.writing import specification_toml
 
 
 def model(
@@ -184,11 +183,6 @@ def plain_tables(given: Mapping[str, Any]) -> dict[str, Any]:
         reference = model(reference)
     kept = kept_reference(reference) if isinstance(reference, Model) else _plain(reference)
     return {**tables, "model": kept}
-
-
-def toml_of(tables: Mapping[str, Any]) -> str:
-    """Return the tables of a specification, given in Python, as TOML text."""
-    return specification_toml(plain_tables(tables))
 
 
 def _plain(given: Any) -> Any:

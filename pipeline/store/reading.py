@@ -20,7 +20,7 @@ from pipeline.layout.vocabulary import (
     overrides_attribute,
     section_attributes,
 )
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.declared import METADATA, consolidated_metadata
 from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.records import Commit

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.limits import check_plan
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import cube_digest, read_commits
 from pipeline.store.files import Files
 from pipeline.store.records import Records

@@ -18,7 +18,7 @@ from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import Run
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
 from pipeline.products.tipping import TippingOptions
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 

@@ -25,7 +25,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name
 from pipeline.runs.status import state
 from pipeline.runs.zoom import Changes, to_toml, zoom
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, RandomStarts
 from pipeline.store.errors import StoreError
 from pipeline.store.run import Run

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from magpend._plots import Plots
     from pipeline.explorer.notebook.widget import Explorer
     from pipeline.runs.status import State
+    from pipeline.specification.spec import Spec
     from pipeline.store.checking import Verification
     from pipeline.store.files import Files
 
@@ -300,7 +301,7 @@ class Run(StoredRun):
         nums: Mapping[str, int] | None = None,
         samples: int | None = None,
         echo: Callable[[str], None] | None = None,
-    ) -> dict[str, Any]:
+    ) -> Spec:
         """Return this run's specification with narrower ranges, for `magpend.run`.
 
         Parameters
@@ -320,8 +321,8 @@ class Run(StoredRun):
 
         Returns
         -------
-        dict
-            Tables of the specification, as `magpend.run` takes them.
+        Spec
+            The new specification.
 
         Raises
         ------
@@ -342,7 +343,7 @@ class Run(StoredRun):
         if echo is not None:
             for note in notes:
                 echo(note)
-        return spec.as_dict()
+        return spec
 
 
 def _opening(function: Callable[P, StoredRun]) -> Callable[P, Run]:

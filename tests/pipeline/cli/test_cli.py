@@ -18,8 +18,8 @@ from pipeline.plots import bifurcation
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.run import Run
 
 
@@ -117,7 +117,7 @@ def sweep_of(axes, **tables):
     """A sweep over so many values of each axis: its plan and specification."""
     values = {name: {"values": [1.5 + i for i in range(n)]} for name, n in axes.items()}
     parameters = {} if "frequency_hz" in axes else {"frequency_hz": 2.2}
-    spec = parse_spec({"kind": "sweep", "parameters": parameters, "axes": values, **tables})
+    spec = Spec.parse({"kind": "sweep", "parameters": parameters, "axes": values, **tables})
     return SimpleNamespace(spec=spec, plan=make_plan(spec), name="run")
 
 

@@ -32,7 +32,7 @@ from pipeline.layout.vocabulary import (
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.status import state
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.spec import Spec
 from pipeline.store.run import Run
 from tests.pipeline.explorer.small_runs import FLOW, finished
 
@@ -348,7 +348,7 @@ def test_zoomed__is_the_region_and_reads_back(directories, tmp_path):
     opened = Run.open(directories["whole"])
     region = Region.model_validate_json(json.dumps(REGION))
     (tmp_path / "zoom.toml").write_text(zoom_toml(opened, region))
-    spec = load_spec(tmp_path / "zoom.toml")
+    spec = Spec.read(tmp_path / "zoom.toml")
     assert spec == zoomed(opened, region)[0]
     assert spec.values["A"] == 0.25
     assert not spec.axes

@@ -14,7 +14,8 @@ import pytest
 
 from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store import products
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import read_commits
@@ -51,7 +52,7 @@ def hostile(sound, tmp_path):
 
 
 def plan_of(directory):
-    return make_plan(kept_spec(read_run(directory).spec))
+    return make_plan(Spec.parse(read_run(directory).spec, KEPT))
 
 
 def bomb(n_bytes):

@@ -26,7 +26,7 @@ from pipeline.runs.extend import extend
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits, packing, records
 from pipeline.store.commits import read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
@@ -74,7 +74,7 @@ class Directory:
         self.path = folder / "run"
         text = spec_of(N_TASKS)
         (folder / "spec.toml").write_text(text)
-        self.spec = load_spec(folder / "spec.toml")
+        self.spec = Spec.read(folder / "spec.toml")
         self.plan = make_plan(self.spec)
         self.identity = identity_of(self.spec, self.plan)
         self.info = create(self.path, self.spec, self.plan, self.identity, text)

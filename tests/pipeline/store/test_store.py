@@ -14,7 +14,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.specification.parsing import load_spec, parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits, packing, records
 from pipeline.store.commits import marker_key, read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError
@@ -107,10 +107,10 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
     text = 'kind = "sweep"\n[axes]\n' + "".join(
         f"{name} = {{ values = [1.5, 1.6] }}\n" for name in ("q", "frequency_hz", "eps_drive")
     )
-    spec = load_spec(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
+    spec = Spec.read(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
     identity = identity_of(spec, make_plan(spec))
     create(tmp_path / "run", spec, make_plan(spec), identity, text)
-    again = parse_spec(read_run(tmp_path / "run").spec)
+    again = Spec.parse(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
     assert digest_of(identity_of(again, make_plan(again))) == digest_of(identity)
 
