@@ -25,7 +25,6 @@ from pipeline.plots.style import TARGET, Target
 from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
-from pipeline.runs import python
 from pipeline.runs.arguments import in_python
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
@@ -131,7 +130,7 @@ def test_run__function_returns_the_run_with_methods(run):
     assert type(run) is magpend.Run
     assert magpend.Run.open(run) is run
     assert type(magpend.Run.open(str(run.directory))) is magpend.Run
-    assert inspect.signature(magpend.run) == inspect.signature(python.run)
+    assert "smoke" in inspect.signature(magpend.run).parameters
     assert "run.plot.lyapunov(" in repr(run)
     assert run.status().complete
     assert "20 of 20 cells" in str(run.status())

@@ -18,10 +18,10 @@ from magpend_core import Sections, Status
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.models import KEPT

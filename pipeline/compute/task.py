@@ -22,10 +22,9 @@ from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences, identity_of
+from pipeline.layout.identity import differences, identity_of, numbered
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.models import KEPT
 from pipeline.specification.spec import Spec

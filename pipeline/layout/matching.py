@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.layout.cells import InitialStates, initial_states, parameter_axes
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences
-from pipeline.motion.inputs import Inputs
+from pipeline.layout.identity import differences, numbered
+from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import NoiseTable
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY

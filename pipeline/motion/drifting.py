@@ -11,8 +11,7 @@ import numpy as np
 
 from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Parameters
-from pipeline.motion.inputs import Inputs
-from pipeline.motion.steady import Steady, Values
+from pipeline.motion.steady import Inputs, Steady, Values
 
 if TYPE_CHECKING:
     from magpend_core.models.drift.sections import Drift

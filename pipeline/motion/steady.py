@@ -1,4 +1,4 @@
-"""Integrate cells at constant parameters, and define what the program asks of every kind of motion."""
+"""Define what the integration of cells begins with."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.motion.inputs import Inputs
 from pipeline.products.product import Analysis
 from pipeline.products.registry import ANALYSES
 from pipeline.specification.tables import Integration
@@ -18,6 +17,32 @@ from pipeline.specification.tables import Integration
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.sections import Sections
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Input arrays of `run_branches` for one task: parameters, frequencies and initial states of its branches.
+
+    Attributes
+    ----------
+    parameters : ndarray, (branch, point, parameter)
+    frequency_hz : ndarray, (branch, point)
+    initial_states : ndarray, (branch, n_states)
+    step_size : ndarray, (branch,), or None
+        First step of each branch that continues an earlier task [s]; NaN for a branch that has ended. None
+        for a task in which all branches begin.
+    """
+
+    parameters: np.ndarray
+    frequency_hz: np.ndarray
+    initial_states: np.ndarray
+    step_size: np.ndarray | None = None
+
+    def take(self, branches: Any) -> Inputs:
+        """Return the inputs of selected branches."""
+        step = None if self.step_size is None else self.step_size[branches]
+        return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step)
+
 
 Values = dict[str, np.ndarray]
 

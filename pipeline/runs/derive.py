@@ -31,8 +31,8 @@ from pipeline.layout.conventions import conventional
 from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
-from pipeline.runs import notebook
 from pipeline.runs.naming import named
+from pipeline.runs.progress import bar_in_notebook
 from pipeline.runs.versions import OF_ATTRACTORS, attractor_options, current, key_of
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
@@ -172,7 +172,7 @@ def derive(
     why = unwritable(place.local.parent) if place.local is not None else ""
     if why:
         run.echo(f"{why}: the result of {name} is shown but not kept")
-    with notebook.progress():
+    with bar_in_notebook():
         computed = _compute(run, analysis, wanted, can_keep=not why)
         others = {k: value for k, value in computed.attrs.items() if k not in key}
         result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.spec import Spec
 

@@ -25,8 +25,7 @@ from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size
 from pipeline.runs.run import Echo, carry_out, identity_here
 from pipeline.runs.status import State, state
-from pipeline.runs.widen import Widening, widened
-from pipeline.runs.zoom import derived_toml
+from pipeline.runs.zoom import Widening, derived_toml, widened
 from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec

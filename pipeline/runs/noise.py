@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.layout.cells import CellMap
-from pipeline.motion.inputs import Inputs
 from pipeline.motion.noisy import Noisy
+from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import STEPS, NoiseTable
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec

@@ -8,17 +8,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.domains import check_starts
 from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.scales import size_remarks
-from pipeline.layout.units import unit_remarks
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
-from pipeline.runs.run import identity_here
-from pipeline.runs.scaling import in_scales
+from pipeline.runs.run import identity_here, in_scales
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits

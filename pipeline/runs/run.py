@@ -11,30 +11,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
+from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import size_remarks
-from pipeline.layout.units import unit_remarks
-from pipeline.runs.mending import sound_commits
+from pipeline.layout.scales import size_remarks, with_sizes
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
-from pipeline.runs.scaling import in_scales
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import log_timing, sweep
-from pipeline.store.errors import IncompleteError
+from pipeline.store.commits import log_timing, scan, sweep
+from pipeline.store.errors import DamagedError, IncompleteError, RefusedError
 from pipeline.store.files import Files
-from pipeline.store.packing import Packer
+from pipeline.store.packing import Packer, withdraw
 from pipeline.store.places import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
-from pipeline.store.runfile import RunInfo
+from pipeline.store.runfile import RunInfo, is_run, read_run
 from pipeline.store.setup import check, establish
+from pipeline.store.view import VERIFY, checks_chunks
 
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
@@ -243,3 +242,53 @@ def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
         )
     sweep(info, plan, commits, echo)
     write_copy(info, plan, commits)
+
+
+_LONG_SECONDS = 5.0
+_NAMED = 10
+
+
+def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
+    """Return the commit records of all undamaged tasks; damaged tasks are discarded, to be computed again.
+
+    Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
+    environment only sizes are compared. Files without a record are removed. Only the holder of the lock may
+    call this.
+
+    Parameters
+    ----------
+    info, plan
+        The run and its plan.
+    echo
+        Function that prints a line about each task that is computed again, with the reason.
+    alone
+        Whether no other process can be writing here. Otherwise files without a record stay, since another
+        process may be about to commit them.
+    """
+    started = time.perf_counter()
+    contents = checks_chunks()
+    records, damaged = damaged_records(info, plan, contents=contents)
+    seconds = time.perf_counter() - started
+    if contents and seconds > _LONG_SECONDS:
+        echo(
+            f"{len(records)} committed tasks compared with their records in {duration(seconds)} ({VERIFY}=0 skips this)"
+        )
+    for problem in list(damaged.values())[:_NAMED]:
+        echo(f"{problem}: computed again")
+    if len(damaged) > _NAMED:
+        echo(f"and {len(damaged) - _NAMED} more")
+    if damaged:
+        withdraw(info, damaged)
+        records, _ = scan(info, plan)
+    if alone:
+        sweep(info, plan, records, echo)
+    return records
+
+
+def in_scales(spec: Spec, files: Files) -> Spec:
+    """Return a specification with the sizes of its states: those that the run in a directory keeps, if there is one."""
+    try:
+        kept = read_run(files).parsed_spec() if is_run(files) else None
+    except (DamagedError, RefusedError, OSError):
+        kept = None
+    return with_sizes(spec, kept)

@@ -1,7 +1,9 @@
-"""Read TOML files and texts as plain tables, and merge tables."""
+"""Find, read and write the TOML files of specifications and models."""
 
 from __future__ import annotations
 
+import json
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -9,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from magpend_core.models.imported import KEY
 from pipeline.specification.problems import SpecError, unknown_name
 
 MOST_BYTES = 1_000_000
@@ -228,3 +231,90 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         old = result.get(key)
         result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return result
+
+
+def toml_key(key: str) -> str:
+    """Format a TOML key, quoted if necessary."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
+
+
+def toml_value(value: Any) -> str:
+    """Format a number, text, boolean, list or inline table as TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # JSON escapes every character that TOML requires, except DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{toml_key(k)} = {toml_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        items = [toml_value(v) for v in value]
+        if any(isinstance(v, list | tuple) for v in value):
+            return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
+        return "[" + ", ".join(items) + "]"
+    return repr(value)
+
+
+def table_lines(head: str, table: Mapping[str, Any]) -> list[str]:
+    """Return the TOML lines of a table and of the tables in it, each below its own header."""
+    plain = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+    lines = [f"[{head}]", *(f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items())]
+    for key, inner in table.items():
+        if key not in plain:
+            entries = (f"{toml_key(k)} = {toml_value(v)}" for k, v in inner.items())
+            lines += ["", f"[{head}.{toml_key(key)}]", *entries]
+    return lines
+
+
+ORDER = (
+    "parameters",
+    "axes",
+    "initial_conditions",
+    "section",
+    "drive",
+    "drift",
+    "noise",
+    "continuation",
+    "integration",
+    "products",
+    "execution",
+    "smoke",
+)
+"""Tables of a specification in the order of a file. A model as text comes last, with its own tables."""
+
+
+def specification_toml(tables: Mapping[str, Any]) -> str:
+    """Return the tables of a specification as TOML text. Empty tables are left out.
+
+    Parameters
+    ----------
+    tables
+        Plain data with the keys of a specification. Values that no specification has are written as they
+        are, for the reader to report.
+    """
+    model = tables.get("model")
+    text = model_toml(model) if isinstance(model, str | Mapping) else None
+    plain = {key: value for key, value in tables.items() if key != "model" and not isinstance(value, Mapping)}
+    lines = [f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items()]
+    if model is not None and (text is None or not text.startswith("[")):
+        lines.append(text.rstrip("\n") if text is not None else f"model = {toml_value(model)}")
+    names = [key for key in tables if key not in plain and key != "model"]
+    for name in sorted(names, key=lambda n: ORDER.index(n) if n in ORDER else len(ORDER)):
+        entries = [f"{toml_key(k)} = {toml_value(v)}" for k, v in tables[name].items()]
+        lines += ["", f"[{toml_key(name)}]", *entries] if entries else []
+    if text is not None and text.startswith("["):
+        lines += ["", text.rstrip("\n")]
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def model_toml(reference: str | Mapping[str, Any]) -> str:
+    """Format the reference to a model as TOML: one line for a name, or the tables of a model given as text.
+
+    For a Python object this is its import path, which is imported when the file is read. Tables must come
+    last in a file.
+    """
+    if isinstance(reference, str):
+        return f"model = {toml_value(reference)}\n"
+    if KEY in reference:
+        return f"model = {toml_value(reference[KEY])}\n"
+    return "\n".join(table_lines("model", reference)) + "\n"

@@ -28,7 +28,6 @@ from pipeline.products.product import Options
 from pipeline.products.rotation import ROTATION, RotationOptions
 from pipeline.specification import drift as moving
 from pipeline.specification.drift import DriftTable
-from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import (
     check_new_file,
     default_directory,
@@ -36,20 +35,19 @@ from pipeline.specification.files import (
     merged,
     nested,
     read_toml,
+    specification_toml,
     toml_tables,
     write_new,
 )
-from pipeline.specification.inputs import is_toml_text, plain_tables
-from pipeline.specification.models import is_model_file, with_model_table
+from pipeline.specification.models import is_model_file, is_toml_text, plain_tables, with_model_table
 from pipeline.specification.noise import NoiseTable, disturbed
 from pipeline.specification.parsing import TABLES, valid_tables
 from pipeline.specification.problems import SpecError, shown
-from pipeline.specification.recorded_drive import DriveTable, recorded
+from pipeline.specification.recorded_drive import DriveTable, RecordedDrive, recorded
 from pipeline.specification.section import SectionTable, seen_through
 from pipeline.specification.starts import GridStarts, Starts
 from pipeline.specification.table_methods import TableMethod, knows_its_keys
 from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range
-from pipeline.specification.writing import specification_toml
 
 if TYPE_CHECKING:
     import numpy as np

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from magpend_core.models.model import Model
-from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
-from pipeline.layout.conventions import conventional
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.conventions import conventional, netcdf_safe
+from pipeline.layout.identity import numbered
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import (
     drift_attributes,

@@ -16,8 +16,7 @@ from pipeline.explorer.data.clicked_orbit import finite
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.overlays import MOST_SECTION, SAME_VALUE
 from pipeline.explorer.data.view import can_have
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, KINDS
+from pipeline.layout.vocabulary import ATTRACTS, KINDS, letter
 from pipeline.store.run import Run
 
 

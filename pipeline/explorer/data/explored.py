@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.runs.derive import stored, stored_each
 from pipeline.specification.problems import unknown_name
 from pipeline.store.files import DERIVED

@@ -20,9 +20,7 @@ from pipeline.explorer.data.clicked_orbit import finite, shown
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.verticals import vertical
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, model_of
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, letter, model_of, periods_of
 from pipeline.plots import palette
 from pipeline.plots.branches import NAMES, SHORT, pieces
 from pipeline.plots.labels import state_measure

@@ -17,7 +17,7 @@ from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.series import fixed_points, orbit_series
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
 from pipeline.plots.branches import NAMES
 from pipeline.plots.curve_lines import POINT_NAMES

@@ -18,7 +18,7 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane_of
 from pipeline.explorer.data.verticals import vertical
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
 from pipeline.layout.writing import netcdf_bytes
 from pipeline.plots.files import with_provenance

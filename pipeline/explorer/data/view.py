@@ -16,8 +16,7 @@ from pipeline.explorer.data.explored import Axis, ExploredRun
 from pipeline.explorer.data.plain_text import plain
 from pipeline.explorer.data.series import fixed_points
 from pipeline.explorer.data.verticals import verticals
-from pipeline.layout.period_names import period_of, section_name
-from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
+from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim, period_of, section_name
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.notebook import LEAST_HEIGHT
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 from pipeline.store.run import Run
 
 if TYPE_CHECKING:

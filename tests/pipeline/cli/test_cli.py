@@ -16,8 +16,9 @@ from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.plots import bifurcation
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
-from pipeline.runs import preview, workflows
+from pipeline.runs import preview
 from pipeline.runs.preview import figure_command, first_figure
+from pipeline.specification import files as workflows
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.store.run import Run

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.runs.versions import version_of

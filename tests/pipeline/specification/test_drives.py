@@ -11,8 +11,8 @@ import pytest
 
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.specification.drive_files import load_drive, parse_drive, rising_edges
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import load_drive, parse_drive, rising_edges
 from pipeline.specification.spec import Spec
 
 EDGES = "# measured\nrising_s,falling_s\n1.0,1.2\n1.5,1.7\n2.1,2.3\n2.5,\n"

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.layout.plan import make_plan
+from pipeline.specification.files import toml_key, toml_value
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import Range
-from pipeline.specification.toml import toml_key, toml_value
 from tests.pipeline.factories import duffing
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"

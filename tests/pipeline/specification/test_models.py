@@ -12,7 +12,8 @@ from magpend_core.models import import_model, imported, load_model
 from magpend_core.models.imported import DescribedModel, origin
 from magpend_core.models.parameters import ParameterError
 from pipeline.runs.zoom import Changes, Source, write_zoom
-from pipeline.specification.models import KEPT, find_model, model_toml, read_model_file
+from pipeline.specification.files import model_toml
+from pipeline.specification.models import KEPT, find_model, read_model_file
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 

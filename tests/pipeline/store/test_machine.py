@@ -23,7 +23,7 @@ from magpend_core.status import Status
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec

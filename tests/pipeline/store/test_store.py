@@ -11,7 +11,7 @@ import pytest
 from pipeline import open_run
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from pipeline.analysis.ragged import dense
-from pipeline.layout.attractor_letters import letter
+from pipeline.layout.vocabulary import letter
 from pipeline.runs.derive import stored
 from pipeline.store.run import Run, open_run
 from tests.pipeline.explorer.browser.conftest import WAIT_MS, drawn, reused, served
