@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,7 +85,7 @@ class Work:
         ]
 
 
-def measure(spec: Spec, plan: Plan, done: Mapping[int, Any]) -> Work:
+def measure(spec: Spec, plan: Plan, done: Container[int]) -> Work:
     """Measure the work that a run still has to do, as ``magpend run --dry-run`` does."""
     left = [index for index in range(plan.n_tasks) if index not in done]
     n_left = sum(plan.cells_in(index) for index in left)

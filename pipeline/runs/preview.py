@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.layout.conventions import unit_remarks
-from pipeline.layout.domains import check_starts
 from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.scales import size_remarks
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
-from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
-from pipeline.runs.run import identity_here, in_scales
+from pipeline.runs.run import identity_here, ready
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
@@ -219,10 +217,8 @@ def preview(
         See `pipeline.runs.run.run`.
     """
     parsed = Spec.read(spec, smoke=smoke)
-    check_starts(parsed)
     files = open_files(out if out is not None else parsed.directory)
-    parsed = in_scales(parsed, files)
-    check_steps(parsed)
+    parsed = ready(parsed, files)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}

@@ -31,6 +31,7 @@ from pipeline.store.packing import Packer, withdraw
 from pipeline.store.places import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
+from pipeline.store.run import Run
 from pipeline.store.runfile import RunInfo, is_run, read_run
 from pipeline.store.setup import check, establish
 from pipeline.store.view import VERIFY, checks_chunks
@@ -105,16 +106,35 @@ def run(
     files = open_files(out if out is not None else parsed.directory)
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
-    check_starts(parsed)
-    parsed = in_scales(parsed, files)
-    check_steps(parsed)
+    parsed = ready(parsed, files)
     for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
     for line in size_remarks(parsed):
         echo(line)
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
-    warn_of_steps(parsed, files, echo)
-    return state(files)
+    finished = Run.open(files)
+    warn_of_steps(parsed, finished, echo)
+    return state(finished)
+
+
+def ready(spec: Spec, files: Files) -> Spec:
+    """Check what a specification computes, and return it with the sizes of its states.
+
+    The sizes are those that the run in the directory keeps, if there is one.
+
+    Raises
+    ------
+    SpecError
+        If the equations have no value at the starts, or if steps of noise are too long.
+    """
+    check_starts(spec)
+    try:
+        kept = read_run(files).parsed_spec() if is_run(files) else None
+    except (DamagedError, RefusedError, OSError):
+        kept = None
+    spec = with_sizes(spec, kept)
+    check_steps(spec)
+    return spec
 
 
 def carry_out(
@@ -283,12 +303,3 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) 
     if alone:
         sweep(info, plan, records, echo)
     return records
-
-
-def in_scales(spec: Spec, files: Files) -> Spec:
-    """Return a specification with the sizes of its states: those that the run in a directory keeps, if there is one."""
-    try:
-        kept = read_run(files).parsed_spec() if is_run(files) else None
-    except (DamagedError, RefusedError, OSError):
-        kept = None
-    return with_sizes(spec, kept)

@@ -14,23 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.jobqueue import jobs_folder, worker_script
-from pipeline.layout.domains import check_starts
-from pipeline.layout.plan import make_plan
 from pipeline.layout.writing import write_atomically
 from pipeline.runs.batch_systems import Choice, answer, choose, no_command
 from pipeline.runs.derive import analyses_in
 from pipeline.runs.jobs import Work, complete, coordinator_script, is_whole, measure, remarks, resources
-from pipeline.runs.noise import check_steps
+from pipeline.runs.preview import preview
 from pipeline.runs.progress import size, whole
-from pipeline.runs.run import identity_here, in_scales
 from pipeline.specification.clusters import SYSTEMS, Cluster, cluster_of
-from pipeline.specification.files import default_directory, find_spec, specification_toml, toml_value
+from pipeline.specification.files import find_spec, specification_toml, toml_value
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
-from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
 from pipeline.store.places import open_files
-from pipeline.store.setup import check
 
 SCRIPT, SENT, TABLE = "job.sh", "job.json", "cluster.toml"
 _ANSWER_S = 60.0
@@ -133,25 +128,20 @@ def prepare(
         If the run cannot be done in the directory.
     """
     path = find_spec(spec)
-    parsed = Spec.read(path, smoke=smoke)
+    directory = out if out is not None else Spec.read(path, smoke=smoke).directory
     analyses_in(analyse)
     more = [*(["--smoke"] if smoke else []), *(["--analyse", analyse] if analyse else [])]
     retry = shlex.join([str(spec), *(["--out", str(out)] if out else []), *more])
     choice = choose(cluster, changes, retry)
-    files = open_files(out if out is not None else default_directory(path, smoke))
+    files = open_files(directory)
     folder = jobs_folder(files.place)
     if _AWKWARD.search(str(folder)):
         raise SpecError(
             f"{folder}: batch systems do not accept this path for a job's output; give an --out with only letters, "
             "digits, and . _ - + , : = @."
         )
-    check_starts(parsed)
-    parsed = in_scales(parsed, files)
-    check_steps(parsed)
-    plan = make_plan(parsed)
-    info = check(files, identity_here(parsed, plan))
-    done = read_commits(info, plan) if info is not None else {}
-    work = measure(parsed, plan, done)
+    found = preview(path, directory, smoke=smoke)
+    work = measure(found.spec, found.plan, found.done)
     table, reasons = complete(choice.table, work)
     described = cluster_of(table)
     file = choice.file or folder / TABLE
@@ -159,7 +149,7 @@ def prepare(
     command = _command(described, file, path, files.place, more)
     return Submission(
         name=files.name,
-        title=parsed.title,
+        title=found.spec.title,
         retry=retry,
         folder=folder,
         choice=choice,
@@ -168,7 +158,7 @@ def prepare(
         work=work,
         script=coordinator_script(described, name, f"{folder}/coordinator", str(Path.cwd()), command),
         worker=None if is_whole(described) else worker_script(described, folder),
-        complete=info is not None and len(done) == plan.n_tasks,
+        complete=found.exists and len(found.done) == found.n_tasks,
     )
 
 
