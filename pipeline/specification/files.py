@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import tomllib
@@ -15,6 +16,8 @@ from magpend_core.models.imported import KEY
 from pipeline.specification.problems import SpecError, unknown_name
 
 MOST_BYTES = 1_000_000
+MOST_TEXT_BYTES = 20_000_000
+"""Most bytes of a CSV file that a table names."""
 MOST_ELEMENTS = 100_000
 """Most elements of an array."""
 MOST_DEPTH = 32
@@ -44,6 +47,56 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise SpecError(f"{path}: {_unreadable(error)}") from None
     return toml_tables(content, str(path))
+
+
+def read_text(path: str | Path, remedy: str = "") -> tuple[str, str]:
+    """Return the text of a CSV file and its sha256.
+
+    Parameters
+    ----------
+    path
+        The file.
+    remedy
+        End of the message if it cannot be read.
+
+    Raises
+    ------
+    SpecError
+        If it cannot be read, is not text, or is too large.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read ({error.strerror or error}){remedy}.") from None
+    if len(content) > MOST_TEXT_BYTES:
+        raise SpecError(f"{path}: has {len(content)} bytes; give at most {MOST_TEXT_BYTES}: choose a part, or thin it.")
+    try:
+        return content.decode("utf-8"), hashlib.sha256(content).hexdigest()
+    except UnicodeDecodeError:
+        raise SpecError(f"{path}: is not text in UTF-8; give a CSV file.") from None
+
+
+def with_text(table: Any, folder: str | Path, at: str, problems: list[str], remedy: str = "") -> Any:
+    """Return a table with the text and the sha256 of the file that it names, unless it has them."""
+    if not isinstance(table, dict) or not isinstance(table.get("file"), str) or "text" in table:
+        return table
+    path = Path(folder) / table["file"]
+    try:
+        text, digest = read_text(path, remedy)
+    except SpecError as error:
+        problems += [f"{at}.file = {table['file']!r}: {p.removeprefix(f'{path}: ')}" for p in error.problems]
+        return table
+    return {"sha256": digest, **table, "text": text}
+
+
+def has_digest(text: str, sha256: str | None, file: str | None, at: str, problems: list[str]) -> bool:
+    """Return whether the text of a file has the digest of its table; if not, add a problem."""
+    if hashlib.sha256(text.encode()).hexdigest() == sha256:
+        return True
+    problems.append(
+        f"{at}.sha256 = {sha256!r}: is not the digest of {file}; drop the key, or restore the file with this digest."
+    )
+    return False
 
 
 def shipped_files(pattern: str) -> list[Path]:

@@ -16,12 +16,12 @@ from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification import drift as moving
-from pipeline.specification.files import IDENTIFICATION, odd_data
+from pipeline.specification.files import IDENTIFICATION, odd_data, with_text
 from pipeline.specification.models import A_MODEL, add_model, stand_in
 from pipeline.specification.noise import NoiseTable, disturbed, follows, noise_of
 from pipeline.specification.parameters import parameter_problems, size_problems
-from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
-from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
+from pipeline.specification.problems import SpecError, checked, shown, table_at, unknown_choice, unknown_key
+from pipeline.specification.recorded_drive import HOW, DriveTable, recorded, run_problems
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, Starts, refine_problems, starts_model
 from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range, Table
@@ -86,7 +86,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
         raise SpecError(A_MODEL)
     problems = [unknown_key(key, key, KEYS) for key in data if key not in KEYS]
     data = _with_preset(data, folder, problems)
-    data = data if folder is None else moving.with_files(with_drive(data, folder, problems), folder, problems)
+    data = data if folder is None else _with_texts(data, folder, problems)
     kind, title = _kind(data, problems), _title(data, problems)
     model = add_model(data.get("model", DEFAULT), folder, problems)
     tables = {name: _table(data, name, table, problems) for name, table in TABLES.items()}
@@ -149,12 +149,21 @@ def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: l
     return {**data, "parameters": {"preset": content, **rest}}
 
 
+def _with_texts(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
+    """Add the texts of the files that ``[drive]`` and the tables of ``[drift]`` name."""
+    found = dict(data)
+    if "drive" in data:
+        found["drive"] = with_text(data["drive"], folder, "drive", problems, HOW)
+    if isinstance(data.get("drift"), dict):
+        drift = data["drift"].items()
+        found["drift"] = {name: with_text(table, folder, f"drift.{name}", problems) for name, table in drift}
+    return found
+
+
 def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
     """Validate ``[products]``, the results stored for each cell; fill in options that follow from the model."""
-    if not _is_table(data, "products", problems):
-        return {}
     found: dict[str, Options] = {}
-    for name, table in data.get("products", {}).items():
+    for name, table in table_at(data, "products", problems).items():
         path = f"products.{name}"
         if name not in CELL_PRODUCTS:
             problems.append(unknown_key(path, name, CELL_PRODUCTS))
@@ -203,23 +212,15 @@ def _title(data: Mapping[str, Any], problems: list[str]) -> str:
     return str(title)
 
 
-def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
-    if isinstance(data.get(name, {}), dict):
-        return True
-    problems.append(f"{name} = {shown(data[name])}: must be a table; write [{name}].")
-    return False
-
-
 def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
-    if not _is_table(data, name, problems) or (name not in data and name in _OPTIONAL):
-        return None
-    return checked(model, data.get(name, {}), name, problems)
+    table = table_at(data, name, problems)
+    is_left_out = name not in data and name in _OPTIONAL
+    return None if is_left_out or not isinstance(data.get(name, {}), dict) else checked(model, table, name, problems)
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    if not _is_table(data, "axes", problems):
-        return {}
-    axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
+    given = table_at(data, "axes", problems).items()
+    axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in given}
     return {name: axis for name, axis in axes.items() if axis is not None}
 
 
@@ -227,9 +228,9 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
     if "initial_conditions" not in data:
         problems.append('initial_conditions: missing; add this table with kind = "grid", "list" or "random".')
         return None
-    if not _is_table(data, "initial_conditions", problems):
+    table = table_at(data, "initial_conditions", problems)
+    if not isinstance(data["initial_conditions"], dict):
         return None
-    table = data["initial_conditions"]
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in STARTS:
         choices = list(STARTS)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from pipeline.specification.files import has_digest, read_text
 from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import FREQUENCY, Table
 
@@ -34,7 +35,8 @@ HEADERS = {EDGES: ("rising_s", "falling_s"), TORQUE: ("time_s", "drive")}
 DUTY = "duty_cycle"
 """Parameter whose value measured edges set anew in each period."""
 
-MOST_BYTES = 20_000_000
+HOW = "; make one with: magpend recordings drive"
+"""Remedy for a drive file that cannot be read."""
 MOST_PROBLEMS = 5
 _COINCIDENT_S = 1e-9
 _BAND = 0.5
@@ -126,34 +128,9 @@ class RecordedDrive:
         return np.asarray(np.searchsorted(self._times, self.sections_s - _COINCIDENT_S) - 1)
 
 
-def read_drive(path: str | Path) -> tuple[str, str]:
-    """Return a drive file's text and its sha256.
-
-    Raises
-    ------
-    SpecError
-        If it cannot be read, is not text, or is too large.
-    """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise SpecError(
-            f"{path}: cannot be read ({error.strerror or error}); make one with: magpend recordings drive."
-        ) from None
-    if len(content) > MOST_BYTES:
-        raise SpecError(
-            f"{path}: has {len(content)} bytes; a drive file has at most {MOST_BYTES}: choose a part of the "
-            "recording, or thin it (magpend recordings drive --window, --tolerance)."
-        )
-    try:
-        return content.decode("utf-8"), hashlib.sha256(content).hexdigest()
-    except UnicodeDecodeError:
-        raise SpecError(f"{path}: is not text in UTF-8; a drive file is CSV.") from None
-
-
 def load_drive(path: str | Path, *, section_hz: float | None = None) -> RecordedDrive:
     """Read a drive file (CSV) and parse it into a `RecordedDrive`."""
-    text, digest = read_drive(path)
+    text, digest = read_text(path, HOW)
     return parse_drive(text, Path(path).name, digest, section_hz)
 
 
@@ -304,21 +281,6 @@ class DriveTable(Table):
     text: str | None = Field(default=None, description="The file's text; filled in when the file is read.")
 
 
-def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
-    """Read the drive file that a specification names and add its text and sha256 to ``[drive]``, unless they are
-    there.
-    """
-    table = data.get("drive")
-    if not isinstance(table, dict) or not isinstance(table.get("file"), str) or "text" in table:
-        return data
-    try:
-        text, digest = read_drive(Path(folder) / table["file"])
-    except SpecError as error:
-        problems += [f"drive.file = {table['file']!r}: {p}" for p in error.problems]
-        return data
-    return {**data, "drive": {"sha256": digest, **table, "text": text}}
-
-
 def is_whole(table: Any) -> bool:
     """Return whether the recording in a ``[drive]`` table has the sha256 stored with it, or there is no such table."""
     if not isinstance(table, Mapping):
@@ -330,11 +292,7 @@ def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | N
     """Parse the recording in a ``[drive]`` table; return None if there is no table or if it has problems."""
     if table is None or table.text is None:  # an unreadable file is reported already
         return None
-    if hashlib.sha256(table.text.encode()).hexdigest() != table.sha256:
-        problems.append(
-            f"drive.sha256 = {table.sha256!r}: is not the digest of {table.file}; drop the key, or "
-            "restore the file with this digest."
-        )
+    if not has_digest(table.text, table.sha256, table.file, "drive", problems) or table.sha256 is None:
         return None
     try:
         return parse_drive(table.text, Path(table.file).name, table.sha256, table.section_hz)
