@@ -95,7 +95,7 @@ def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tu
     Raises
     ------
     RefusedError, DamagedError, UnreadableError
-        See `pipeline.store.run.Run.open`.
+        See `pipeline.store.run.RunDirectory.open`.
     """
     shown = Shown(AnalysedRun.of(source, echo), computed)
     title = shown.run.info.title or shown.run.name.rpartition("/")[2]

@@ -14,7 +14,7 @@ from pipeline.products.registry import FIGURES
 from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
 from pipeline.runs.naming import named
 from pipeline.specification.problems import SpecError, unknown_name, validated
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -116,7 +116,7 @@ def draw_panels(
 
         make = pyplot.figure
     run: Any
-    if isinstance(source, str | Path | Run):
+    if isinstance(source, str | Path | RunDirectory):
         run, wanted = ready(source, name, wanted, echo)
     else:
         run, wanted = ready_cube(source, name, wanted, echo)

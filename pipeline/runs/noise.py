@@ -13,7 +13,7 @@ from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import STEPS, NoiseTable
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 SAMPLE, PERIODS = 32, 4
 """Cells and periods of the sample that is integrated before a run begins."""
@@ -59,7 +59,7 @@ def check_steps(spec: Spec) -> None:
         )
 
 
-def warn_of_steps(spec: Spec, run: Run, echo: Callable[[str], None]) -> None:
+def warn_of_steps(spec: Spec, run: RunDirectory, echo: Callable[[str], None]) -> None:
     """Print a warning if cells of a finished run have a strong error above ``noise.tolerance``."""
     motion = spec.motion
     if not isinstance(motion, Noisy):

@@ -20,14 +20,14 @@ from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
 from pipeline.store.places import open_files
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import check
 
 MANY_SECTIONS = 500
 """Fewest kept sections for which the section of a single parameter point is drawn."""
 
 
-def first_figure(run: Run) -> str:
+def first_figure(run: RunDirectory) -> str:
     """Return the name of the figure that gives the best overview of a run; the run can draw it."""
     plan = run.plan
     swept, grid = _long(plan)
@@ -46,14 +46,14 @@ def first_figure(run: Run) -> str:
     return "bifurcation" if any(not is_start_dim(d) for d in plan.dims) else "gallery"
 
 
-def figure_command(run: Run) -> str:
+def figure_command(run: RunDirectory) -> str:
     """Return the ``magpend plot`` command that draws the best overview of a run."""
     name, options = needed(run)
     points = "".join(f" --at {axis}={value:.10g}" for axis, value in options.get("at", {}).items())
     return f"magpend plot {name} {run.name}" + (" --map" if "as_map" in options else "") + points
 
 
-def needed(run: Run, name: str = "") -> tuple[str, dict[str, Any]]:
+def needed(run: RunDirectory, name: str = "") -> tuple[str, dict[str, Any]]:
     """Return the name of a figure, by default `first_figure`, and the options without which it cannot show the run: a
     value in the middle of each axis that it has not.
     """
@@ -75,7 +75,7 @@ def _long(plan: Plan) -> tuple[list[str], list[str]]:
     return [d for d in long if not is_start_dim(d)], [d for d in long if is_grid_dim(d)]
 
 
-def shown(run: Run) -> tuple[str, dict[str, Any], str]:
+def shown(run: RunDirectory) -> tuple[str, dict[str, Any], str]:
     """Return the figure that ``magpend run --plot`` draws: its name, its options, and a note on what it leaves out.
 
     Returns

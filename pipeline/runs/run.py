@@ -31,7 +31,7 @@ from pipeline.store.packing import Packer, withdraw
 from pipeline.store.places import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import RunInfo, is_run, read_run
 from pipeline.store.setup import check, establish
 from pipeline.store.view import VERIFY, checks_chunks
@@ -112,7 +112,7 @@ def run(
     for line in size_remarks(parsed):
         echo(line)
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
-    finished = Run.open(files)
+    finished = RunDirectory.open(files)
     warn_of_steps(parsed, finished, echo)
     return state(finished)
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class OpenedRun(Protocol):
-    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.Run`."""
+    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.RunDirectory`."""
 
     @property
     def info(self) -> RunInfo: ...  # noqa: D102

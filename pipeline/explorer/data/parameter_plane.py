@@ -22,12 +22,12 @@ from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, sp
 from pipeline.plots.branches import NAMES
 from pipeline.plots.curve_lines import POINT_NAMES
 from pipeline.plots.labels import swept_label
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or name their run with --curves"
 
 
-def parameter_plane(run: Run) -> dict[str, Any]:
+def parameter_plane(run: RunDirectory) -> dict[str, Any]:
     """Return the bifurcation curves of a run, with the number of attractors over the plane if the run sweeps both
     parameters.
 
@@ -108,7 +108,7 @@ def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
     }
 
 
-def curve_orbit(run: Run, curve: int, point: int) -> bytes:
+def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
     """Integrate the orbit at a point of a bifurcation curve; return arrays and attributes, packed for the page.
 
     Parameters

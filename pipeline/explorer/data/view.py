@@ -20,7 +20,7 @@ from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING,
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 FORMAT = 1
 """Of the answers; a page refuses another one."""
@@ -28,7 +28,7 @@ FORMAT = 1
 _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
-def describe_view(run: Run, live: bool) -> dict[str, Any]:
+def describe_view(run: RunDirectory, live: bool) -> dict[str, Any]:
     """Return a dictionary with all that the page needs to know about a run when it loads.
 
     Parameters
@@ -71,7 +71,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
     }
 
 
-def _name(run: Run) -> str:
+def _name(run: RunDirectory) -> str:
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 

@@ -25,7 +25,7 @@ from pipeline.runs.run import run as complete
 from pipeline.runs.stopping import InterruptedRunError, interrupt
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.spec import Spec
-from pipeline.store.run import Run as StoredRun
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipeline.store.files import Files
 
 
-class Run(StoredRun):
+class Run(RunDirectory):
     """An opened run directory with its analyses as methods and its figures under `plot`.
 
     A run holds the commit records found when it was opened, so that all its results use the same cells. Open it
@@ -84,7 +84,7 @@ class Run(StoredRun):
     density = AnalysisMethod(DensityOptions)
 
     @classmethod
-    def open(cls, source: str | Path | Files | StoredRun) -> Self:
+    def open(cls, source: str | Path | Files | RunDirectory) -> Self:
         """Open a run directory with its present commit records; return an opened run unchanged.
 
         Raises
@@ -98,7 +98,7 @@ class Run(StoredRun):
         """
         if isinstance(source, cls):
             return source
-        run = StoredRun.open(source)
+        run = RunDirectory.open(source)
         return cls(run.info, run.spec, run.plan, run.commits)
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
@@ -160,7 +160,7 @@ class Run(StoredRun):
         return table(getattr(self, name)(**options))
 
     @names_arguments
-    def explore(self, *, curves: str | Path | StoredRun | None = None, height: int = 720) -> Explorer:
+    def explore(self, *, curves: str | Path | RunDirectory | None = None, height: int = 720) -> Explorer:
         """Show the run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
 
         Parameters
@@ -401,18 +401,18 @@ def run(
 
 @overload
 def open_run(
-    path: str | Path | StoredRun, *, tree: Literal[False] = False, chunks: Any = None, check: bool | None = None
+    path: str | Path | RunDirectory, *, tree: Literal[False] = False, chunks: Any = None, check: bool | None = None
 ) -> xr.Dataset: ...
 
 
 @overload
 def open_run(
-    path: str | Path | StoredRun, *, tree: Literal[True], chunks: Any = None, check: bool | None = None
+    path: str | Path | RunDirectory, *, tree: Literal[True], chunks: Any = None, check: bool | None = None
 ) -> xr.DataTree: ...
 
 
 def open_run(
-    path: str | Path | StoredRun, *, tree: bool = False, chunks: Any = None, check: bool | None = None
+    path: str | Path | RunDirectory, *, tree: bool = False, chunks: Any = None, check: bool | None = None
 ) -> xr.Dataset | xr.DataTree:
     """Open the result cube of a run directory, alone or in a tree with the kept results of all analyses.
 

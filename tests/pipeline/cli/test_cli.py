@@ -21,7 +21,7 @@ from pipeline.runs.preview import figure_command, first_figure
 from pipeline.specification import files as workflows
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 
 @pytest.mark.slow
@@ -179,7 +179,7 @@ def test_hint_after_a_run__is_a_figure_that_the_run_can_draw(main, tables, hint,
         workers=0,
         echo=lambda _: None,
     )
-    command = figure_command(Run.open("run"))
+    command = figure_command(RunDirectory.open("run"))
     assert command == f"magpend plot {hint}"
     code, _, err = main(*command.split()[1:])
     assert code == 0, err

@@ -32,7 +32,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
 from pipeline.runs.derive import derive
 from pipeline.specification.spec import Spec
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create
 from tests.pipeline.explorer.small_runs import FLOW, finished
 
@@ -140,7 +140,7 @@ def test_describe_view__reads_what_is_computed_later(walk):
     derive(walk, "settling")
     assert explored.refreshed() is not explored
     # whoever holds an opened run may hand it over; an explored one is taken as it is
-    opened = Run.open(walk)
+    opened = RunDirectory.open(walk)
     assert ExploredRun.of(ExploredRun.of(opened)).digest == opened.digest
     assert ExploredRun.of(explored) is explored
 

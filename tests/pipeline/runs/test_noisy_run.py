@@ -19,7 +19,7 @@ from pipeline.runs.noise import warn_of_steps
 from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import WELL, finished, quietly
 
 S = (0.45, 0.55, 0.7)
@@ -167,7 +167,7 @@ def test_run__refuses_steps_that_are_too_long(tmp_path: Path) -> None:
 def test_warn_of_steps__counts_the_cells_above_the_tolerance(directory: Path) -> None:
     lines: list[str] = []
     for tolerance in (0.01, 1e-9):
-        warn_of_steps(Spec.parse(spec(noise={"tolerance": tolerance})), Run.open(directory), lines.append)
+        warn_of_steps(Spec.parse(spec(noise={"tolerance": tolerance})), RunDirectory.open(directory), lines.append)
     assert len(lines) == 1
     assert lines[0].startswith("warning: in 600 of 600 cells the last period changes by more than noise.tolerance")
 

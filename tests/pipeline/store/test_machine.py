@@ -31,7 +31,7 @@ from pipeline.store import commits, packing, records
 from pipeline.store.commits import read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.packing import Packer, pack_block
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
 from tests.pipeline.factories import duffing, finished, silent
 
@@ -64,7 +64,7 @@ def computed(n: int) -> tuple[dict[str, bytes], xr.Dataset]:
     """Bytes and cube of a run that nothing happens to."""
     with tempfile.TemporaryDirectory(prefix="life-") as folder:
         directory = finished(Path(folder), spec_of(n))
-        return bytes_of(directory), Run.open(directory).cube().load()
+        return bytes_of(directory), RunDirectory.open(directory).cube().load()
 
 
 class Directory:
@@ -228,7 +228,7 @@ class Life(RuleBasedStateMachine):
     @invariant()
     def is_read_as_written_or_not_at_all(self):
         try:
-            opened = Run.open(self.run.path)
+            opened = RunDirectory.open(self.run.path)
             cube = opened.cube().load()
         except StoreError:
             return

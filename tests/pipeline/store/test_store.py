@@ -21,7 +21,7 @@ from pipeline.store.errors import DamagedError
 from pipeline.store.keys import Owners, keys_of
 from pipeline.store.packing import Packer, pack_block, withdraw
 from pipeline.store.records import block_of_pack
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import create
 from tests.pipeline.factories import silent
@@ -120,11 +120,11 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
 
 @pytest.mark.slow
 def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
-    alone = Run.open(whole.info.directory)
+    alone = RunDirectory.open(whole.info.directory)
     digest, cells, first = alone.digest, alone.commits.cells(), dict(alone.commits)
     assert go_on(whole) == []
     assert names_in(whole) == PACKED
-    together = Run.open(whole.info.directory)
+    together = RunDirectory.open(whole.info.directory)
     assert (together.digest, together.commits.cells()) == (digest, cells)
     found = together.commits
     assert dict(found) == first
