@@ -17,7 +17,7 @@ from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
 from pipeline.compute.closing import LOOKED_AT, closing_of
-from pipeline.layout.domains import check_states
+from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.specification.files import check_new_file

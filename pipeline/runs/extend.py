@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.layout.cells import CellMap
-from pipeline.layout.domains import check_starts
+from pipeline.layout.evaluation import check_starts, with_sizes
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import with_sizes
 from pipeline.layout.writing import sync_folder
 from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size

@@ -153,7 +153,7 @@ def _alone(start: Start) -> instants.Moving:
     import numpy as np
 
     from pipeline.compute.simulate import start_of
-    from pipeline.layout.domains import check_states
+    from pipeline.layout.evaluation import check_states
     from pipeline.specification.tables import FREQUENCY
 
     model = load_model(start.model)

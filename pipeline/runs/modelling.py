@@ -9,7 +9,7 @@ import numpy as np
 
 from magpend_core.models.model import Model, Parameters
 from pipeline.layout.cells import CellMap
-from pipeline.layout.domains import check_starts, check_states
+from pipeline.layout.evaluation import check_starts, check_states
 from pipeline.specification.files import check_new_file, read_toml, write_new
 from pipeline.specification.models import find_model, is_model_file
 from pipeline.specification.parsing import KINDS

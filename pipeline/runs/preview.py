@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.layout.conventions import unit_remarks
-from pipeline.layout.limits import check_space
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import size_remarks
+from pipeline.layout.evaluation import size_remarks
+from pipeline.layout.plan import Plan, check_space, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import duration, size

@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
 from pipeline.layout.conventions import unit_remarks
-from pipeline.layout.domains import check_starts
+from pipeline.layout.evaluation import check_starts, size_remarks, with_sizes
 from pipeline.layout.identity import identity_of
-from pipeline.layout.limits import check_plan, check_space
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import size_remarks, with_sizes
+from pipeline.layout.plan import Plan, check_plan, check_space, make_plan
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
@@ -181,7 +179,7 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     Raises
     ------
     SpecError
-        If the run is too large, see `limits.check_plan`.
+        If the run is too large, see `check_plan`.
     """
     check_plan(plan)
     return identity_of(spec, plan)

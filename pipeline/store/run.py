@@ -9,8 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.limits import check_plan
-from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.plan import Plan, check_plan, make_plan
 from pipeline.specification.spec import Spec
 from pipeline.store.commits import cube_digest, read_commits
 from pipeline.store.files import Files

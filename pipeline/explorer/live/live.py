@@ -24,7 +24,7 @@ from pipeline.explorer.live.legend import Legend
 from pipeline.explorer.live.messages import RequestError
 from pipeline.explorer.live.settling import Flight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
-from pipeline.layout.domains import check_states
+from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import axis_name
 from pipeline.runs.derive import stored
 from pipeline.specification.tables import FREQUENCY

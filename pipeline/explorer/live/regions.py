@@ -20,8 +20,7 @@ from pipeline.explorer.live.jobs import PATIENCE_S, Job
 from pipeline.explorer.live.messages import Region, RequestError, RunRequest
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.identity import canonical
-from pipeline.layout.limits import check_plan
-from pipeline.layout.plan import make_plan
+from pipeline.layout.plan import check_plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name
 from pipeline.runs.status import state
 from pipeline.runs.zoom import Changes, to_toml, zoom

@@ -7,8 +7,7 @@ from collections import namedtuple
 
 import pytest
 
-from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space
-from pipeline.layout.plan import MOST_TASKS, make_plan
+from pipeline.layout.plan import MOST_CHUNK_BYTES, MOST_TASKS, check_plan, check_space, make_plan
 from pipeline.runs.preview import describe_plan
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.layout.scales import with_sizes
+from pipeline.layout.evaluation import with_sizes
 from pipeline.specification.spec import Spec
 
 TEXT = {
