@@ -41,22 +41,15 @@ class ParameterAxis:
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Initial states numbered by one flat index; a grid is stored as its axes, not as a table of all states.
+    """Initial states numbered by one flat index; a grid is stored as its axes, not as a table of all states."""
 
-    Attributes
-    ----------
-    dims, shape
-        Dims of the initial conditions in a sweep, and their sizes.
-    columns
-        Values of each state, in the model's units: one number for all, one value per row, or with `grid`
-        one value per step of the grid's dim.
-    grid
-        Index of each state's grid dim, None for a fixed state; None as a whole without a grid.
-    """
-
+    # dims of the initial conditions in a sweep, and their sizes
     dims: tuple[str, ...]
     shape: tuple[int, ...]
+    # values of each state, in the model's units: one number for all, one value per row, or with `grid` one value
+    # per step of the grid's dim
     columns: tuple[np.ndarray, ...]
+    # index of each state's grid dim, None for a fixed state; None as a whole without a grid
     grid: tuple[int | None, ...] | None = None
 
     def __len__(self) -> int:

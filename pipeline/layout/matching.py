@@ -51,21 +51,11 @@ def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Way:
-    """Order in which a continuation visits its parameter values, and the position of a block of cells in this order.
+    """Order in which a continuation visits its parameter values, and the position of a block of cells in this order."""
 
-    Attributes
-    ----------
-    direction : str
-        ``"up"`` or ``"down"``.
-    values : ndarray
-        The whole path, in the order in which it is walked.
-    first : int
-        Number of points on the path before the block.
-    """
-
-    direction: str
-    values: np.ndarray
-    first: int
+    direction: str  # ``"up"`` or ``"down"``
+    values: np.ndarray  # the whole path, in the order in which it is walked
+    first: int  # number of points on the path before the block
 
 
 def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:

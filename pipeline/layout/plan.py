@@ -48,39 +48,20 @@ TASK_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class Plan:
-    """The plan of a run: cells, tasks and chunks, with estimates of size and time.
+    """The plan of a run: cells, tasks and chunks, with estimates of size and time."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"sweep"`` or ``"continuation"``.
-    dims, shape : tuple
-        Cell dims of the cube, and their sizes.
-    path : int or None
-        Index of the dim that branches walk; None in a sweep.
-    block : tuple of int
-        Cells of a task, per dim.
-    variables : tuple of Variable
-        Variables of the cube.
-    sizes : dict
-        Sizes of the dims that are not cell dims.
-    seconds_per_cell : float
-        Estimated time on one core [s].
-    directions : tuple of str
-        Directions in which branches walk, each for an equal part of the branches; empty in a sweep.
-    seconds_at : ndarray or None
-        Estimated time of a cell on one core at each swept frequency [s]; None if it is not swept.
-    """
-
-    kind: str
+    kind: str  # ``"sweep"`` or ``"continuation"``
+    # cell dims of the cube, and their sizes
     dims: tuple[str, ...]
     shape: tuple[int, ...]
-    path: int | None
-    block: tuple[int, ...]
-    variables: tuple[Variable, ...]
-    sizes: Mapping[str, int]
-    seconds_per_cell: float
+    path: int | None  # index of the dim that branches walk; None in a sweep
+    block: tuple[int, ...]  # cells of a task, per dim
+    variables: tuple[Variable, ...]  # variables of the cube
+    sizes: Mapping[str, int]  # sizes of the dims that are not cell dims
+    seconds_per_cell: float  # estimated time on one core [s]
+    # directions in which branches walk, each for an equal part of the branches; empty in a sweep
     directions: tuple[str, ...] = ()
+    # estimated time of a cell on one core at each swept frequency [s]; None if it is not swept
     seconds_at: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property

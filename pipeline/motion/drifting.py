@@ -20,21 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Drifting(Steady):
-    """Motion while parameters move.
+    """Motion while parameters move."""
 
-    Attributes
-    ----------
-    ramps : tuple of Ramp
-        How each parameter moves.
-    values : Parameters
-        Values of the parameters that are not swept.
-    corners : tuple of ndarray
-        Packed parameters and frequencies of cells at the ends of all axes.
-    """
-
-    ramps: tuple[Ramp, ...]
-    values: Parameters
-    corners: tuple[np.ndarray, np.ndarray]
+    ramps: tuple[Ramp, ...]  # how each parameter moves
+    values: Parameters  # values of the parameters that are not swept
+    corners: tuple[np.ndarray, np.ndarray]  # packed parameters and frequencies of cells at the ends of all axes
 
     kind: ClassVar[str] = "drifting"
     has_quantities: ClassVar[bool] = False  # the parameters are others at each section

@@ -21,21 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Input arrays of `run_branches` for one task: parameters, frequencies and initial states of its branches.
+    """Input arrays of `run_branches` for one task: parameters, frequencies and initial states of its branches."""
 
-    Attributes
-    ----------
-    parameters : ndarray, (branch, point, parameter)
-    frequency_hz : ndarray, (branch, point)
-    initial_states : ndarray, (branch, n_states)
-    step_size : ndarray, (branch,), or None
-        First step of each branch that continues an earlier task [s]; NaN for a branch that has ended. None
-        for a task in which all branches begin.
-    """
-
-    parameters: np.ndarray
-    frequency_hz: np.ndarray
-    initial_states: np.ndarray
+    parameters: np.ndarray  # shape (branch, point, parameter)
+    frequency_hz: np.ndarray  # shape (branch, point)
+    initial_states: np.ndarray  # shape (branch, n_states)
+    # first step of each branch that continues an earlier task [s]; NaN for a branch that has ended. None for a task
+    # in which all branches begin, shape (branch,)
     step_size: np.ndarray | None = None
 
     def take(self, branches: Any) -> Inputs:
@@ -73,18 +65,10 @@ NEEDS = {
 
 @dataclass(frozen=True)
 class Steady:
-    """Motion at constant parameters without noise: a state goes on in the same way whenever it is reached.
+    """Motion at constant parameters without noise: a state goes on in the same way whenever it is reached."""
 
-    Attributes
-    ----------
-    model : Model
-        Model that is integrated.
-    integration : Integration
-        The table ``[integration]``.
-    """
-
-    model: Model
-    integration: Integration
+    model: Model  # model that is integrated
+    integration: Integration  # the table ``[integration]``
 
     kind: ClassVar[str] = "steady"
     """The kind of motion that an `Analysis` is for."""

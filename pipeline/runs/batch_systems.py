@@ -26,18 +26,10 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class System:
-    """Batch system of this machine.
+    """Batch system of this machine."""
 
-    Attributes
-    ----------
-    kind : str
-        Its name in a ``[cluster]`` table.
-    command : str
-        Path of the command that submits a batch script.
-    """
-
-    kind: str
-    command: str
+    kind: str  # its name in a ``[cluster]`` table
+    command: str  # path of the command that submits a batch script
 
     @property
     def named(self) -> str:
@@ -101,27 +93,13 @@ _LONGEST = "9999:00:00"
 
 @dataclass(frozen=True)
 class Choice:
-    """Batch system of a run, and the values of ``[cluster]`` that are given.
+    """Batch system of a run, and the values of ``[cluster]`` that are given."""
 
-    Attributes
-    ----------
-    kind : str
-        The batch system.
-    table : dict
-        Values of ``[cluster]`` that are given.
-    why : str
-        Phrase on how the batch system was chosen.
-    sources : dict of str
-        Source of each given value, by key.
-    file : Path, optional
-        File with the values, if nothing else changes them.
-    """
-
-    kind: str
-    table: Mapping[str, Any]
-    why: str
-    sources: Mapping[str, str] = field(default_factory=dict)
-    file: Path | None = None
+    kind: str  # the batch system
+    table: Mapping[str, Any]  # values of ``[cluster]`` that are given
+    why: str  # phrase on how the batch system was chosen
+    sources: Mapping[str, str] = field(default_factory=dict)  # source of each given value, by key
+    file: Path | None = None  # file with the values, if nothing else changes them
 
 
 def choose(cluster: str | Path | None, changes: Sequence[str], retry: str) -> Choice:

@@ -67,22 +67,13 @@ def _silent(_: str) -> None:
 
 @dataclass(frozen=True, repr=False)
 class AnalysedRun(RunDirectory):
-    """An opened run for analyses; an analysis gets from it the results of other analyses.
+    """An opened run for analyses; an analysis gets from it the results of other analyses."""
 
-    Attributes
-    ----------
-    echo : callable
-        Function that prints a line.
-    workers : int, optional
-        Number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`;
-        of threads of the engine for an analysis without blocks.
-    where : Where, optional
-        Place of the computation of blocks.
-    """
-
-    echo: Echo = _silent
+    echo: Echo = _silent  # function that prints a line
+    # number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`; of
+    # threads of the engine for an analysis without blocks
     workers: int | None = None
-    where: Where | None = None
+    where: Where | None = None  # place of the computation of blocks
 
     @classmethod
     def of(cls, source: Source, echo: Echo | None = None, **places: Any) -> AnalysedRun:

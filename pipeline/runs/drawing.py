@@ -152,18 +152,10 @@ _REMEDY = "Analyses are of whole runs: open the run with magpend.Run.open(DIR), 
 
 @dataclass(frozen=True)
 class CubeRun:
-    """A cube in the place of a run, for figures that use nothing but cells.
+    """A cube in the place of a run, for figures that use nothing but cells."""
 
-    Attributes
-    ----------
-    ds : Dataset
-        A cube from `pipeline.open_run`, or a part of it.
-    echo : callable
-        Function that prints a line.
-    """
-
-    ds: xr.Dataset
-    echo: Echo
+    ds: xr.Dataset  # a cube from `pipeline.open_run`, or a part of it
+    echo: Echo  # function that prints a line
 
     digest = ""
     name = "the cube"

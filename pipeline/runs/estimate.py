@@ -46,21 +46,11 @@ FILE_S = 0.004
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated computing time of a run on one core of this machine.
+    """Estimated computing time of a run on one core of this machine."""
 
-    Attributes
-    ----------
-    core_seconds : float
-        Time of all cells on one core [s].
-    how : str
-        Phrase on how it was measured.
-    compiled_s : float
-        Time spent on compiling [s].
-    """
-
-    core_seconds: float
-    how: str
-    compiled_s: float
+    core_seconds: float  # time of all cells on one core [s]
+    how: str  # phrase on how it was measured
+    compiled_s: float  # time spent on compiling [s]
 
 
 def estimate(spec: Spec, plan: Plan) -> Estimate:

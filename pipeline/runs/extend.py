@@ -37,27 +37,16 @@ from pipeline.store.runfile import is_run
 
 @dataclass(frozen=True)
 class Extension:
-    """Plan of a wider run, with the earlier runs from which it copies cells.
+    """Plan of a wider run, with the earlier runs from which it copies cells."""
 
-    Attributes
-    ----------
-    spec, text, plan, identity
-        The wider run.
-    runs : tuple of Run
-        Runs whose cells are reused.
-    counts : tuple of int
-        Number of reused cells of each.
-    notes : tuple of str
-        Remarks on runs that are incomplete or have no suitable cells.
-    """
-
+    # the wider run
     spec: Spec
     text: str
     plan: Plan
     identity: Mapping[str, Any]
-    runs: tuple[RunDirectory, ...]
-    counts: tuple[int, ...]
-    notes: tuple[str, ...]
+    runs: tuple[RunDirectory, ...]  # runs whose cells are reused
+    counts: tuple[int, ...]  # number of reused cells of each
+    notes: tuple[str, ...]  # remarks on runs that are incomplete or have no suitable cells
 
     @property
     def reused(self) -> int:

@@ -40,34 +40,19 @@ LONG_S = 86400.0
 
 @dataclass(frozen=True)
 class Work:
-    """The work that a run still has to do, measured on this machine.
+    """The work that a run still has to do, measured on this machine."""
 
-    Attributes
-    ----------
-    n_cells, n_left : int
-        Cells of the run, and those that are not computed yet.
-    n_tasks, n_tasks_left : int
-        Tasks of the run, and those that are not committed yet.
-    n_parallel : int
-        Most tasks that can run at a time.
-    periods : float
-        Most drive periods (returns of a flow) of the cells that are left, with those of their products.
-    seconds : float
-        Time of one core for all of it [s].
-    how : str
-        Phrase on how it was measured.
-    n_bytes, task_bytes : int
-        Size of the cube and of a task's results, before compression [bytes].
-    """
-
+    # cells of the run, and those that are not computed yet
     n_cells: int
     n_left: int
+    # tasks of the run, and those that are not committed yet
     n_tasks: int
     n_tasks_left: int
-    n_parallel: int
-    periods: float
-    seconds: float
-    how: str
+    n_parallel: int  # most tasks that can run at a time
+    periods: float  # most drive periods (returns of a flow) of the cells that are left, with those of their products
+    seconds: float  # time of one core for all of it [s]
+    how: str  # phrase on how it was measured
+    # size of the cube and of a task's results, before compression [bytes]
     n_bytes: int
     task_bytes: int
 

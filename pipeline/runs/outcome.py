@@ -25,23 +25,12 @@ Range = tuple[str, float, float, str]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Cells of a run that have one status, such as diverged: their number, share and parameter ranges.
+    """Cells of a run that have one status, such as diverged: their number, share and parameter ranges."""
 
-    Attributes
-    ----------
-    status : Status
-        Status of the cells.
-    n_cells : int
-        Number of cells.
-    share : float
-        Fraction of all cells of the run.
-    where : tuple of Range
-        Ranges of swept parameters in which these cells lie, without parameters whose whole range they cover.
-    """
-
-    status: Status
-    n_cells: int
-    share: float
+    status: Status  # status of the cells
+    n_cells: int  # number of cells
+    share: float  # fraction of all cells of the run
+    # ranges of swept parameters in which these cells lie, without parameters whose whole range they cover
     where: tuple[Range, ...]
 
     @property

@@ -44,30 +44,16 @@ def size(n_bytes: float) -> str:
 
 @dataclass
 class Work:
-    """A named piece of work, with the amounts done and in total.
+    """A named piece of work, with the amounts done and in total."""
 
-    Attributes
-    ----------
-    what : str
-        Name of the work.
-    started : float
-        Time of its first report [s].
-    begun : float
-        Amount that was done at its first report.
-    done, total : float
-        Amounts of the last report; a total of 0 is unknown.
-    heard : float
-        Time of the last report [s].
-    expected_s : float
-        Expected time of the whole work [s]; 0 if unknown, `UNTOLD` if no time left is to be shown.
-    """
-
-    what: str
-    started: float
-    begun: float = 0.0
+    what: str  # name of the work
+    started: float  # time of its first report [s]
+    begun: float = 0.0  # amount that was done at its first report
+    # amounts of the last report; a total of 0 is unknown
     done: float = 0.0
     total: float = 0.0
-    heard: float = 0.0
+    heard: float = 0.0  # time of the last report [s]
+    # expected time of the whole work [s]; 0 if unknown, `UNTOLD` if no time left is to be shown
     expected_s: float = 0.0
 
     def counted(self) -> str:

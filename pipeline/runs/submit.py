@@ -39,48 +39,20 @@ class SubmitError(Exception):
 
 @dataclass(frozen=True)
 class Submission:
-    """Batch job of a run: its script, its folder and, once it is sent, its number.
+    """Batch job of a run: its script, its folder and, once it is sent, its number."""
 
-    Attributes
-    ----------
-    name : str
-        The run directory, as it was given.
-    title : str
-        Title of the specification.
-    retry : str
-        Words after ``magpend submit`` that give the same run again.
-    folder : Path
-        Folder of its jobs: script, job number, and logs.
-    choice : Choice
-        Batch system, and the given values.
-    cluster : Cluster
-        Description of a job.
-    reasons : dict of str
-        Reason for each value of the job that was not given, by key.
-    work : Work
-        Work that the run still has to do.
-    script : str
-        The batch script.
-    worker : str, optional
-        Batch script of the jobs of workers, if the run has such jobs.
-    complete : bool
-        Whether there is nothing left to compute.
-    job : str, optional
-        Job number, after sending.
-    """
-
-    name: str
-    title: str
-    retry: str
-    folder: Path
-    choice: Choice
-    cluster: Cluster
-    reasons: dict[str, str]
-    work: Work
-    script: str
-    worker: str | None
-    complete: bool
-    job: str | None = None
+    name: str  # the run directory, as it was given
+    title: str  # title of the specification
+    retry: str  # words after ``magpend submit`` that give the same run again
+    folder: Path  # folder of its jobs: script, job number, and logs
+    choice: Choice  # batch system, and the given values
+    cluster: Cluster  # description of a job
+    reasons: dict[str, str]  # reason for each value of the job that was not given, by key
+    work: Work  # work that the run still has to do
+    script: str  # the batch script
+    worker: str | None  # batch script of the jobs of workers, if the run has such jobs
+    complete: bool  # whether there is nothing left to compute
+    job: str | None = None  # job number, after sending
 
     def log_of(self, job: str) -> str:
         """Return the path of the output of a job, by its number or a word for it."""

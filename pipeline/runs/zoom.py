@@ -25,46 +25,24 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Source:
-    """A specification, with the run or the file that it comes from.
+    """A specification, with the run or the file that it comes from."""
 
-    Attributes
-    ----------
-    spec : Spec
-        The specification.
-    origin : str
-        Phrase for the comment at the head of the new file.
-    smoke : dict
-        Its ``[smoke]`` table; empty if it has none.
-    """
-
-    spec: Spec
-    origin: str
-    smoke: Mapping[str, Any] = field(default_factory=dict)
+    spec: Spec  # the specification
+    origin: str  # phrase for the comment at the head of the new file
+    smoke: Mapping[str, Any] = field(default_factory=dict)  # its ``[smoke]`` table; empty if it has none
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes to a specification: new ranges, fixed values and numbers of points, by state or parameter.
+    """Changes to a specification: new ranges, fixed values and numbers of points, by state or parameter."""
 
-    Attributes
-    ----------
-    ranges : dict
-        Lowest and highest value by key: a state (with ``_deg`` in degrees), ``frequency_hz`` or a parameter.
-    pins : dict
-        One value by key, as in `ranges`.
-    num : int or None
-        Number of points of every new range.
-    nums : dict
-        Number of points by state, frequency or parameter; takes precedence over `num`.
-    samples : int or None
-        Number of random initial conditions.
-    """
-
+    # lowest and highest value by key: a state (with ``_deg`` in degrees), ``frequency_hz`` or a parameter
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    pins: Mapping[str, float] = field(default_factory=dict)
-    num: int | None = None
+    pins: Mapping[str, float] = field(default_factory=dict)  # one value by key, as in `ranges`
+    num: int | None = None  # number of points of every new range
+    # number of points by state, frequency or parameter; takes precedence over `num`
     nums: Mapping[str, int] = field(default_factory=dict)
-    samples: int | None = None
+    samples: int | None = None  # number of random initial conditions
 
 
 def read_source(path: str | Path) -> Source:
@@ -282,23 +260,13 @@ def _filled(table: Any) -> Any:
 
 @dataclass(frozen=True)
 class Widening:
-    """Changes that enlarge a specification: longer axes, more initial conditions, section points or products.
+    """Changes that enlarge a specification: longer axes, more initial conditions, section points or products."""
 
-    Attributes
-    ----------
-    axes : dict
-        New ranges, as the tables of ``[axes]``, by ``frequency_hz``, parameter, or state of a grid.
-    starts : int or None
-        Number of random initial states.
-    keep : int or None
-        Kept sections.
-    products : dict
-        Options of additional products by name, as in the tables of ``[products]``.
-    """
-
+    # new ranges, as the tables of ``[axes]``, by ``frequency_hz``, parameter, or state of a grid
     axes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    starts: int | None = None
-    keep: int | None = None
+    starts: int | None = None  # number of random initial states
+    keep: int | None = None  # kept sections
+    # options of additional products by name, as in the tables of ``[products]``
     products: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __bool__(self) -> bool:

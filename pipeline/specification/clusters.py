@@ -17,49 +17,23 @@ from pipeline.specification.tables import Table
 
 @dataclass(frozen=True)
 class BatchSystem:
-    """A batch system.
+    """A batch system."""
 
-    Attributes
-    ----------
-    title : str
-        Its name, for messages.
-    mark : str
-        Begin of the lines of a job file that are for the batch system.
-    head : str
-        Lines of a job file, without the mark, with ``{fields}``, see `lines`.
-    send : tuple of str
-        Command that reads a job file, by its name or from its standard input, and prints the job's number.
-    ask : tuple of str
-        Command that prints the state of a job whose number is appended, while the job exists.
-    follow, cancel : str
-        Commands for users, to which the job's number is appended.
-    queues : str
-        Command that lists queues and their limits.
-    jobqueue : str
-        Class of dask-jobqueue.
-    accounts : str
-        Command that lists a user's accounts, or where they stand.
-    over : str
-        Regular expression of final states.
-    number : str
-        Regular expression of the job's number in the output of `send`.
-    log : str
-        Suffix of the path of a job's output; ``{job}`` is the job's number.
-    """
-
-    title: str
-    mark: str
-    head: str
+    title: str  # its name, for messages
+    mark: str  # begin of the lines of a job file that are for the batch system
+    head: str  # lines of a job file, without the mark, with ``{fields}``, see `lines`
+    # command that reads a job file, by its name or from its standard input, and prints the job's number
     send: tuple[str, ...]
-    ask: tuple[str, ...]
+    ask: tuple[str, ...]  # command that prints the state of a job whose number is appended, while the job exists
+    # commands for users, to which the job's number is appended
     follow: str
     cancel: str
-    queues: str
-    jobqueue: str
-    accounts: str = "your site's pages"
-    over: str = r"(?!)"
-    number: str = r"(?P<job>\d+)"
-    log: str = ".out"
+    queues: str  # command that lists queues and their limits
+    jobqueue: str  # class of dask-jobqueue
+    accounts: str = "your site's pages"  # command that lists a user's accounts, or where they stand
+    over: str = r"(?!)"  # regular expression of final states
+    number: str = r"(?P<job>\d+)"  # regular expression of the job's number in the output of `send`
+    log: str = ".out"  # suffix of the path of a job's output; ``{job}`` is the job's number
 
     def lines(self, values: Mapping[str, object]) -> list[str]:
         """Return the filled lines of a job file; a line with a field that is None is left out."""
