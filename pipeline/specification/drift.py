@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from magpend_core.models.drift.model import drifting
 from magpend_core.models.drift.ramps import NUMBERS, TABLE, Motion, Ramp, motions_of
 from magpend_core.models.parameters import unknown_name_problem
 from pipeline.specification.files import has_digest
-from pipeline.specification.problems import SpecError, problems_of, shown
+from pipeline.specification.problems import SpecError, checked, shown
 from pipeline.specification.tables import FREQUENCY, Range, Table
 
 if TYPE_CHECKING:
@@ -65,19 +65,12 @@ class DriftTable(Table):
 
 def drift_tables(data: Mapping[str, Any], problems: list[str]) -> dict[str, DriftTable]:
     """Return the valid tables of ``[drift]`` by parameter; add the problems of the others to `problems`."""
-    tables = data.get("drift", {})
-    if not isinstance(tables, dict):
-        problems.append(f"drift = {shown(tables)}: must be a table for each parameter; write [drift.NAME].")
-        return {}
     found = {}
-    for name, table in tables.items():
+    for name, table in data.get("drift", {}).items():
         if not isinstance(table, dict):
             problems.append(f"drift.{name} = {shown(table)}: must be a table; write [drift.{name}].")
-            continue
-        try:
-            found[name] = DriftTable.model_validate(table)
-        except ValidationError as error:
-            problems += problems_of(error, DriftTable, f"drift.{name}")
+        elif (valid := checked(DriftTable, table, f"drift.{name}", problems)) is not None:
+            found[name] = valid
     return found
 
 
@@ -268,7 +261,7 @@ def run_problems(tables: Mapping[str, DriftTable], data: Mapping[str, Any], inte
             "move; drop the key, or [drift]."
         )
     for name in ("lyapunov", "rotation"):
-        if name in (data.get("products") or {}):
+        if name in data.get("products", {}):
             problems.append(
                 f"products.{name}: is measured on an attractor at constant parameters; drop the product, or [drift]."
             )

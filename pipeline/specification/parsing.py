@@ -20,7 +20,7 @@ from pipeline.specification.files import IDENTIFICATION, odd_data, with_text
 from pipeline.specification.models import A_MODEL, add_model, stand_in
 from pipeline.specification.noise import NoiseTable, disturbed, follows, noise_of
 from pipeline.specification.parameters import parameter_problems, size_problems
-from pipeline.specification.problems import SpecError, checked, shown, table_at, unknown_choice, unknown_key
+from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
 from pipeline.specification.recorded_drive import HOW, DriveTable, recorded, run_problems
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, Starts, refine_problems, starts_model
@@ -39,6 +39,7 @@ TABLES: dict[str, type[Table]] = {
     "noise": NoiseTable,
 }
 _OPTIONAL = ("drive", "section", "noise")
+_NO_TABLES = ("kind", "title", "model", "measured")
 KEYS = (
     "kind",
     "title",
@@ -85,11 +86,12 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     if "kind" not in data and "equations" in data:
         raise SpecError(A_MODEL)
     problems = [unknown_key(key, key, KEYS) for key in data if key not in KEYS]
+    data, wrong = _only_tables(data, problems)
     data = _with_preset(data, folder, problems)
     data = data if folder is None else _with_texts(data, folder, problems)
     kind, title = _kind(data, problems), _title(data, problems)
     model = add_model(data.get("model", DEFAULT), folder, problems)
-    tables = {name: _table(data, name, table, problems) for name, table in TABLES.items()}
+    tables = {name: None if name in wrong else _table(data, name, table, problems) for name, table in TABLES.items()}
     axes, drift = _axes(data, problems), moving.drift_tables(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     if model is None:  # the remaining checks need the model's states and parameters
@@ -100,17 +102,17 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     ramps = moving.checked_ramps(drift, model, axes, problems)
     noise = noise_of(tables["noise"], model, data, problems)
     seen = disturbed(moving.moved(seen_through(model, section), ramps, problems), noise)
-    starts = _starts(data, model, problems)
+    starts = None if "initial_conditions" in wrong else _starts(data, model, problems)
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
     problems += moving.run_problems(drift, data, tables["integration"], starts)
     problems += size_problems(axes, starts)
     problems += _method_problems(tables["integration"], products, "drive" in data)
-    known = _valid_keys(ParametersTable, data.get("parameters", {}))
+    known = _valid_keys(data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
-    own = parameter_problems(known, seen, _declared(data), axes, complete)
+    own = parameter_problems(known, seen, tuple(data.get("axes", {})), axes, complete)
     problems += [p for p in own if not follows(p, data, noise)]
     if ramps and not problems:
         problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
@@ -131,11 +133,18 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     }
 
 
+def _only_tables(data: Mapping[str, Any], problems: list[str]) -> tuple[dict[str, Any], set[str]]:
+    """Replace what must be a table and is none by an empty table; return also the names of these keys."""
+    wrong = {key for key in KEYS if key in data and key not in _NO_TABLES and not isinstance(data[key], dict)}
+    problems += [f"{key} = {shown(data[key])}: must be a table; write [{key}]." for key in data if key in wrong]
+    return {**data, **{key: {} for key in wrong}}, wrong
+
+
 def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: list[str]) -> Mapping[str, Any]:
     """Replace the file name of a parameter preset by the file's content; drop the name if the file cannot be read."""
-    table = data.get("parameters")
-    name = table.get("preset") if isinstance(table, dict) else None
-    if table is None or not isinstance(name, str) or not is_file(name):
+    table = data.get("parameters", {})
+    name = table.get("preset")
+    if not isinstance(name, str) or not is_file(name):
         return data
     rest = {key: value for key, value in table.items() if key != "preset"}
     if folder is None:
@@ -154,7 +163,7 @@ def _with_texts(data: Mapping[str, Any], folder: str | Path, problems: list[str]
     found = dict(data)
     if "drive" in data:
         found["drive"] = with_text(data["drive"], folder, "drive", problems, HOW)
-    if isinstance(data.get("drift"), dict):
+    if "drift" in data:
         drift = data["drift"].items()
         found["drift"] = {name: with_text(table, folder, f"drift.{name}", problems) for name, table in drift}
     return found
@@ -163,7 +172,7 @@ def _with_texts(data: Mapping[str, Any], folder: str | Path, problems: list[str]
 def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
     """Validate ``[products]``, the results stored for each cell; fill in options that follow from the model."""
     found: dict[str, Options] = {}
-    for name, table in table_at(data, "products", problems).items():
+    for name, table in data.get("products", {}).items():
         path = f"products.{name}"
         if name not in CELL_PRODUCTS:
             problems.append(unknown_key(path, name, CELL_PRODUCTS))
@@ -180,18 +189,10 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
     return {name: found[name] for name in CELL_PRODUCTS if name in found}
 
 
-def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of all axes that the specification lists, valid or not."""
-    axes = data.get("axes", {})
-    return tuple(axes) if isinstance(axes, dict) else ()
-
-
-def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
-    valid: dict[str, Any] = {}
-    for key, value in table.items() if isinstance(table, dict) else ():
-        if checked(model, {key: value}, "", []) is not None:
-            valid[key] = value
-    return model.model_validate(valid)
+def _valid_keys(table: dict[str, Any]) -> ParametersTable:
+    """Return the table ``[parameters]`` with its valid keys alone."""
+    valid = {k: value for k, value in table.items() if checked(ParametersTable, {k: value}, "", []) is not None}
+    return ParametersTable.model_validate(valid)
 
 
 def _kind(data: Mapping[str, Any], problems: list[str]) -> str:
@@ -213,14 +214,12 @@ def _title(data: Mapping[str, Any], problems: list[str]) -> str:
 
 
 def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
-    table = table_at(data, name, problems)
     is_left_out = name not in data and name in _OPTIONAL
-    return None if is_left_out or not isinstance(data.get(name, {}), dict) else checked(model, table, name, problems)
+    return None if is_left_out else checked(model, data.get(name, {}), name, problems)
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    given = table_at(data, "axes", problems).items()
-    axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in given}
+    axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
     return {name: axis for name, axis in axes.items() if axis is not None}
 
 
@@ -228,9 +227,7 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
     if "initial_conditions" not in data:
         problems.append('initial_conditions: missing; add this table with kind = "grid", "list" or "random".')
         return None
-    table = table_at(data, "initial_conditions", problems)
-    if not isinstance(data["initial_conditions"], dict):
-        return None
+    table = data["initial_conditions"]
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in STARTS:
         choices = list(STARTS)
@@ -257,7 +254,7 @@ def _walk(
         if kind == "sweep" and "continuation" in data:
             problems.append('continuation: a sweep has no such table; set kind = "continuation" or drop the table.')
         return None
-    declared = _declared(data)
+    declared = tuple(data.get("axes", {}))
     if walk is not None and walk.path not in declared:
         known = ", ".join(declared) or "none yet"
         problems.append(

@@ -363,9 +363,9 @@ def run_problems(
     return problems + _product_problems(drive, data.get("products", {}))
 
 
-def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
+def _idle_problems(drive: RecordedDrive, model: Model, axes: Mapping[str, Any]) -> list[str]:
     """Return problems of axes that sweep parameters of the model's own drive while a recorded torque replaces it."""
-    if drive.kind != TORQUE or not isinstance(axes, Mapping) or not set(axes) - {FREQUENCY, DUTY}:
+    if drive.kind != TORQUE or not set(axes) - {FREQUENCY, DUTY}:
         return []
     from magpend_core.engine.driven import drive_parameters
 
@@ -391,15 +391,14 @@ def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]
     ]
 
 
-def _product_problems(drive: RecordedDrive, products: Any) -> list[str]:
-    names = products if isinstance(products, Mapping) else {}
+def _product_problems(drive: RecordedDrive, products: Mapping[str, Any]) -> list[str]:
     problems = []
-    if "lyapunov" in names:
+    if "lyapunov" in products:
         problems.append(
             "products.lyapunov: exponents are averages over many periods, and a recording "
             "ends; drop the product, or [drive]."
         )
-    if "extremes" in names and drive.kind == TORQUE:
+    if "extremes" in products and drive.kind == TORQUE:
         problems.append(
             "products.extremes: extremes are taken over drive periods, and the intervals of a torque are not "
             "periods; drop the product, or give the drive as edges (columns rising_s,falling_s)."
