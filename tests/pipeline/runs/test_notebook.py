@@ -30,7 +30,7 @@ spec = (
     .with_axis("A", 0.1, 0.4, 16)
     .with_start_grid(x=(-1, 1, 16))
     .with_integration(n_transient=3000, n_keep=4)
-    .execution(trajectories_per_task=16)
+    .with_execution(trajectories_per_task=16)
 )
 """
 COMPUTE = 'run = magpend.run(spec, "run", workers=2)\n'
