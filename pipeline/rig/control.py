@@ -41,32 +41,15 @@ SURE = 2.0
 
 @dataclass(frozen=True)
 class Controlled:
-    """Settings of a virtual rig under feedback control: model, drive, gains, noise and measuring times.
+    """Settings of a virtual rig under feedback control: model, drive, gains, noise and measuring times."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        The rig's; the value of `drive` does not matter.
-    frequency_hz : float
-        Drive frequency [Hz].
-    state : str
-        Controlled state; its rate is measured as well.
-    drive : str
-        Parameter that is the amplitude of the drive, a cosine.
-    gains : tuple of float
-        Of the state and of its rate [the drive's unit per theirs].
-    noise : float
-        Standard deviation of the measured state; that of its rate is larger by the angular frequency.
-    n_settle, n_measure : int
-        Drive periods for which the rig settles after each change of the target, and that are then measured.
-    """
-
-    parameters: Parameters
+    parameters: Parameters  # the rig's; the value of `drive` does not matter
     frequency_hz: float
-    state: str
-    drive: str
-    gains: tuple[float, float] = (2.0, 1.0)
-    noise: float = 0.0
+    state: str  # controlled state; its rate is measured as well
+    drive: str  # parameter that is the amplitude of the drive, a cosine
+    gains: tuple[float, float] = (2.0, 1.0)  # of the state and of its rate [the drive's unit per theirs]
+    noise: float = 0.0  # standard deviation of the measured state; that of its rate is larger by the angular frequency
+    # drive periods for which the rig settles after each change of the target, and that are then measured
     n_settle: int = 12
     n_measure: int = 8
     seed: int = 0
@@ -74,24 +57,14 @@ class Controlled:
 
 @dataclass(frozen=True)
 class TracedOrbits:
-    """Traced orbits of the rig, one per target: median and standard deviation over the measured drive periods.
+    """Traced orbits of the rig, one per target: median and standard deviation over the measured drive periods."""
 
-    Attributes
-    ----------
-    drive : ndarray, (target,)
-        Amplitude of the drive.
-    amplitude, amplitude_sd : ndarray, (target,)
-        Half of the peak-to-peak value of the state.
-    residue : ndarray, (target,)
-        Largest further harmonic of the controller's output, in units of the first.
-    stable : tuple of str
-        ``yes`` where the drive grows along the branch, ``no`` where it falls, ``unknown`` where its scatter hides it.
-    """
-
-    drive: np.ndarray
+    drive: np.ndarray  # (target,) amplitude of the drive
+    # (target,) half of the peak-to-peak value of the state
     amplitude: np.ndarray
     amplitude_sd: np.ndarray
-    residue: np.ndarray
+    residue: np.ndarray  # (target,) largest further harmonic of the controller's output, in units of the first
+    # ``yes`` where the drive grows along the branch, ``no`` where it falls, ``unknown`` where its scatter hides it
     stable: tuple[str, ...]
 
 

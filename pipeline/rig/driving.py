@@ -20,30 +20,14 @@ LONG = 1.5
 
 @dataclass(frozen=True)
 class DriveFile:
-    """The text of a drive file, with a summary: timing, row and sample counts, interpolation error.
-
-    Attributes
-    ----------
-    text : str
-        Content of the file.
-    timing : Timing or None
-        Frequency, jitter and duty cycle of its edges; None for a torque that is not periodic.
-    n_rows : int
-        Rows of the file's table.
-    n_samples : int
-        Samples of the recording.
-    error : float
-        Largest distance of the torque's samples from the file's interpolated torque; 0 for edges.
-    notes : tuple of str
-        Warnings about periods that may have lost an edge.
-    """
+    """The text of a drive file, with a summary: timing, row and sample counts, interpolation error."""
 
     text: str
-    timing: Timing | None
-    n_rows: int
-    n_samples: int
-    error: float = 0.0
-    notes: tuple[str, ...] = ()
+    timing: Timing | None  # frequency, jitter and duty cycle of its edges; None for a torque that is not periodic
+    n_rows: int  # rows of the file's table
+    n_samples: int  # samples of the recording
+    error: float = 0.0  # largest distance of the torque's samples from the file's interpolated torque; 0 for edges
+    notes: tuple[str, ...] = ()  # warnings about periods that may have lost an edge
 
 
 def drive_file(recording: xr.Dataset, kind: str, *, tolerance: float = 0.0) -> DriveFile:

@@ -36,44 +36,28 @@ class Timing(NamedTuple):
     """Frequency, jitter and duty cycle of a drive signal, from a line through the times of its rising edges.
 
     Errors are standard errors.
-
-    Attributes
-    ----------
-    jitter_s : float
-        Root mean square distance of the edges from the line [s].
-    duty_cycle, duty_cycle_error : float
-        Fraction of the period in the high state; NaN if no falling edge lies between rising ones.
-    n_periods : int
-        Number of periods from the first edge to the last.
     """
 
     frequency_hz: float
     frequency_error_hz: float
-    jitter_s: float
+    jitter_s: float  # root mean square distance of the edges from the line [s]
+    # fraction of the period in the high state; NaN if no falling edge lies between rising ones
     duty_cycle: float
     duty_cycle_error: float
-    n_periods: int
+    n_periods: int  # number of periods from the first edge to the last
 
 
 @dataclass(frozen=True)
 class Edges:
-    """The times at which a drive signal crosses the middle between its two levels.
+    """The times at which a drive signal crosses the middle between its two levels."""
 
-    Attributes
-    ----------
-    rising, falling : ndarray
-        Times of the edges [s], in rising order.
-    resolution_s : float
-        Sampling interval if the signal switches between two samples, so that an edge is only known to lie
-        between them [s]; 0 if samples lie on the flanks.
-    noise_s : float
-        Standard error of an edge's time from the signal's noise on its flanks [s].
-    """
-
+    # times of the edges [s], in rising order
     rising: Floats
     falling: Floats
+    # sampling interval if the signal switches between two samples, so that an edge is only known to lie between them
+    # [s]; 0 if samples lie on the flanks
     resolution_s: float = 0.0
-    noise_s: float = 0.0
+    noise_s: float = 0.0  # standard error of an edge's time from the signal's noise on its flanks [s]
 
     @property
     def error_s(self) -> float:

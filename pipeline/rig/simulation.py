@@ -91,29 +91,13 @@ NUMBERS = ("sampling_rate_hz", "duration_s", "seed")
 
 @dataclass(frozen=True)
 class Rig:
-    """Validated specification of a virtual rig: parameters, initial state, sample times, drive and sensors.
-
-    Attributes
-    ----------
-    parameters : Parameters
-        Parameters of the model.
-    initial_state : tuple of float
-        Initial state in the model's units.
-    times : ndarray
-        Times of the samples, (n,) [s].
-    drive : tuple of Step, optional
-        Steps of the drive; None for none.
-    sensors : mapping
-        Sensors by name of a state, and of the drive.
-    seed : int
-        Seed of the noise.
-    """
+    """Validated specification of a virtual rig: parameters, initial state, sample times, drive and sensors."""
 
     parameters: Parameters
-    initial_state: tuple[float, ...]
-    times: np.ndarray
-    drive: tuple[Step, ...] | None
-    sensors: AnyMapping[str, Sensor | DriveSensor]
+    initial_state: tuple[float, ...]  # initial state in the model's units
+    times: np.ndarray  # times of the samples, (n,) [s]
+    drive: tuple[Step, ...] | None  # steps of the drive; None for none
+    sensors: AnyMapping[str, Sensor | DriveSensor]  # sensors by name of a state, and of the drive
     seed: int
 
 

@@ -41,63 +41,35 @@ TURN = 2.0 * math.pi
 
 @dataclass(frozen=True)
 class Sensor:
-    """Simulated sensor of one state: kind, noise, resolution, dead band and offset.
+    """Simulated sensor of one state: kind, noise, resolution, dead band and offset."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"potentiometer"``: an angle as a voltage from 0 to 5 V, which wraps at half a turn from 0.
-        ``"encoder"``: the state itself, without wraps.
-    noise : float
-        Standard deviation of white noise [the state's unit], before it is quantised.
-    bits : int, optional
-        Resolution in bits: of 5 V for a potentiometer, of a turn for an encoder (of 1 unit if the state is no
-        angle). None for full floating-point resolution.
-    dead_band : float
-        Part of a turn in which a potentiometer does not measure, half a turn from 0 [rad].
-    offset : float
-        Error that is added to the state [the state's unit]; the mapping does not correct it.
-    """
-
+    # ``"potentiometer"``: an angle as a voltage from 0 to 5 V, which wraps at half a turn from 0. ``"encoder"``: the
+    # state itself, without wraps.
     kind: Literal["potentiometer", "encoder"] = "encoder"
-    noise: float = 0.0
+    noise: float = 0.0  # standard deviation of white noise [the state's unit], before it is quantised
+    # resolution in bits: of 5 V for a potentiometer, of a turn for an encoder (of 1 unit if the state is no angle).
+    # None for full floating-point resolution.
     bits: int | None = None
-    dead_band: float = 0.0
-    offset: float = 0.0
+    dead_band: float = 0.0  # part of a turn in which a potentiometer does not measure, half a turn from 0 [rad]
+    offset: float = 0.0  # error that is added to the state [the state's unit]; the mapping does not correct it
 
 
 @dataclass(frozen=True)
 class DriveSensor:
-    """Sensor of the drive: it records the torque, or a signal that gives the torque's sign.
+    """Sensor of the drive: it records the torque, or a signal that gives the torque's sign."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"torque"``: the model's forcing; ``"signal"``: its sign, as -1 and 1 [V].
-    noise : float
-        Standard deviation of white noise [unit of the kind].
-    """
-
+    # ``"torque"``: the model's forcing; ``"signal"``: its sign, as -1 and 1 [V]
     kind: Literal["torque", "signal"] = "signal"
-    noise: float = 0.0
+    noise: float = 0.0  # standard deviation of white noise [unit of the kind]
 
 
 @dataclass(frozen=True)
 class Step:
-    """Step of the drive: consecutive periods with the same frequency and parameters.
-
-    Attributes
-    ----------
-    frequency_hz : float
-        Drive frequency [Hz].
-    n_periods : int
-        Number of drive periods.
-    values : mapping
-        Parameters that differ in this step, by name, such as the duty cycle, or an amplitude of 0.
-    """
+    """Step of the drive: consecutive periods with the same frequency and parameters."""
 
     frequency_hz: float
     n_periods: int
+    # parameters that differ in this step, by name, such as the duty cycle, or an amplitude of 0
     values: AnyMapping[str, float] = field(default_factory=dict)
 
     @property

@@ -36,24 +36,13 @@ LEAST_NOISE = 1e-6
 class Built:
     """Least-squares problem of an identification, and the held-out pieces of the recordings, on which the fit is only
     tested.
-
-    Attributes
-    ----------
-    held_out : tuple of Piece
-        Pieces that are judged afterwards; only their starts are fitted.
-    tables : tuple of MeasuredTable
-        Measured orbits, with those that only judge the fit.
-    simulated : bool
-        Whether any of the recordings is simulated.
-    findings : tuple of tuple of str
-        Sentences about each recording's findings, without notes.
     """
 
     problem: Problem
-    held_out: tuple[Piece, ...]
-    tables: tuple[MeasuredTable, ...] = ()
-    simulated: bool = False
-    findings: tuple[tuple[str, ...], ...] = ()
+    held_out: tuple[Piece, ...]  # pieces that are judged afterwards; only their starts are fitted
+    tables: tuple[MeasuredTable, ...] = ()  # measured orbits, with those that only judge the fit
+    simulated: bool = False  # whether any of the recordings is simulated
+    findings: tuple[tuple[str, ...], ...] = ()  # sentences about each recording's findings, without notes
 
 
 @dataclass(frozen=True)

@@ -58,15 +58,7 @@ FIT = 1
 
 @dataclass(frozen=True)
 class Source:
-    """Recording of an identification: its file name and sha256, with the text of its mapping file.
-
-    Attributes
-    ----------
-    file : str
-        Name of the file.
-    mapping : str
-        Text of the mapping file.
-    """
+    """Recording of an identification: its file name and sha256, with the text of its mapping file."""
 
     file: str
     sha256: str
@@ -75,32 +67,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Info:
-    """Content of ``identification.json``.
-
-    Attributes
-    ----------
-    directory : Path
-        Directory of the identification.
-    digest : str
-        Digest of `identity`.
-    identity : dict
-        Everything that decides the numbers.
-    title, spec_text : str
-        Title and text of the specification.
-    files : list of str
-        Names of the recordings.
-    mappings : list of str
-        Texts of their mapping files.
-    versions, provenance : dict
-        Versions of packages; time and host.
-    """
+    """Content of ``identification.json``."""
 
     directory: Path
-    digest: str
-    identity: dict[str, Any]
+    digest: str  # digest of `identity`
+    identity: dict[str, Any]  # everything that decides the numbers
     title: str
     spec_text: str
-    files: list[str]
+    files: list[str]  # names of the recordings
     mappings: list[str]
     versions: dict[str, str]
     provenance: dict[str, str]

@@ -33,23 +33,14 @@ AGREES, OFF, OPEN = "agrees", "off", "not decided"
 
 @dataclass(frozen=True)
 class DriveFrequency:
-    """Estimate of the frequency of a recording's known drive.
-
-    Attributes
-    ----------
-    recording : int
-        Index of the recording.
-    frequency_hz, estimate_hz, error_hz : float
-        Frequency as stated and as estimated, and the standard error of the latter [Hz].
-    verdict : str
-        ``agrees``, ``off`` or ``not decided``.
-    """
+    """Estimate of the frequency of a recording's known drive."""
 
     recording: int
+    # frequency as stated and as estimated, and the standard error of the latter [Hz]
     frequency_hz: float
     estimate_hz: float
     error_hz: float
-    verdict: str
+    verdict: str  # ``agrees``, ``off`` or ``not decided``
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data."""

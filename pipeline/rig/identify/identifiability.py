@@ -31,21 +31,13 @@ NEVER = 1e-6
 class Direction:
     """Direction in parameter space with its singular value and standard error; each parameter is in units of its
     typical size.
-
-    Attributes
-    ----------
-    singular_value : float
-        Norm of the change of all residuals, in standard deviations of the noise, for a step of one size.
-        Priors do not count.
-    error : float
-        Standard error along the direction, relative to the sizes; infinite if the data do not determine it.
-    vector : ndarray (n_free,)
-        Unit vector.
     """
 
+    # norm of the change of all residuals, in standard deviations of the noise, for a step of one size. Priors do not
+    # count.
     singular_value: float
-    error: float
-    vector: np.ndarray
+    error: float  # standard error along the direction, relative to the sizes; infinite if the data do not determine it
+    vector: np.ndarray  # (n_free,) unit vector
 
     @property
     def is_loose(self) -> bool:

@@ -23,21 +23,11 @@ The length is then doubled until it covers the piece: a long piece does not tole
 
 @dataclass(frozen=True)
 class Judgement:
-    """Residuals of measured pieces, with root mean squares and correlations.
-
-    Attributes
-    ----------
-    channels : tuple of str
-        Channels that are compared.
-    pieces : tuple of Piece
-        Pieces that are judged.
-    residuals : tuple of ndarray (n, n_channels)
-        Measured less computed [SI]; NaN where nothing was measured.
-    """
+    """Residuals of measured pieces, with root mean squares and correlations."""
 
     channels: tuple[str, ...]
     pieces: tuple[Piece, ...]
-    residuals: tuple[np.ndarray, ...]
+    residuals: tuple[np.ndarray, ...]  # (n, n_channels) measured less computed [SI]; NaN where nothing was measured
 
     @property
     def rms(self) -> dict[str, float]:

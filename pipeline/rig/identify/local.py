@@ -27,32 +27,18 @@ DENSE_COLUMNS = 600
 
 @dataclass(frozen=True)
 class Fit:
-    """Outcome of a local fit: estimates, cost, convergence and residuals.
+    """Outcome of a local fit: estimates, cost, convergence and residuals."""
 
-    Attributes
-    ----------
-    theta : ndarray, (n_free,)
-        Unknowns [SI].
-    starts : ndarray, (n_piece, n_states)
-        Starts of the pieces [SI].
-    cost : float
-        Half the sum of squares in units of the noise.
-    residuals, rows, jacobian
-        See `Evaluation`.
-    known : tuple of Solution
-        Computed counterparts of the measured orbits, one entry per table.
-    """
-
-    theta: Array
-    starts: Array
-    cost: float
+    theta: Array  # (n_free,) unknowns [SI]
+    starts: Array  # (n_piece, n_states) starts of the pieces [SI]
+    cost: float  # half the sum of squares in units of the noise
     converged: bool
     message: str
     n_evaluations: int
     residuals: tuple[Array, ...]
     rows: Array
     jacobian: Array
-    known: tuple[Solution, ...] = ()
+    known: tuple[Solution, ...] = ()  # computed counterparts of the measured orbits, one entry per table
 
     @property
     def rms(self) -> Array:

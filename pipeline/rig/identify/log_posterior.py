@@ -51,26 +51,16 @@ ORBITS_ALONE = "orbits"
 
 @dataclass
 class LogPosterior:
-    """Logarithm of the posterior density of the unknowns, up to a constant; it counts what it could not evaluate.
+    """Logarithm of the posterior density of the unknowns, up to a constant; it counts what it could not evaluate."""
 
-    Attributes
-    ----------
-    problem : Problem
-        Problem at the best fit; Newton's method for measured orbits starts from the orbits there.
-    best : Fit
-    moves : ndarray, (n_piece, n_states, n_free)
-        Derivative of the best initial states of the pieces by the unknowns, for first guesses.
-    pieces, stated : float
-        Factors on the chi^2 of the pieces and on that of orbits and priors: ``1/k^2`` and ``1/s^2`` of the module.
-    n_inside, n_lost : int
-        Number of sets of unknowns within the bounds, and of those for which a measured orbit or a trajectory was lost.
-    """
-
-    problem: Problem
+    problem: Problem  # problem at the best fit; Newton's method for measured orbits starts from the orbits there
     best: Fit
+    # (n_piece, n_states, n_free) derivative of the best initial states of the pieces by the unknowns, for first guesses
     moves: Array
+    # factors on the chi^2 of the pieces and on that of orbits and priors: ``1/k^2`` and ``1/s^2`` of the module
     pieces: float
     stated: float
+    # number of sets of unknowns within the bounds, and of those for which a measured orbit or a trajectory was lost
     n_inside: int = 0
     n_lost: int = 0
 

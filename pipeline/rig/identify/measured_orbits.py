@@ -45,26 +45,14 @@ _KINDS = {"fold": FOLD, "doubling": DOUBLING, "torus": TORUS, "hopf": HOPF}
 
 @dataclass(frozen=True)
 class MeasuredTable:
-    """Measured orbits and bifurcations of one table ``[[orbits]]``, read and checked.
+    """Measured orbits and bifurcations of one table ``[[orbits]]``, read and checked."""
 
-    Attributes
-    ----------
-    along : Along
-        Model, parameter and interval.
-    state : str
-        Measured state; empty if there are bifurcations alone.
-    measured : Dataset or None
-        Orbits as of `read_branch`; None if there are bifurcations alone.
-    settings : dict
-        Values of parameters in these measurements alone.
-    """
-
-    along: Along
-    state: str
+    along: Along  # model, parameter and interval
+    state: str  # measured state; empty if there are bifurcations alone
     fitted: tuple[Datum, ...]
     held_out: tuple[Datum, ...]
-    measured: xr.Dataset | None
-    settings: Mapping[str, float]
+    measured: xr.Dataset | None  # orbits as of `read_branch`; None if there are bifurcations alone
+    settings: Mapping[str, float]  # values of parameters in these measurements alone
 
     @property
     def data(self) -> tuple[Datum, ...]:

@@ -33,28 +33,18 @@ LOST = 1e6
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residuals, and on request their derivatives, for one set of unknowns.
+    """Residuals, and on request their derivatives, for one set of unknowns."""
 
-    Attributes
-    ----------
-    residuals : tuple of ndarray, (n, n_channels)
-        Measured less computed, piece by piece [SI]; NaN where nothing was measured.
-    rows : ndarray, (m,)
-        Residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per
-        piece, which keeps the cost, ``rows @ rows / 2``.
-    jacobian : ndarray, (m, n_free + n_piece*n_states)
-        Slopes of `rows`: the unknowns first, then the starts, piece by piece; empty without slopes.
-    failed : int
-        Number of pieces whose trajectory did not reach its end, and of measured orbits that were not found.
-    orbits : tuple of OrbitData
-        Measured orbits, with the computed ones of these unknowns.
-    """
-
+    # (n, n_channels) measured less computed, piece by piece [SI]; NaN where nothing was measured
     residuals: tuple[Array, ...]
+    # (m,) residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per piece,
+    # which keeps the cost, ``rows @ rows / 2``.
     rows: Array
+    # (m, n_free + n_piece*n_states) slopes of `rows`: the unknowns first, then the starts, piece by piece; empty
+    # without slopes
     jacobian: Array
-    failed: int
-    orbits: tuple[OrbitData, ...] = ()
+    failed: int  # number of pieces whose trajectory did not reach its end, and of measured orbits that were not found
+    orbits: tuple[OrbitData, ...] = ()  # measured orbits, with the computed ones of these unknowns
 
     @property
     def cost(self) -> float:

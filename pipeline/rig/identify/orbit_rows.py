@@ -22,24 +22,12 @@ STEP = 1e-4
 
 @dataclass(frozen=True)
 class OrbitRows:
-    """Residuals of measured orbits for one set of unknowns.
+    """Residuals of measured orbits for one set of unknowns."""
 
-    Attributes
-    ----------
-    rows : ndarray, (m,)
-        Measured less computed, in standard deviations.
-    jacobian : ndarray, (m, n_free)
-        Derivative of `rows` by the unknowns; empty without slopes.
-    lost : int
-        Number of orbits that were not found.
-    tables : tuple of OrbitData
-        Tables with the computed orbits of these unknowns, to start from next.
-    """
-
-    rows: Array
-    jacobian: Array
-    lost: int
-    tables: tuple[OrbitData, ...]
+    rows: Array  # (m,) measured less computed, in standard deviations
+    jacobian: Array  # (m, n_free) derivative of `rows` by the unknowns; empty without slopes
+    lost: int  # number of orbits that were not found
+    tables: tuple[OrbitData, ...]  # tables with the computed orbits of these unknowns, to start from next
 
 
 def orbit_rows(problem: Problem, thetas: Array, *, slopes: bool) -> list[OrbitRows]:

@@ -67,21 +67,11 @@ def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Options of the sampling by an ensemble of walkers.
+    """Options of the sampling by an ensemble of walkers."""
 
-    Attributes
-    ----------
-    n_walkers : int
-        Number of walkers; 0 for the larger of 32 and four times the number of unknowns.
-    most_steps : int
-        Number of steps after which the chain ends, converged or not.
-    spec : str or Path, optional
-        Specification of the identification; needed if recordings were fitted.
-    """
-
-    n_walkers: int = 0
-    most_steps: int = 2000
-    spec: str | Path | None = None
+    n_walkers: int = 0  # number of walkers; 0 for the larger of 32 and four times the number of unknowns
+    most_steps: int = 2000  # number of steps after which the chain ends, converged or not
+    spec: str | Path | None = None  # specification of the identification; needed if recordings were fitted
 
 
 def sample_draws(

@@ -31,21 +31,14 @@ UNKNOWN_STEP = 0.1
 class Profile:
     """Profile likelihood of one parameter: the scaled increase of the cost away from the estimate, and its 95 %
     interval.
-
-    Attributes
-    ----------
-    values : ndarray (n,)
-        Rising, in the parameter's unit; the estimate is among them.
-    growth : ndarray (n,)
-        Twice the growth of the cost over the best fit, scaled so that it is 1 at one standard error on a
-        quadratic criterion. NaN where a fit did not converge.
-    interval : tuple of float
-        95 % interval; infinite where the profile does not rise far enough within the bounds.
     """
 
     name: str
-    values: np.ndarray
+    values: np.ndarray  # (n,) rising, in the parameter's unit; the estimate is among them
+    # (n,) twice the growth of the cost over the best fit, scaled so that it is 1 at one standard error on a quadratic
+    # criterion. NaN where a fit did not converge.
     growth: np.ndarray
+    # 95 % interval; infinite where the profile does not rise far enough within the bounds
     interval: tuple[float, float]
 
     @property
@@ -58,30 +51,14 @@ class Profile:
 
 @dataclass(frozen=True)
 class Curvature:
-    """Quadratic approximation of the cost along one parameter near its estimate, with the step sizes for its profile.
+    """Quadratic approximation of the cost along one parameter near its estimate, and the scales of its profile."""
 
-    Attributes
-    ----------
-    error : float
-        Standard error; infinite if it is not known.
-    plain : float
-        Standard error for independent residuals as large as the noise.
-    critical : float
-        Half width of the interval in standard errors.
-    size : float
-        Size of the parameter.
-    others : ndarray (n_free,)
-        Derivative of the optimum of all parameters by this one.
-    starts : ndarray (n_piece, n_states)
-        Derivative of the optimum of the starts by this parameter.
-    """
-
-    error: float
-    plain: float
-    critical: float
+    error: float  # standard error; infinite if it is not known
+    plain: float  # standard error for independent residuals as large as the noise
+    critical: float  # half width of the interval in standard errors
     size: float
-    others: np.ndarray
-    starts: np.ndarray
+    others: np.ndarray  # (n_free,) derivative of the optimum of all parameters by this one
+    starts: np.ndarray  # (n_piece, n_states) derivative of the optimum of the starts by this parameter
 
 
 def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]) -> Profile:

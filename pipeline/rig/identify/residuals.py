@@ -23,24 +23,14 @@ BINS = 30
 class Series:
     """Piece of a recording within a dataset of residuals: its indices, its range of samples, and the size of its
     residuals.
-
-    Attributes
-    ----------
-    recording, number : int
-        Index of the recording, and of the piece in it.
-    held_out : bool
-        Whether the piece was held out.
-    samples : tuple of int
-        First sample, and one past the last.
-    worst : float
-        Mean square of its residuals, each channel relative to its mean square over all pieces.
     """
 
+    # index of the recording, and of the piece in it
     recording: int
     number: int
     held_out: bool
-    samples: tuple[int, int]
-    worst: float
+    samples: tuple[int, int]  # first sample, and one past the last
+    worst: float  # mean square of its residuals, each channel relative to its mean square over all pieces
 
     def of(self, ds: xr.Dataset) -> xr.Dataset:
         """Return the samples of this piece from the dataset of residuals."""

@@ -52,34 +52,16 @@ SHRINK = 0.5
 
 @dataclass(frozen=True)
 class Chain:
-    """Positions of all walkers at all steps of a chain, with its convergence figures.
+    """Positions of all walkers at all steps of a chain, with its convergence figures."""
 
-    Attributes
-    ----------
-    values : ndarray, (step, walker, n_free)
-        Unknowns [SI], without the first steps.
-    log_density : ndarray, (step, walker)
-    accepted : float
-        Share of accepted moves.
-    n_discarded : int
-        Steps that were left out at the beginning.
-    time : ndarray, (n_free,)
-        Integrated autocorrelation time of each unknown [steps].
-    rhat : ndarray, (n_free,)
-        Split R-hat of each unknown: 1 if the halves of all walkers agree.
-    reasons : tuple of str
-        Reasons why the chain has not converged; empty if it has.
-    lost : float
-        Share of the proposed parameters within the bounds for which a measured orbit or a trajectory was lost.
-    """
-
-    values: Array
-    log_density: Array
+    values: Array  # (step, walker, n_free) unknowns [SI], without the first steps
+    log_density: Array  # (step, walker)
     accepted: float
-    n_discarded: int
-    time: Array
-    rhat: Array
-    reasons: tuple[str, ...]
+    n_discarded: int  # steps that were left out at the beginning
+    time: Array  # (n_free,) integrated autocorrelation time of each unknown [steps]
+    rhat: Array  # (n_free,) split R-hat of each unknown: 1 if the halves of all walkers agree
+    reasons: tuple[str, ...]  # reasons why the chain has not converged; empty if it has
+    # share of the proposed parameters within the bounds for which a measured orbit or a trajectory was lost
     lost: float = 0.0
 
     @property

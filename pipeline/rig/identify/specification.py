@@ -116,43 +116,22 @@ class SearchTable(Table):
 
 @dataclass(frozen=True)
 class IdentificationSpec:
-    """Validated specification of an identification.
-
-    Attributes
-    ----------
-    title : str
-        Title of the identification.
-    model : Model
-        Model that is fitted.
-    preset : str, optional
-        Preset as given; by default the model's first.
-    parameters : dict
-        Fixed values by name, which replace the preset's.
-    values : Parameters
-        Values of the preset with `parameters` applied.
-    unknowns : tuple of Unknown
-        Identified parameters.
-    tied : dict
-        By parameter, the factor and the name of the identified parameter that it follows.
-    sensors, recordings, orbits, fit, search
-        Tables of the specification.
-    folder : Path
-        Folder that paths of files are relative to.
-    """
+    """Validated specification of an identification."""
 
     title: str
     model: Model
-    preset: str | None
-    parameters: dict[str, float]
-    values: Parameters
+    preset: str | None  # preset as given; by default the model's first
+    parameters: dict[str, float]  # fixed values by name, which replace the preset's
+    values: Parameters  # values of the preset with `parameters` applied
     unknowns: tuple[Unknown, ...]
+    # by parameter, the factor and the name of the identified parameter that it follows
     tied: dict[str, tuple[float, str]]
     sensors: SensorsTable
     recordings: tuple[RecordingTable, ...]
     orbits: tuple[OrbitsTable, ...]
     fit: FitTable
     search: SearchTable
-    folder: Path
+    folder: Path  # folder that paths of files are relative to
 
     @property
     def preset_found(self) -> str | Path | None:

@@ -46,45 +46,22 @@ Estimator = Literal["white", "pieces", "newey-west", "orbits"]
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and their derivatives at a fit's optimum, with the initial states eliminated, in units of the noise.
+    """Residuals and their derivatives at a fit's optimum, with the initial states eliminated, in units of the noise."""
 
-    Attributes
-    ----------
-    information : ndarray (n_free, n_free)
-        Information from data, priors and continuity.
-    prior : ndarray (n_free,)
-        Information of the priors, 1/sd^2; 0 where there is none.
-    residuals : tuple of ndarray (n, n_channels)
-        Residuals by piece; NaN where nothing was measured.
-    slopes : tuple of ndarray (n, n_channels, n_free)
-        Slopes of the residuals by the parameters, by piece, with the starts eliminated.
-    groups : tuple of int
-        The independent stretch that each piece belongs to.
-    n_starts : int
-        Number of fitted components of starts.
-    loss : str
-        Name of the loss in `scipy.optimize.least_squares`.
-    loss_scale : float
-        Residual above which a robust loss grows slower than the square.
-    following : ndarray (n_piece, n_states, n_free), optional
-        Derivative of the optimum of the starts by the parameters.
-    orbits : ndarray (n_orbit_residuals, n_free), optional
-        Slopes of the residuals of measured orbits, in standard deviations.
-    orbit_residuals : ndarray (n_orbit_residuals,), optional
-        Their residuals.
-    """
-
-    information: np.ndarray
-    prior: np.ndarray
-    residuals: tuple[np.ndarray, ...]
+    information: np.ndarray  # (n_free, n_free) information from data, priors and continuity
+    prior: np.ndarray  # (n_free,) information of the priors, 1/sd^2; 0 where there is none
+    residuals: tuple[np.ndarray, ...]  # (n, n_channels) residuals by piece; NaN where nothing was measured
+    # (n, n_channels, n_free) slopes of the residuals by the parameters, by piece, with the starts eliminated
     slopes: tuple[np.ndarray, ...]
-    groups: tuple[int, ...]
-    n_starts: int
-    loss: str = "linear"
-    loss_scale: float = 1.0
+    groups: tuple[int, ...]  # the independent stretch that each piece belongs to
+    n_starts: int  # number of fitted components of starts
+    loss: str = "linear"  # name of the loss in `scipy.optimize.least_squares`
+    loss_scale: float = 1.0  # residual above which a robust loss grows slower than the square
+    # (n_piece, n_states, n_free) derivative of the optimum of the starts by the parameters
     following: np.ndarray | None = None
+    # (n_orbit_residuals, n_free) slopes of the residuals of measured orbits, in standard deviations
     orbits: np.ndarray | None = None
-    orbit_residuals: np.ndarray | None = None
+    orbit_residuals: np.ndarray | None = None  # (n_orbit_residuals,) their residuals
 
     @property
     def stated(self) -> np.ndarray:
@@ -107,30 +84,14 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance of the estimates, with the method that gave it and the half width of 95 % intervals.
+    """Covariance of the estimates, with the method that gave it and the half width of 95 % intervals."""
 
-    Attributes
-    ----------
-    matrix : ndarray (n_free, n_free)
-        NaN in rows and columns of parameters that are not determined.
-    estimator : str
-        Name of the method.
-    why : str
-        A sentence that gives the reason for the method.
-    critical : float
-        Half width of a 95 % interval in standard errors.
-    degrees : float
-        Degrees of freedom of Student's t.
-    inflation : float
-        Ratio of the standard errors to those of independent residuals as large as the noise.
-    """
-
-    matrix: np.ndarray
+    matrix: np.ndarray  # (n_free, n_free) NaN in rows and columns of parameters that are not determined
     estimator: Estimator
-    why: str
-    critical: float
-    degrees: float
-    inflation: float
+    why: str  # a sentence that gives the reason for the method
+    critical: float  # half width of a 95 % interval in standard errors
+    degrees: float  # degrees of freedom of Student's t
+    inflation: float  # ratio of the standard errors to those of independent residuals as large as the noise
 
     @property
     def errors(self) -> np.ndarray:

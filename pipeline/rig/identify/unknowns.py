@@ -44,15 +44,10 @@ class Identified(Table):
 
 @dataclass(frozen=True)
 class Unknown:
-    """Parameter to be identified, with first guess, bounds and prior filled in.
-
-    Attributes
-    ----------
-    start, lower, upper : float
-        In the parameter's unit.
-    """
+    """Parameter to be identified, with first guess, bounds and prior filled in."""
 
     name: str
+    # in the parameter's unit
     start: float
     lower: float
     upper: float

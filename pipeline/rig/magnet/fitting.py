@@ -33,15 +33,10 @@ FARTHEST_DIPOLES = 3.0
 
 @dataclass(frozen=True)
 class CurveFit:
-    """Fit of one Gaussian bump to one torque curve (Wojna et al. 2018, Eq. 17), with standard errors and quality.
-
-    Attributes
-    ----------
-    values, errors : dict
-        By ``A`` [N m], ``b``, ``c`` [rad].
-    """
+    """Fit of one Gaussian bump to one torque curve (Wojna et al. 2018, Eq. 17), with standard errors and quality."""
 
     curve: Curve
+    # by ``A`` [N m], ``b``, ``c`` [rad]
     values: dict[str, float]
     errors: dict[str, float]
     quality: Quality
@@ -49,71 +44,42 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class Laws:
-    """Fitted height, position and width of the bumps as functions of the locked angle (Wojna et al. 2018, Eq. 18).
+    """Fitted height, position and width of the bumps as functions of the locked angle (Wojna et al. 2018, Eq. 18)."""
 
-    Attributes
-    ----------
-    values, errors : dict
-        By the names of `laws.FITTED`, without the steepness.
-    r2 : dict
-        R squared of height and position by side, ``A1`` ... ``b2``. The width is constant.
-    """
-
+    # by the names of `laws.FITTED`, without the steepness
     values: dict[str, float]
     errors: dict[str, float]
-    r2: dict[str, float]
+    r2: dict[str, float]  # R squared of height and position by side, ``A1`` ... ``b2``. The width is constant.
 
 
 @dataclass(frozen=True)
 class JointFit:
     """Joint fit to all readings (Wojna et al. 2018, Eq. 18-19), with standard errors and correlations of its
     parameters.
-
-    Attributes
-    ----------
-    free : tuple of str
-        Parameters that were fitted.
-    values : dict
-        All of `laws.FITTED`.
-    errors, errors_by_curve : dict
-        Standard errors of `free`: from the residuals' variance, and from a jackknife over whole curves. The
-        latter are NaN if one curve alone determines a parameter.
-    correlation : ndarray
-        Correlation matrix of `free`.
-    residuals : ndarray
-        Measured minus computed [N m].
-    neighbours : float
-        Correlation of the residuals of neighbouring readings of a curve; 0 for white noise.
-    undetermined : dict
-        For each parameter that the readings hardly determine, the one with which it correlates most.
     """
 
     free: tuple[str, ...]
-    values: dict[str, float]
+    values: dict[str, float]  # all of `laws.FITTED`
+    # standard errors of `free`: from the residuals' variance, and from a jackknife over whole curves. The latter are
+    # NaN if one curve alone determines a parameter.
     errors: dict[str, float]
     errors_by_curve: dict[str, float]
     correlation: np.ndarray
     quality: Quality
-    residuals: np.ndarray
-    neighbours: float
+    residuals: np.ndarray  # measured minus computed [N m]
+    neighbours: float  # correlation of the residuals of neighbouring readings of a curve; 0 for white noise
+    # for each parameter that the readings hardly determine, the one with which it correlates most
     undetermined: dict[str, str]
 
 
 @dataclass(frozen=True)
 class DipoleFit:
-    """Fit of two point dipoles to the readings (Wojna et al. 2018, Eq. 16).
+    """Fit of two point dipoles to the readings (Wojna et al. 2018, Eq. 16)."""
 
-    Attributes
-    ----------
-    values : dict
-        ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m].
-    residuals : ndarray
-        Measured minus computed [N m].
-    """
-
+    # ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m]
     values: dict[str, float]
     quality: Quality
-    residuals: np.ndarray
+    residuals: np.ndarray  # measured minus computed [N m]
 
 
 # ---- one curve -----------------------------------------------------------------------------------
@@ -387,23 +353,14 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All fits to a measurement of the magnets' torque.
-
-    Attributes
-    ----------
-    joint : JointFit
-        Joint fit with the parameters held that the header names.
-    unheld : JointFit or None
-        Joint fit with nothing held; None if the header holds nothing, or if this fit fails.
-    dipoles, placed_dipoles : DipoleFit
-        Fits with the fixed dipole at the fixed magnet, and at its best place.
-    """
+    """All fits to a measurement of the magnets' torque."""
 
     measured: Measurement
     curves: tuple[CurveFit, ...]
     laws: Laws
-    joint: JointFit
-    unheld: JointFit | None
+    joint: JointFit  # joint fit with the parameters held that the header names
+    unheld: JointFit | None  # joint fit with nothing held; None if the header holds nothing, or if this fit fails
+    # fits with the fixed dipole at the fixed magnet, and at its best place
     dipoles: DipoleFit
     placed_dipoles: DipoleFit
 

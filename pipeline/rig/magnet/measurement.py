@@ -150,21 +150,11 @@ class Header(Table):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Torque curve: the readings at one locked angle, on one side of the fixed magnet.
+    """Torque curve: the readings at one locked angle, on one side of the fixed magnet."""
 
-    Attributes
-    ----------
-    side : int
-        Index in `laws.SIDES`.
-    locked : float
-        Locked angle [rad].
-    rows : ndarray
-        Indices of its readings in the measurement.
-    """
-
-    side: int
+    side: int  # index in `laws.SIDES`
     locked: float
-    rows: np.ndarray
+    rows: np.ndarray  # indices of its readings in the measurement
 
     def __str__(self) -> str:
         return f"{laws.LOCKED} = {math.degrees(self.locked):.4g} deg, {laws.SIDES[self.side]}"
@@ -172,38 +162,19 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques.
-
-    Attributes
-    ----------
-    path : Path
-        Path of the header.
-    digest : str
-        sha256 of the table.
-    parameters : Parameters
-        Parameters of the model that are known before the fit.
-    angle, locked : ndarray
-        Angles [rad], one per reading.
-    side : ndarray of int
-        Indices in `laws.SIDES`.
-    reading : ndarray
-        Uncorrected torque [N m].
-    torque : ndarray
-        Of the magnets alone [N m].
-    warnings : tuple of str
-        Names of columns that were taken though they are not the header's.
-    """
+    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques."""
 
     header: Header
     path: Path
-    digest: str
-    parameters: Parameters
+    digest: str  # sha256 of the table
+    parameters: Parameters  # parameters of the model that are known before the fit
+    # angles [rad], one per reading
     angle: np.ndarray
     locked: np.ndarray
-    side: np.ndarray
-    reading: np.ndarray
-    torque: np.ndarray
-    warnings: tuple[str, ...] = ()
+    side: np.ndarray  # indices in `laws.SIDES`
+    reading: np.ndarray  # uncorrected torque [N m]
+    torque: np.ndarray  # of the magnets alone [N m]
+    warnings: tuple[str, ...] = ()  # names of columns that were taken though they are not the header's
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:

@@ -15,24 +15,12 @@ MAX_EVALUATIONS = 4000
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a converged least-squares fit: estimates, standard errors, Jacobian and residuals.
+    """Result of a converged least-squares fit: estimates, standard errors, Jacobian and residuals."""
 
-    Attributes
-    ----------
-    x : ndarray
-        Estimates, (n_free,).
-    errors : ndarray
-        Standard errors, (n_free,).
-    jacobian : ndarray
-        Derivatives of the residuals, (n, n_free).
-    residuals : ndarray
-        Measured minus computed (n,).
-    """
-
-    x: np.ndarray
-    errors: np.ndarray
-    jacobian: np.ndarray
-    residuals: np.ndarray
+    x: np.ndarray  # estimates, (n_free,)
+    errors: np.ndarray  # standard errors, (n_free,)
+    jacobian: np.ndarray  # derivatives of the residuals, (n, n_free)
+    residuals: np.ndarray  # measured minus computed (n,)
 
     @property
     def correlation(self) -> np.ndarray:
@@ -44,18 +32,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of a fit: R squared, and root mean square of the residuals.
+    """Quality of a fit: R squared, and root mean square of the residuals."""
 
-    Attributes
-    ----------
-    r2 : float
-        1 - residual over total sum of squares about the mean.
-    rms : float
-        Root mean square of the residuals [N m].
-    """
-
-    r2: float
-    rms: float
+    r2: float  # 1 - residual over total sum of squares about the mean
+    rms: float  # root mean square of the residuals [N m]
 
     @classmethod
     def of(cls, measured: np.ndarray, residuals: np.ndarray) -> Quality:

@@ -63,23 +63,12 @@ def cube_and_parameters(
 
 @dataclass(frozen=True)
 class Computed:
-    """Attractors of a run over the drive frequency, at one value of every other swept parameter.
+    """Attractors of a run over the drive frequency, at one value of every other swept parameter."""
 
-    Attributes
-    ----------
-    attractors : Dataset
-        Result of the analysis ``attractors``: dims frequency, cells, attractor, in rising frequency.
-    cube : Dataset
-        Cells of the run, for the points of sets that do not close and the diagram.
-    parameters : Parameters
-        Parameters at the chosen values of the other axes.
-    title, digest : str
-        Title and digest of the run.
-    """
-
+    # result of the analysis ``attractors``: dims frequency, cells, attractor, in rising frequency
     attractors: xr.Dataset
-    cube: xr.Dataset
-    parameters: Parameters
+    cube: xr.Dataset  # cells of the run, for the points of sets that do not close and the diagram
+    parameters: Parameters  # parameters at the chosen values of the other axes
     title: str
     digest: str
 

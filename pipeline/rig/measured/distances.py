@@ -67,41 +67,22 @@ def _transport(ways: Floats) -> float:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Attractor of the model at one frequency, with its section points.
-
-    Attributes
-    ----------
-    attractor : int
-        Id of the attractor.
-    orbit_period : int
-        Period of the orbit; 0 for a set that does not close.
-    side : int
-        Code of the model's classifier.
-    points : ndarray
-        (n, state): all points of a closed orbit, or a sample of a set that does not close.
-    """
+    """Attractor of the model at one frequency, with its section points."""
 
     attractor: int
-    orbit_period: int
-    side: int
-    points: Floats
+    orbit_period: int  # period of the orbit; 0 for a set that does not close
+    side: int  # code of the model's classifier
+    points: Floats  # (n, state): all points of a closed orbit, or a sample of a set that does not close
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Measured section points at one frequency step, with their noise.
+    """Measured section points at one frequency step, with their noise."""
 
-    Attributes
-    ----------
-    points, noise : ndarray
-        (n, state): states, and the standard deviation of each.
-    orbit_period : int
-        Period of the orbit; 0 if it does not close.
-    """
-
+    # (n, state): states, and the standard deviation of each
     points: Floats
     noise: Floats
-    orbit_period: int
+    orbit_period: int  # period of the orbit; 0 if it does not close
 
     @property
     def cycle(self) -> int:

@@ -32,24 +32,12 @@ _LEAST_SPARE = 3
 
 @dataclass(frozen=True)
 class Channel:
-    """Measured state of a recording. The slope of the state gives its rate if the rate itself is not measured.
-
-    Attributes
-    ----------
-    name : str
-        Name of the state.
-    place : int
-        Index among the model's states.
-    slope : int
-        Index of the rate's state; -1 if the slope is no state or is measured.
-    smooth : bool
-        Whether the slope is continuous across an edge.
-    """
+    """Measured state of a recording. The slope of the state gives its rate if the rate itself is not measured."""
 
     name: str
-    place: int
-    slope: int
-    smooth: bool
+    place: int  # index among the model's states
+    slope: int  # index of the rate's state; -1 if the slope is no state or is measured
+    smooth: bool  # whether the slope is continuous across an edge
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:

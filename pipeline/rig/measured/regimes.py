@@ -28,27 +28,15 @@ _RESAMPLES = 200
 
 @dataclass(frozen=True)
 class Regime:
-    """The estimated period of a motion, with its confidence.
+    """The estimated period of a motion, with its confidence."""
 
-    Attributes
-    ----------
-    orbit_period : int
-        Period in drive periods; 0 if the motion closes at no tested period.
-    confidence : float
-        Fraction of resamples that give the same period, 0 to 1.
-    closure : float
-        Root mean square of the second differences at that period, in units of noise. Without a period, the
-        least over all tested periods.
-    margin : float
-        Ratio by which the decision clears the limit: the least of closure/limit over all shorter periods, and
-        of limit/closure at this period. Without a period, the least closure/limit.
-    max_period : int
-        Longest tested period.
-    """
-
-    orbit_period: int
-    confidence: float
+    orbit_period: int  # period in drive periods; 0 if the motion closes at no tested period
+    confidence: float  # fraction of resamples that give the same period, 0 to 1
+    # root mean square of the second differences at that period, in units of noise. Without a period, the least over all
+    # tested periods.
     closure: float
+    # ratio by which the decision clears the limit: the least of closure/limit over all shorter periods, and of
+    # limit/closure at this period. Without a period, the least closure/limit.
     margin: float
     max_period: int
 

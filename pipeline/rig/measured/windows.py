@@ -34,31 +34,20 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowEdge:
-    """End of a measured window, with the frequency at which the same regime ends in the model.
-
-    Attributes
-    ----------
-    direction : str
-        Direction of the sweep.
-    before, after : tuple of int
-        Regimes on the rig.
-    measured_hz, measured_error_hz : float
-        Middle between the last step before and the first after the edge, and half their distance.
-    computed_hz, computed_error_hz : float
-        The same in the model, for the attractor that is nearest within the window. NaN if none has that
-        regime, or if the regime continues to the end of the run's axis.
-    note : str
-        Reason for a missing number, or a caveat.
-    """
+    """End of a measured window, with the frequency at which the same regime ends in the model."""
 
     direction: str
+    # regimes on the rig
     before: Regime
     after: Regime
+    # middle between the last step before and the first after the edge, and half their distance
     measured_hz: float
     measured_error_hz: float
+    # the same in the model, for the attractor that is nearest within the window. NaN if none has that regime, or if the
+    # regime continues to the end of the run's axis.
     computed_hz: float
     computed_error_hz: float
-    note: str
+    note: str  # reason for a missing number, or a caveat
 
     @property
     def shift_hz(self) -> float:

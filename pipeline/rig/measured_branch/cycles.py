@@ -22,29 +22,17 @@ class CyclesError(ValueError):
 
 @dataclass(frozen=True)
 class Cycles:
-    """Periodic motion in one signal: medians over its cycles, and the scatter of single cycles.
-
-    Attributes
-    ----------
-    n : int
-        Whole cycles.
-    amplitude, amplitude_sd : float
-        Half of the peak-to-peak value [the signal's unit].
-    mean, mean_sd : float
-        Mean over a cycle.
-    frequency, frequency_sd : float
-        [Hz].
-    harmonics : ndarray, (N_HARMONICS,)
-        Amplitudes of the Fourier components of a cycle, the first at the frequency itself.
-    """
+    """Periodic motion in one signal: medians over its cycles, and the scatter of single cycles."""
 
     n: int
+    # half of the peak-to-peak value [the signal's unit]
     amplitude: float
     amplitude_sd: float
-    mean: float
+    mean: float  # over a cycle
     mean_sd: float
-    frequency: float
+    frequency: float  # [Hz]
     frequency_sd: float
+    # (N_HARMONICS,) amplitudes of the Fourier components of a cycle, the first at the frequency itself
     harmonics: np.ndarray
 
 

@@ -20,24 +20,12 @@ RTOL = 1e-10
 
 @dataclass(frozen=True)
 class Shapes:
-    """Amplitude, mean, frequency and harmonics of one state, one entry per orbit; NaN where the integration failed.
+    """Amplitude, mean, frequency and harmonics of one state, one entry per orbit; NaN where the integration failed."""
 
-    Attributes
-    ----------
-    amplitude : ndarray, (n,)
-        Half of the peak-to-peak value [the state's unit].
-    mean : ndarray, (n,)
-        Mean over the orbit.
-    frequency : ndarray, (n,)
-        Drive periods or returns per second [Hz].
-    harmonics : ndarray, (n, N_HARMONICS)
-        Amplitudes of the Fourier components at multiples of the frequency.
-    """
-
-    amplitude: np.ndarray
-    mean: np.ndarray
-    frequency: np.ndarray
-    harmonics: np.ndarray
+    amplitude: np.ndarray  # (n,) half of the peak-to-peak value [the state's unit]
+    mean: np.ndarray  # (n,) mean over the orbit
+    frequency: np.ndarray  # (n,) drive periods or returns per second [Hz]
+    harmonics: np.ndarray  # (n, N_HARMONICS) amplitudes of the Fourier components at multiples of the frequency
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return amplitude, mean, frequency and harmonics by name, as in the columns of a measured branch."""

@@ -39,27 +39,13 @@ UNEVEN = 0.5
 
 @dataclass(eq=False)
 class Clock:
-    """Uniform sample times of a recording, and the range of samples used from each channel.
+    """Uniform sample times of a recording, and the range of samples used from each channel."""
 
-    Attributes
-    ----------
-    time : ndarray
-        Times, (n,) [s since the first sample], even within a piece.
-    piece : ndarray
-        Index of the piece, (n,): 0, 1, ...
-    step_s : float
-        Sampling interval [s].
-    taken : list of mappings
-        For each stretch, by channel, the first sample and the one after the last.
-    findings : list of Finding
-        Findings about times.
-    """
-
-    time: np.ndarray
-    piece: np.ndarray
-    step_s: float
-    taken: list[dict[str, tuple[int, int]]]
-    findings: list[Finding] = field(default_factory=list)
+    time: np.ndarray  # times, (n,) [s since the first sample], even within a piece
+    piece: np.ndarray  # index of the piece, (n,): 0, 1, ...
+    step_s: float  # sampling interval [s]
+    taken: list[dict[str, tuple[int, int]]]  # for each stretch, by channel, the first sample and the one after the last
+    findings: list[Finding] = field(default_factory=list)  # findings about times
 
 
 def clock_of(

@@ -17,29 +17,17 @@ SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding: a fault in a recording, or a correction made to it, with its time, severity and description.
+    """Finding: a fault in a recording, or a correction made to it, with its time, severity and description."""
 
-    Attributes
-    ----------
-    kind : str
-        One word, such as ``gap``; `KINDS` describes each.
-    channel : str
-        Name in the dataset, or in the file before it is mapped; empty if it concerns all channels.
-    start_s, end_s : float
-        Place in the recording [s since its first sample]; NaN if it is unknown.
-    severity : str
-        ``note``: a correction as requested, nothing is lost. ``warning``: some samples cannot be used, or are
-        less exact. ``error``: results from this recording will be wrong unless it is corrected.
-    text : str
-        A sentence with the remedy, if there is one.
-    """
-
-    kind: str
-    channel: str = ""
+    kind: str  # one word, such as ``gap``; `KINDS` describes each
+    channel: str = ""  # name in the dataset, or in the file before it is mapped; empty if it concerns all channels
+    # place in the recording [s since its first sample]; NaN if it is unknown
     start_s: float = math.nan
     end_s: float = math.nan
+    # ``note``: a correction as requested, nothing is lost. ``warning``: some samples cannot be used, or are less exact.
+    # ``error``: results from this recording will be wrong unless it is corrected.
     severity: Severity = "warning"
-    text: str = field(kw_only=True)
+    text: str = field(kw_only=True)  # a sentence with the remedy, if there is one
 
 
 KINDS = {

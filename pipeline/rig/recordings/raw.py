@@ -15,30 +15,15 @@ from pipeline.rig.recordings.findings import Finding
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """Channel of a file: readings with unit and sample times, in one stretch.
+    """Channel of a file: readings with unit and sample times, in one stretch."""
 
-    Attributes
-    ----------
-    name : str
-        Name as a mapping gives it.
-    values : ndarray
-        Readings as in the file, (n,) float64; NaN for fields that are not numbers.
-    unit : str
-        Unit that the file states; empty if it does not.
-    start_s : float
-        Time of the first sample on a clock that the file's channels share [s]; NaN if it is not stated.
-    step_s : float
-        Sampling interval that the file states [s]; NaN if it does not.
-    time : ndarray, optional
-        Time stamps, (n,) [s], if the file has one for each sample.
-    """
-
-    name: str
-    values: np.ndarray
-    unit: str = ""
+    name: str  # name as a mapping gives it
+    values: np.ndarray  # readings as in the file, (n,) float64; NaN for fields that are not numbers
+    unit: str = ""  # unit that the file states; empty if it does not
+    # time of the first sample on a clock that the file's channels share [s]; NaN if it is not stated
     start_s: float = math.nan
-    step_s: float = math.nan
-    time: np.ndarray | None = None
+    step_s: float = math.nan  # sampling interval that the file states [s]; NaN if it does not
+    time: np.ndarray | None = None  # time stamps, (n,) [s], if the file has one for each sample
 
     def __len__(self) -> int:
         return len(self.values)
@@ -46,33 +31,16 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """Content of a recording's file before any mapping: its channels, in one or more stretches.
-
-    Attributes
-    ----------
-    path : Path
-        Path of the file.
-    format : str
-        Name of its format.
-    sha256 : str
-        Digest of its bytes.
-    stretches : tuple of mappings
-        Channels by name; several if the file separates recordings, such as the cells of MATLAB.
-    findings : tuple of Finding
-        Faults of the file itself.
-    simulated : bool
-        Whether the file states that its readings are simulated.
-    apart : bool
-        Whether each stretch is a piece, even if it continues another.
-    """
+    """Content of a recording's file before any mapping: its channels, in one or more stretches."""
 
     path: Path
     format: str
-    sha256: str
+    sha256: str  # digest of its bytes
+    # channels by name; several if the file separates recordings, such as the cells of MATLAB
     stretches: tuple[Mapping[str, Channel], ...]
-    findings: tuple[Finding, ...] = ()
-    simulated: bool = False
-    apart: bool = False
+    findings: tuple[Finding, ...] = ()  # faults of the file itself
+    simulated: bool = False  # whether the file states that its readings are simulated
+    apart: bool = False  # whether each stretch is a piece, even if it continues another
 
     @property
     def names(self) -> tuple[str, ...]:
