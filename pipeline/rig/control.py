@@ -18,7 +18,7 @@ from pydantic import Field
 
 from magpend_core import rates
 from magpend_core.models.model import Parameters
-from pipeline.rig.simulation import rig_parameters
+from pipeline.rig.virtual import rig_parameters
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, checked, unknown_key, unknown_name
 from pipeline.specification.tables import Table

@@ -15,7 +15,6 @@ from magpend_core.sampling import Drive
 from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.measured_orbits import MeasuredTable, first_orbits
 from pipeline.rig.identify.problem import PHASE, ZERO, Free, Piece, Problem, steady_drive
-from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
 from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth, summary
 from pipeline.specification.problems import SpecError
@@ -466,3 +465,41 @@ def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
     """
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
     return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]
+
+
+def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
+    """Attach parameter values that hold for a single recording to the drives of that recording's pieces.
+
+    Parameters
+    ----------
+    pieces
+        Pieces of any recordings.
+    settings
+        Values of parameters by index of the recording.
+
+    Returns
+    -------
+    list of Piece
+        The drives of all pieces have values of the same parameters; NaN leaves a parameter unchanged.
+    """
+    names: dict[str, None] = {}
+    for piece in pieces:
+        names |= dict.fromkeys(piece.drive.names if piece.drive is not None else ())
+        names |= dict.fromkeys(settings.get(piece.recording, {}))
+    if not names:
+        return list(pieces)
+    return [_with(piece, tuple(names), settings.get(piece.recording, {})) for piece in pieces]
+
+
+def _with(piece: Piece, names: tuple[str, ...], own: Mapping[str, float]) -> Piece:
+    drive = piece.drive
+    if drive is None:
+        time = piece.time
+        drive = Drive(np.array([2 * time[-1] - time[-2]]))
+    values = np.full((len(drive.durations_s), len(names)), np.nan)
+    for k, name in enumerate(names):
+        if name in own:
+            values[:, k] = own[name]
+        elif name in drive.names:
+            values[:, k] = drive.values[:, drive.names.index(name)]
+    return replace(piece, drive=replace(drive, names=names, values=values))

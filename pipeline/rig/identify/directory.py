@@ -21,13 +21,15 @@ from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
+import xarray as xr
 
+from magpend_core.models import load_model
 from magpend_core.models.imported import is_object_path
 from magpend_core.versions import ENGINE
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import canonical, differences, digest_of
 from pipeline.layout.writing import sync_folder, write_atomically
-from pipeline.rig.identify.measured_orbits import MeasuredTable
+from pipeline.rig.identify.measured_orbits import MeasuredTable, stored_table
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
 from pipeline.specification.models import is_model_file
@@ -317,3 +319,16 @@ def is_complete(directory: Path) -> bool:
     except DamagedError:
         return False
     return not problems_of(open_files(directory), result.get("files", {}))
+
+
+def stored_tables(directory: str | Path) -> list[MeasuredTable]:
+    """Return the measured orbits of a finished identification, one `MeasuredTable` per table ``[[orbits]]``."""
+    info, result = read_info(directory), read_result(directory)
+    model = load_model(result["model"])
+    found = []
+    for i, table in enumerate(info.identity["spec"]["orbits"]):
+        with xr.open_dataset(Path(directory) / ORBITS.format(i), engine="scipy") as ds:
+            # a dim of length 0 is read as an unlimited one
+            measured = ds.load().drop_encoding()
+        found.append(stored_table(table["data"], model, measured if "orbit" in measured.sizes else None))
+    return found

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import DETUNING, Free, Problem
-from pipeline.rig.identify.statistics import covariance_of
+from pipeline.rig.identify.statistics import covariance_of, linearise, loss_scale_of
 
 FAR = 2.0
 """Distance from the stated frequency, in half widths of the 95 % interval, that is reported: four standard errors or

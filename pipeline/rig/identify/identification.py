@@ -20,16 +20,22 @@ from pipeline.rig.identify import identifiability, reports
 from pipeline.rig.identify.build import Built, build, read_all
 from pipeline.rig.identify.directory import Outcomes, Source
 from pipeline.rig.identify.drive_frequency import estimate_frequencies
-from pipeline.rig.identify.judging import judge, judge_fit
-from pipeline.rig.identify.linearise import linearise, loss_scale_of
+from pipeline.rig.identify.identifiability import Curvature, Profile, following, profile
+from pipeline.rig.identify.judgement import judge, judge_fit
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.measured_orbits import judge_orbits, read_orbits
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import ZERO, Problem
-from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
-from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
+from pipeline.rig.identify.statistics import (
+    Covariance,
+    Linearised,
+    covariance_of,
+    linearise,
+    loss_scale_of,
+    n_effective,
+)
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.specification.problems import SpecError

@@ -13,7 +13,7 @@ from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.branches.carrying import OrbitData
-from pipeline.rig.identify.orbit_rows import OrbitRows, orbit_rows
+from pipeline.rig.identify.orbit_residuals import OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]

@@ -15,12 +15,11 @@ from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import json_value
 from pipeline.rig.identify.directory import Source
 from pipeline.rig.identify.drive_frequency import DriveFrequency
-from pipeline.rig.identify.identifiability import Direction
-from pipeline.rig.identify.judging import Judgement
+from pipeline.rig.identify.identifiability import Direction, Profile
+from pipeline.rig.identify.judgement import Judgement
 from pipeline.rig.identify.local import Fit
-from pipeline.rig.identify.orbit_reports import orbit_lines, orbits_result
+from pipeline.rig.identify.measured_orbits import orbit_lines, orbits_result
 from pipeline.rig.identify.problem import PHASE, ZERO, Problem
-from pipeline.rig.identify.profiles import Profile
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.identify.statistics import Covariance
 from pipeline.store.provenance import versions

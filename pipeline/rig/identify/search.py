@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.products.reporting import report
-from pipeline.rig.identify.first_guesses import choose_phases, fit_starts
-from pipeline.rig.identify.local import Echo, Fit, fit_local
+from pipeline.rig.identify.local import Echo, Fit, choose_phases, fit_local, fit_starts
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
 from pipeline.specification.extras import import_extra

@@ -17,7 +17,6 @@ from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims
-from pipeline.rig.measured.distances import Candidate
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.specification.problems import SpecError
 
@@ -59,6 +58,16 @@ def cube_and_parameters(
     part = part.isel(dict.fromkeys(others, 0))
     values = {d: float(part[d]) for d in others if d in run.parameters}
     return part, run.parameters.replace(**values)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Attractor of the model at one frequency, with its section points."""
+
+    attractor: int
+    orbit_period: int  # period of the orbit; 0 for a set that does not close
+    side: int  # code of the model's classifier
+    points: Floats  # (n, state): all points of a closed orbit, or a sample of a set that does not close
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from magpend_core.models.model import Parameters
 from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of
-from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import find_sections, name_of
+from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 
@@ -50,7 +49,7 @@ def series_of(
     n_periods
         Drive periods of the part; it ends earlier if the drive frequency changes.
     window_s, hysteresis
-        See `pipeline.rig.measured.recorded_sections.find_sections` and `pipeline.rig.edges.find_edges`.
+        See `pipeline.rig.measured.sections.find_sections` and `pipeline.rig.edges.find_edges`.
 
     Returns
     -------

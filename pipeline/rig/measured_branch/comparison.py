@@ -7,48 +7,13 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Parameters
 from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameter_name
+from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.products.product import Table
-from pipeline.rig.measured_branch.shapes import shapes_of
 from pipeline.specification.problems import SpecError
 
 REST = 1e-3
 """Amplitude, in units of the measured one, below which a computed orbit is an equilibrium that a trajectory nears."""
-
-
-def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray:
-    """Compute half of the peak-to-peak value of a state on every orbit of computed branches.
-
-    Parameters
-    ----------
-    branches
-        Result of the analysis ``branches``.
-    base
-        Parameters of the run.
-    state
-        Name of the state.
-
-    Returns
-    -------
-    ndarray, (branch, point)
-        0 for equilibria, NaN beyond a branch's own points.
-    """
-    parameter = str(branches.attrs["parameter"])
-    found = np.full((branches.sizes["branch"], branches.sizes["point"]), np.nan)
-    for i in range(branches.sizes["branch"]):
-        n, period = int(branches["n_points"][i]), int(branches["orbit_period"][i])
-        if not period:
-            found[i, :n] = 0.0
-            continue
-        own = {name: float(branches[name][i]) for name in base.names if name in branches}
-        packed = np.tile(base.replace(**own).pack(), (n, 1))
-        if parameter != FREQUENCY_DIM:
-            packed[:, base.names.index(parameter)] = branches["parameter"].values[i, :n]
-        states, seconds = branches["section"].values[i, :n, 0], branches["period_s"].values[i, :n]
-        found[i, :n] = shapes_of(base.model, packed, states, seconds, period, state).amplitude
-    return found
 
 
 def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> xr.Dataset:

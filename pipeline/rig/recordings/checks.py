@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding, runs
+from pipeline.rig.recordings.channels import Finding, runs
 from pipeline.rig.recordings.mapping import ChannelMap
 
 CLIPPED_SAMPLES = 5

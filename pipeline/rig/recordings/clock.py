@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding, runs
-from pipeline.rig.recordings.raw import Channel
+from pipeline.rig.recordings.channels import Channel, Finding, runs
 from pipeline.specification.problems import SpecError
 
 MIXED = 1e-3

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding
-from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.rig.recordings.text import number, read_text, split, table, unique, without_end
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
+from pipeline.rig.recordings.delimited import number, read_text, split, table, unique, without_end
 from pipeline.specification.problems import SpecError
 
 MAGIC = "LabVIEW Measurement"

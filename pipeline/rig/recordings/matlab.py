@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.rig.recordings.raw import Channel, Raw, digest
+from pipeline.rig.recordings.channels import Channel, Raw, digest
 from pipeline.specification.problems import SpecError
 
 STEP = "dt"

@@ -12,10 +12,9 @@ import xarray as xr
 from pipeline.analysis.tabular import aligned, number
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
+from pipeline.rig.recordings.channels import Raw, findings_of, summary
 from pipeline.rig.recordings.clock import step_of
-from pipeline.rig.recordings.findings import findings_of, summary
 from pipeline.rig.recordings.mapping import DRIVE
-from pipeline.rig.recordings.raw import Raw
 
 
 def describe_file(raw: Raw) -> Table:

@@ -11,8 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding
-from pipeline.rig.recordings.raw import Channel, Raw, digest
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
 from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 

@@ -13,9 +13,9 @@ import xarray as xr
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.layout.writing import write_atomically, write_netcdf
+from pipeline.rig.recordings.channels import Channel, Raw
 from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
-from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.tdms import SIMULATED
 from pipeline.specification.extras import import_extra
 from pipeline.specification.files import check_new_file

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.layout.writing import json_value
-from pipeline.rig.identify.first_guesses import fit_starts
-from pipeline.rig.identify.local import Fit, fit_local
+from pipeline.rig.identify.local import Fit, fit_local, fit_starts
 from pipeline.rig.identify.problem import Piece, Problem
 from pipeline.rig.identify.search import slowest_period
 
