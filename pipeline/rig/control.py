@@ -69,15 +69,11 @@ class TracedOrbits:
 
 
 def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbits:
-    """Trace a branch: find one orbit for each amplitude of the target's first harmonic. Each orbit has a separate
-    virtual rig.
+    """Trace a branch: find one orbit for each amplitude of the target's first harmonic, each with a virtual rig of its
+    own.
 
-    Raises
-    ------
-    SpecError
-        If the state has no rate, the drive is no parameter that acts on it as a cosine, or a target is not positive.
-    ArithmeticError
-        If control fails: a rig diverges.
+    Raise `SpecError` if the state has no rate, the drive is no parameter that acts on it as a cosine, or a target is
+    not positive, and `ArithmeticError` if control fails: a rig diverges.
     """
     sizes = np.asarray(targets, np.float64)
     plant = _Plant.of(rig, sizes)
@@ -236,13 +232,9 @@ class ControlTable(Table):
 
 
 def load_control(path: str | Path) -> tuple[Controlled, np.ndarray]:
-    """Read the specification of a virtual rig with the table ``[control]``. Return the settings and the target
-    amplitudes.
+    """Read a virtual rig with the table ``[control]``; return the settings and the target amplitudes.
 
-    Raises
-    ------
-    SpecError
-        With all problems at once; also if the file cannot be read.
+    Raise `SpecError` with all problems at once.
     """
     path, problems = Path(path), []
     data = read_toml(path)

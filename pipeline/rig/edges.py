@@ -75,14 +75,10 @@ class Edges:
         """Fit a line through the times of the rising edges against their numbers; return frequency, jitter and duty
         cycle.
 
-        Missing edges are counted by the median distance of neighbours. The standard errors assume independent
-        jitter. They include the rounding to samples: if edges fall on the same few places between samples,
-        their scatter does not reveal an offset of up to half a sampling interval.
-
-        Raises
-        ------
-        SpecError
-            If there are fewer than three rising edges, or they scatter by more than a fifth of a period.
+        Missing edges are counted by the median distance of neighbours. The standard errors assume independent jitter.
+        They include the rounding to samples: if edges fall on the same few places between samples, their scatter does
+        not reveal an offset of up to half a sampling interval. Raise `SpecError` if there are fewer than three rising
+        edges, or they scatter by more than a fifth of a period.
         """
         rising = self.rising
         if rising.size < 3:
@@ -120,12 +116,8 @@ class Edges:
     def common_error(self, fitted: Floats, scatter: float) -> float:
         """Return the standard error [s] of the time offset of a line fitted through the edges.
 
-        Parameters
-        ----------
-        fitted
-            Times of the rising edges on the line [s].
-        scatter
-            Root mean square distance of the edges from it [s].
+        `fitted` are the times of the rising edges on the line [s], `scatter` the root mean square distance of the edges
+        from it [s].
         """
         return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
 
@@ -153,49 +145,23 @@ class Edges:
 
 
 def find_edges(time: npt.ArrayLike, drive: npt.ArrayLike, *, hysteresis: float | None = None) -> Edges:
-    """Return the times at which a drive signal crosses the middle between its two levels.
+    """Return the times at which a drive signal crosses the middle between its two levels, by linear interpolation.
 
-    Parameters
-    ----------
-    time
-        Times of the samples [s], rising, shape (n,).
-    drive
-        Signal or torque in any unit, shape (n,); finite.
-    hysteresis
-        Width of the band about the middle that an edge must cross completely, in the signal's unit; by
-        default half the distance of the levels.
+    An edge must cross a band about the middle, of the width `hysteresis` (by default half the distance of the levels),
+    completely. If noise crosses the middle several times on one flank, the mean of the first and the last crossing
+    counts. A crossing inside a gap of the sampling is left out.
 
-    Returns
-    -------
-    Edges
-        Times by linear interpolation at the middle. If noise crosses the middle several times on one flank,
-        the mean of the first and the last crossing counts. A crossing inside a gap of the sampling is left
-        out.
-
-    Raises
-    ------
-    SpecError
-        If lengths differ, a value is not finite, time does not rise, or the band is not inside the levels;
-        also for a constant drive, which has no two levels above its noise.
+    Raise `SpecError` if lengths differ, a value is not finite, time does not rise, or the band is not inside the
+    levels; also for a constant drive, which has no two levels above its noise.
     """
     t, x = _checked(time, drive)
     return _found([(t, x)], _switch(x, hysteresis))
 
 
 def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges:
-    """Return the edges of the drive signal in all pieces of a recording. Edges in gaps between the pieces are left out.
+    """Return the edges of the drive signal in all pieces of a recording; edges in gaps between the pieces are left out.
 
-    Parameters
-    ----------
-    recording
-        Recording from `pipeline.rig.recordings.read_recording`, with a drive.
-    hysteresis
-        Width of the band about the middle; see `find_edges`.
-
-    Raises
-    ------
-    SpecError
-        If the recording has no drive, or no piece of it has an edge.
+    Raise `SpecError` if the recording has no drive, or no piece of it has an edge. See `find_edges`.
     """
     if DRIVE not in recording:
         name = recording.attrs.get("file", "the recording")

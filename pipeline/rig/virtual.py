@@ -100,36 +100,15 @@ def record(
     sensors: Sensors,
     seed: int,
 ) -> xr.Dataset:
-    """Simulate a recording of a model with a given drive and sensors.
+    """Simulate a recording of a model with a given drive and sensors, with the attributes ``simulated`` and
+    ``parameters``.
 
-    Parameters
-    ----------
-    parameters
-        The model and its parameters.
-    drive
-        Steps of the drive from time 0 on; the state is continuous between them. None for no drive: then set
-        the parameter of its amplitude to 0.
-    initial_state
-        The model's states at time 0.
-    times
-        Evenly spaced times from 0 on, (n,) [s]; the steps must cover them.
-    sensors
-        Sensors by name of a state, and of the drive under ``drive``; other states are not recorded.
-    seed
-        Seed of the noise.
+    The drive's steps begin at time 0 and cover the times, which are even and begin at 0; the state is continuous
+    between steps. None is for no drive: then set the parameter of its amplitude to 0. Sensors go by the name of a
+    state, and of the drive under ``drive``; other states are not recorded.
 
-    Returns
-    -------
-    Dataset
-        Recording as from `pipeline.rig.recordings.read_recording`, with the attributes ``simulated`` and
-        ``parameters`` (the true ones).
-
-    Raises
-    ------
-    SpecError
-        If arguments are wrong; the message lists all problems.
-    ArithmeticError
-        If the trajectory diverges or meets the step limit.
+    Raise `SpecError` with all problems of the arguments, and `ArithmeticError` if the trajectory diverges or meets the
+    step limit.
     """
     raw, mapping = readings(parameters, drive, initial_state, times, sensors=sensors, seed=seed)
     lines = [f"{name} = {value!r}" for name, value in parameters.as_dict().items()]
@@ -145,19 +124,9 @@ def readings(
     sensors: Sensors,
     seed: int,
 ) -> tuple[Raw, Mapping]:
-    """Simulate the sensors' readings. Return them with the mapping (description of the channels) that converts them to
-    states.
+    """Simulate the sensors' readings, as for `record`; return them with the mapping that converts them to states.
 
-    Returns
-    -------
-    Raw, Mapping
-        Channels ``rig/STATE`` and ``rig/drive`` as they can be written by
-        `pipeline.rig.recordings.write_raw`.
-
-    Raises
-    ------
-    SpecError, ArithmeticError
-        See `record`.
+    The channels are ``rig/STATE`` and ``rig/drive``.
     """
     instants = np.asarray(times, dtype=np.float64)
     _check(parameters, drive, instants, sensors)
@@ -413,23 +382,13 @@ class Rig:
 
 
 def load_rig(path: str | Path) -> Rig:
-    """Read and validate the TOML specification of a virtual rig.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once; also if the file cannot be read or is not TOML.
-    """
+    """Read and validate the TOML specification of a virtual rig; raise `SpecError` with all problems at once."""
     return parse_rig(read_toml(path), Path(path).parent)
 
 
 def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
-    """Validate the tables of a virtual rig's specification; the path of a preset file is relative to `folder`.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
+    """Validate the tables of a virtual rig, with paths relative to `folder`; raise `SpecError` with all problems at
+    once.
     """
     keys = tuple(RigTable.model_fields)
     problems = [unknown_key(key, key, keys) for key in data if key not in keys]
@@ -461,22 +420,9 @@ def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
 
 
 def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
-    """Simulate a virtual rig. Return its readings, and the mapping (description of the channels) for the file that they
-    are written to.
+    """Simulate a virtual rig. Return its readings, and the mapping for the file that they are written to.
 
-    Parameters
-    ----------
-    rig
-        The specification.
-    is_csv
-        Whether the file is a CSV file, which has a column of time.
-
-    Raises
-    ------
-    SpecError
-        If sensors, drive and duration do not fit one another.
-    ArithmeticError
-        If the trajectory diverges or meets the step limit.
+    A CSV file has a column of time. See `record` for errors.
     """
     raw, mapping = readings(rig.parameters, rig.drive, rig.initial_state, rig.times, sensors=rig.sensors, seed=rig.seed)
     if is_csv:

@@ -55,13 +55,7 @@ class Stretch:
 
 
 def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
-    """Read all recordings that the specification of an identification names.
-
-    Raises
-    ------
-    SpecError
-        If one cannot be read; the message lists the problems of all.
-    """
+    """Read all recordings of a specification; raise `SpecError` with the problems of all."""
     found, problems = [], []
     for i, table in enumerate(spec.recordings):
         try:
@@ -75,14 +69,11 @@ def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
 
 
 def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Sequence[MeasuredTable] = ()) -> Built:
-    """Build the least-squares problem of a specification, its recordings and its measured orbits, and set the held-out
+    """Build the least-squares problem of a specification, its recordings and its measured orbits, and set held-out
     pieces apart.
 
-    Raises
-    ------
-    SpecError
-        With all problems at once, before anything is integrated: a missing channel or drive, pieces that are
-        too short, held-out pieces that do not exist, nothing left to fit.
+    Raise `SpecError` with all problems at once, before anything is integrated: a missing channel or drive, pieces that
+    are too short, held-out pieces that do not exist, nothing left to fit.
     """
     problems: list[str] = []
     channels = channels_of(spec.model, spec.fit.channels, recordings, problems) if recordings else ()
@@ -278,25 +269,8 @@ def pieces_of(
 ) -> list[Piece]:
     """Cut a recording into the pieces that are fitted, each with samples, drive and a first guess of its initial state.
 
-    Parameters
-    ----------
-    model
-        Model that has the states.
-    channels
-        Channels that are compared.
-    both
-        The recording as measured, and smoothed. The smoothed one gives the first guess of a start.
-    table
-        The recording's table in the specification: length of pieces, kind of drive.
-    recording
-        Index of the recording.
-    decimate
-        Step between the samples that are used.
-
-    Raises
-    ------
-    SpecError
-        If pieces are too short or the drive does not cover them; the message names them.
+    `both` is the recording as measured, and smoothed for the guess. `decimate` is the step between the samples that are
+    used. Raise `SpecError` if pieces are too short or the drive does not cover them.
     """
     ds, smoothed = both
     drive = _drive_of(table, ds)
@@ -335,17 +309,8 @@ def pieces_of(
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
-    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s` seconds; return all
-    stretches.
-
-    Parameters
-    ----------
-    ds
-        The recording.
-    piece_s
-        Length [s]; by default pieces stay whole.
-    recording
-        Index of the recording.
+    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s` seconds; None keeps pieces
+    whole.
     """
     found: list[Stretch] = []
     piece, time = ds["piece"].values, ds["time"].values
@@ -468,19 +433,10 @@ def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
 
 
 def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
-    """Attach parameter values that hold for a single recording to the drives of that recording's pieces.
+    """Attach parameter values that hold for a single recording, given by its index, to the drives of that recording's
+    pieces.
 
-    Parameters
-    ----------
-    pieces
-        Pieces of any recordings.
-    settings
-        Values of parameters by index of the recording.
-
-    Returns
-    -------
-    list of Piece
-        The drives of all pieces have values of the same parameters; NaN leaves a parameter unchanged.
+    The drives of all pieces then have values of the same parameters; NaN leaves a parameter unchanged.
     """
     names: dict[str, None] = {}
     for piece in pieces:

@@ -83,13 +83,7 @@ class Info:
 
 
 def sources_of(spec: IdentificationSpec) -> list[Source]:
-    """Read the bytes of each recording and the text of its mapping; return file name, sha256 and mapping text.
-
-    Raises
-    ------
-    SpecError
-        If a file cannot be read.
-    """
+    """Read the bytes of each recording and the text of its mapping; raise `SpecError` if a file cannot be read."""
     from pipeline.specification.problems import SpecError
 
     found, problems = [], []
@@ -142,14 +136,10 @@ def is_identification(directory: str | Path) -> bool:
 
 
 def read_info(directory: str | Path) -> Info:
-    """Read ``identification.json``, and check its format and digest.
+    """Read ``identification.json``.
 
-    Raises
-    ------
-    RefusedError
-        If it does not exist, or has another format.
-    DamagedError
-        If its content has changed since it was written.
+    Raise `RefusedError` if it does not exist or has another format, and `DamagedError` if it has changed since it was
+    written.
     """
     directory = local_path(directory)
     path = directory / IDENTIFICATION
@@ -175,18 +165,9 @@ def read_info(directory: str | Path) -> Info:
 
 
 def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
-    """Return the identification in a directory if it has the given identity, or None if the directory is free. Raise
-    RefusedError if it holds anything else.
+    """Return the identification in a directory if it has the given identity, or None if the directory is free.
 
-    Returns
-    -------
-    Info or None
-        The identification that is there already; None if there is none.
-
-    Raises
-    ------
-    RefusedError
-        If the directory holds another identification (the message lists the differences) or other files.
+    Raise `RefusedError` if it holds other files or another identification; the message lists the differences.
     """
     if directory.exists() and not directory.is_dir():
         raise RefusedError(f"{directory}: is a file; give another --out.")
@@ -248,13 +229,7 @@ def establish(
 
 
 class Outcomes:
-    """Stored outcomes of local fits and profiles, one file per outcome. A continued identification reads them again.
-
-    Parameters
-    ----------
-    folder
-        Folder of the files.
-    """
+    """Stored outcomes of local fits and profiles, one file per outcome. A continued identification reads them again."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -289,15 +264,7 @@ def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str
 
 
 def read_result(directory: str | Path) -> dict[str, Any]:
-    """Read ``result.json`` of a finished identification.
-
-    Raises
-    ------
-    RefusedError
-        If it is not finished.
-    DamagedError
-        If it is not JSON.
-    """
+    """Read ``result.json`` of a finished identification; raise `RefusedError` if it is not finished."""
     path = local_path(directory) / RESULT
     read_info(directory)
     if not is_there(path):

@@ -66,14 +66,8 @@ class DriveFrequency:
 
 
 def estimate_frequencies(problem: Problem, fit: Fit, scale: np.ndarray) -> list[DriveFrequency]:
-    """Estimate the frequencies of the drives whose phases were fitted or stated, one step from the fit.
-
-    Parameters
-    ----------
-    problem, fit
-        Problem that was fitted, and its best fit.
-    scale
-        Sizes of the unknowns, (n_free,).
+    """Estimate the frequencies of the drives whose phases were fitted or stated, one step from the fit; `scale` are the
+    unknowns' sizes.
     """
     stated = {p.recording: p.known_hz for p in problem.pieces if p.known_hz}
     if not stated:

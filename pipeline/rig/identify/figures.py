@@ -99,15 +99,8 @@ def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
-    """Return the data of the residual plots: autocorrelation, mean residual against the channel's rate of change,
-    density, and rms by piece.
-
-    Parameters
-    ----------
-    ds
-        See `pipeline.rig.identify.reports.residuals_of`.
-    channels
-        Their names.
+    """Return the data of the residual plots: autocorrelation, mean residual against the channel's rate, density, rms by
+    piece.
     """
     fitted = [s.of(ds) for s in pieces_in(ds) if not s.held_out]
     step = float(np.median(np.diff(fitted[0]["time"].values)))
@@ -161,23 +154,11 @@ def draw_all(
     result: Mapping[str, Any],
     branches: Sequence[tuple[xr.Dataset, xr.Dataset, np.ndarray]] = (),
 ) -> list[str]:
-    """Draw all figures of an identification, and save each with the data that it shows.
+    """Draw all figures of an identification into a folder, each with the data that it shows; return the names of the
+    files.
 
-    Parameters
-    ----------
-    folder
-        Folder to write to.
-    residuals
-        See `pipeline.rig.identify.reports.residuals_of`.
-    result
-        Content of ``result.json``.
-    branches
-        For each table of measured orbits the judged orbits, the computed branches and the amplitudes of their orbits.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
+    `branches` has for each table of measured orbits the judged orbits, the computed branches and the amplitudes of
+    their orbits.
     """
     drawings: dict[str, Callable[[], style.DataFigure]] = {}
     if residuals.sizes["sample"]:
@@ -217,17 +198,8 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
 
 @style.drawn
 def plot_fit(ds: xr.Dataset) -> style.DataFigure:
-    """Draw measured and computed values of up to four pieces, with their residuals.
-
-    Parameters
-    ----------
-    ds
-        See `pipeline.rig.identify.reports.residuals_of`.
-
-    Returns
-    -------
-    DataFigure
-        It shows the first piece, the worst fit, a held-out piece, and the last. Its `data` are those pieces.
+    """Draw measured and computed values of the first piece, the worst fit, a held-out piece and the last, with their
+    residuals.
     """
     chosen = _chosen(pieces_in(ds))
     channels = str(ds.attrs["channels"]).split()
@@ -299,20 +271,10 @@ def _share_range(row: list[Axes]) -> None:
 
 @style.drawn
 def plot_residuals(ds: xr.Dataset) -> style.DataFigure:
-    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the channel's rate of
-    change, and histogram.
+    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the rate, and histogram.
 
-    Parameters
-    ----------
-    ds
-        See `pipeline.rig.identify.reports.residuals_of`.
-
-    Returns
-    -------
-    DataFigure
-        A column for each channel. Wrong friction shows in the third row: the mean residual then depends on
-        the rate. Its `data` are the curves and means drawn. Except in the second row, only fitted pieces
-        count.
+    Wrong friction shows in the third row: the mean residual then depends on the rate. Except in the second row, only
+    fitted pieces count.
     """
     channels = str(ds.attrs["channels"]).split()
     views = residual_views(ds, channels)
@@ -411,20 +373,7 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
 
 @style.drawn
 def plot_profiles(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
-    """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts.
-
-    Parameters
-    ----------
-    attrs
-        Of the residuals.
-    result
-        What ``result.json`` holds.
-
-    Returns
-    -------
-    DataFigure
-        Its `data` are ``NAME_values`` and ``NAME_growth``.
-    """
+    """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts."""
     names = [name for name in result["names"] if name in result["profiles"]]
     n_columns = min(4, len(names))
     n_rows = math.ceil(len(names) / n_columns)
@@ -492,20 +441,7 @@ def _engineering(size: float) -> tuple[float, int]:
 
 @style.drawn
 def plot_correlations(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
-    """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty.
-
-    Parameters
-    ----------
-    attrs
-        Of the residuals.
-    result
-        What ``result.json`` holds.
-
-    Returns
-    -------
-    DataFigure
-        Its `data` are ``correlation`` over ``row`` and ``column``.
-    """
+    """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty."""
     names = list(result["names"])
     matrix = np.array([[_nan(result["correlations"][a][b]) for b in names] for a in names], np.float64)
     data = xr.Dataset(

@@ -57,20 +57,10 @@ class Direction:
 def sizes_of(
     theta: np.ndarray, start: np.ndarray, lower: np.ndarray, upper: np.ndarray, sensed: np.ndarray
 ) -> np.ndarray:
-    """Return a typical size of each parameter, the unit in which its changes are measured.
+    """Return a typical size of each parameter, (n_free,): the larger of estimate and start; if both are 0, the width of
+    the bounds, or 1.
 
-    Parameters
-    ----------
-    theta, start, lower, upper
-        (n_free,) Estimates, starts and bounds.
-    sensed
-        (n_free,) Size of the measured quantity for parameters that are its offset and may be 0; NaN for
-        others.
-
-    Returns
-    -------
-    ndarray (n_free,)
-        The larger of the estimate and the start; if both are 0, the width of the bounds, or 1.
+    `sensed` is the size of the measured quantity for parameters that are its offset and may be 0, and NaN for others.
     """
     size = np.maximum(np.abs(theta), np.abs(start))
     width = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
@@ -78,16 +68,10 @@ def sizes_of(
 
 
 def directions_of(information: np.ndarray, scale: np.ndarray, inflation: float) -> list[Direction]:
-    """Return the eigenvectors of the scaled information matrix as directions, the best determined one first.
+    """Return the eigenvectors of the information matrix of the data alone as directions, the best determined one first.
 
-    Parameters
-    ----------
-    information
-        Information of the data alone, (n_free, n_free).
-    scale
-        Sizes of the parameters, (n_free,), see `sizes_of`.
-    inflation
-        Factor on standard errors, see `Covariance`.
+    The matrix is scaled by the parameters' sizes, see `sizes_of`; `inflation` is a factor on standard errors, see
+    `Covariance`.
     """
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     singular = np.sqrt(np.maximum(values[::-1], 0.0))
@@ -113,21 +97,11 @@ def warnings_of(
     prior_sd: np.ndarray,
     at_bound: Sequence[str],
 ) -> list[str]:
-    """Return warnings about parameters and combinations that the data do not determine, and about estimates at a bound
-    or set by a prior.
+    """Return warnings on parameters and combinations that the data do not determine, and on estimates at a bound or set
+    by a prior.
 
-    Parameters
-    ----------
-    names
-        Names of the parameters.
-    directions
-        Directions from the data alone.
-    covariance
-        Covariance with priors included.
-    prior_sd
-        Standard deviations of priors, (n_free,); NaN where there is none.
-    at_bound
-        For each parameter, the bound at which the estimate lies: ``lower``, ``upper`` or an empty text.
+    `directions` come from the data alone, `covariance` includes priors; `prior_sd` is NaN without a prior, and
+    `at_bound` has ``lower``, ``upper`` or an empty text for each parameter.
     """
     found = [_loose(names, d, prior_sd) for d in directions if d.is_loose]
     errors = covariance.errors
@@ -243,18 +217,8 @@ class Curvature:
 
 
 def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]) -> Profile:
-    """Compute the profile likelihood of one parameter: at each of its values, all other unknowns are fitted again.
-
-    Parameters
-    ----------
-    problem, best
-        Problem that was fitted, and its best fit.
-    name
-        Name of the free parameter.
-    about
-        Curvature along the parameter.
-    fit_local
-        See `pipeline.rig.identify.local.fit_local`.
+    """Compute the profile likelihood of one parameter: at each of its values, all other unknowns are fitted again by
+    `fit_local`.
     """
     index = [f.name for f in problem.free].index(name)
     free = problem.free[index]
@@ -296,17 +260,8 @@ def following(information: np.ndarray, index: int) -> np.ndarray:
 
 
 def interval_of(values: np.ndarray, growth: np.ndarray, estimate: float, critical: float) -> tuple[float, float]:
-    """Return the ends of a parameter's interval: where the square root of its profile likelihood reaches the critical
-    value.
-
-    Parameters
-    ----------
-    values, growth
-        See `Profile`.
-    estimate
-        Value at which the growth is 0.
-    critical
-        Half width of the interval in standard errors.
+    """Return the ends of a parameter's interval: where the root of its profile likelihood reaches `critical` standard
+    errors.
     """
     ends: list[Any] = []
     for side in (-1.0, 1.0):

@@ -146,12 +146,8 @@ def _write(
 
 
 def refuse_invisible(problem: Problem) -> None:
-    """Evaluate the residuals once, and raise `SpecError` if they do not depend on some of the unknowns.
-
-    Raises
-    ------
-    SpecError
-        If there are such unknowns (the message names all), or if trajectories diverge at the start.
+    """Evaluate the residuals once; raise `SpecError` if they do not depend on some unknowns, or if trajectories
+    diverge.
     """
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
@@ -197,13 +193,7 @@ def _is_driven(problem: Problem) -> bool:
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
-    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings.
-
-    Raises
-    ------
-    NotConvergedError
-        If no start converged.
-    """
+    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings."""
     problem, table = built.problem, spec.search
     keep = Kept(outcomes)
     fits = search(
@@ -332,14 +322,7 @@ def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
 
 
 class Kept:
-    """Store of finished local fits for `pipeline.rig.identify.search.search`. The key of a fit is the number of its
-    first guess.
-
-    Parameters
-    ----------
-    outcomes
-        Files of the outcomes.
-    """
+    """Store of finished local fits; the key of a fit is the number of its first guess."""
 
     def __init__(self, outcomes: Outcomes) -> None:
         self._outcomes = outcomes

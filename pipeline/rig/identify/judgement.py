@@ -90,16 +90,7 @@ def known_problem(
 ) -> Problem:
     """Return a least-squares problem in which only the initial states of the given pieces are unknown.
 
-    Parameters
-    ----------
-    problem
-        Problem that was fitted.
-    values
-        All parameters by name [SI].
-    zeros
-        Sensors' zeros by the names of their unknowns [SI].
-    pieces
-        Pieces to be judged.
+    `values` are all parameters by name [SI], `zeros` the sensors' zeros by the names of their unknowns [SI].
     """
     free = tuple(f for f in problem.free if f.name in zeros)
     known = replace(
@@ -117,20 +108,10 @@ def known_problem(
 def judge(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> tuple[Judgement, Fit]:
-    """Judge known parameters on pieces that they were not fitted to. Only the initial states of these pieces are
+    """Judge known parameters on pieces that they were not fitted to; only the initial states of these pieces are
     fitted.
 
-    Parameters
-    ----------
-    problem, values, zeros, pieces
-        See `known_problem`.
-
-    Returns
-    -------
-    Judgement
-        Residuals of the pieces.
-    Fit
-        Fit of the starts. Check that it converged.
+    Return the judgement and the fit of the starts, which may not have converged.
     """
     known = known_problem(problem, values, zeros, pieces)
     longest = max(float(p.time[-1]) for p in known.pieces)

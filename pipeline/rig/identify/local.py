@@ -45,21 +45,8 @@ class ManyStarts(NamedTuple):
 def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     """Fit the initial state of each piece by least squares (Levenberg-Marquardt), with the unknown parameters fixed.
 
-    The engine integrates all pieces together; each has its own damping. Gaps between stretches do not count.
-
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    theta
-        Unknowns, (n_free,).
-    starts
-        First guesses, (n_piece, n_states).
-
-    Returns
-    -------
-    Starts
-        No start is worse than its guess.
+    The engine integrates all pieces together; each has its own damping. Gaps between stretches do not count. `starts`
+    are first guesses, (n_piece, n_states); no fitted start is worse than its guess.
     """
     found = fit_many_starts(problem, theta[None], starts[None])
     return Starts(found.starts[0], found.settled[0])
@@ -68,18 +55,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStarts:
     """Fit the initial state of each piece, as `fit_starts`, for each row of unknowns in common calls of the engine.
 
-    Parameters
-    ----------
-    problem
-    thetas
-        Unknowns, (member, n_free).
-    starts
-        First guesses, (member, piece, n_states).
-
-    Returns
-    -------
-    ManyStarts
-        No start is worse than its guess. Each member depends on its own unknowns and guesses alone.
+    `starts` are first guesses, (member, piece, n_states). Each member depends on its own unknowns and guesses alone.
     """
     held = replace(problem, continuity=None, orbits=(), held=True)
     found = np.array(starts)
@@ -185,19 +161,9 @@ def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change
 
 
 def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Return residuals and their derivatives by the unknowns, with the directions of the initial states projected out.
+    """Return residuals (m,) and their derivatives (m, n_free), with the directions of the initial states projected out.
 
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    evaluation
-        Evaluation with slopes, at starts that are optimal for its unknowns.
-
-    Returns
-    -------
-    tuple of ndarray
-        (m,) and (m, n_free): ``rows @ rows / 2`` is the cost.
+    The evaluation has slopes, at starts that are optimal for its unknowns; ``rows @ rows / 2`` is the cost.
     """
     n, n_free, last = len(problem.model.states), len(problem.free), 0
     rows, slopes = [], []

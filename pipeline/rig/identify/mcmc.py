@@ -113,21 +113,8 @@ class LogPosterior:
 def log_posterior(directory: str | Path, spec: str | Path | None, result: Mapping[str, Any]) -> LogPosterior:
     """Restore the problem of a finished identification, and return the logarithm of its posterior density.
 
-    Parameters
-    ----------
-    directory
-        Directory of the identification.
-    spec
-        Its specification; needed if recordings were fitted, since the directory does not keep these.
-    result
-        Content of ``result.json``.
-
-    Raises
-    ------
-    SpecError
-        If the specification is missing, or its fit has a price on gaps (``continuity``).
-    RefusedError
-        If it is the specification of another identification.
+    The specification is needed if recordings were fitted, since the directory does not keep these. Raise `SpecError` if
+    it is missing, or its fit has a price on gaps, and `RefusedError` if it is that of another identification.
     """
     info = store.read_info(directory)
     fit = _best(info, result)
@@ -272,33 +259,11 @@ def sample_posterior(
     seed: int,
     echo: Callable[[str], None],
 ) -> Chain:
-    """Sample a posterior density until the chain has converged, or until it has its most steps.
+    """Sample a posterior density until the chain has converged, or until it has `most_steps`.
 
-    Parameters
-    ----------
-    directory
-        Directory of the identification, which keeps the chain under ``outcomes``.
-    density
-        Logarithm of the density.
-    covariance
-        Covariance of the estimates, (n_free, n_free), from which the walkers start.
-    n_walkers
-        Number of walkers, at least twice the number of unknowns, and even.
-    most_steps
-        Number of steps after which the chain ends in any case.
-    seed
-        Seed of the walkers and of their moves.
-    echo
-        Function that prints a line.
-
-    Returns
-    -------
-    Chain
-
-    Raises
-    ------
-    SpecError
-        For too few walkers, without emcee, and if no walker finds a place with a density.
+    The directory keeps the chain under ``outcomes``. The walkers start from the covariance of the estimates; their
+    number is even, and at least twice that of unknowns. Raise `SpecError` for too few walkers, without emcee, and if no
+    walker finds a density.
     """
     require_emcee()
     n_free = len(density.problem.free)
@@ -425,14 +390,8 @@ def _unpacked_random(block: Mapping[str, Array]) -> tuple[str, Array, int, int, 
 def judged(values: Array, log_density: Array, accepted: float) -> Chain:
     """Leave out the first steps of a chain, and compute its convergence figures.
 
-    Parameters
-    ----------
-    values
-        All positions, (step, walker, n_free).
-    log_density
-        Their log densities, (step, walker).
-    accepted
-        Share of accepted moves.
+    Positions have the shape (step, walker, n_free), log densities (step, walker); `accepted` is the share of accepted
+    moves.
     """
     n = len(values)
     rough = BURN_IN * float(np.max(autocorrelation_time(values[n // 2 :])))

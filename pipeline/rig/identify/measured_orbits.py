@@ -95,13 +95,7 @@ def _plain(datum: Datum) -> dict[str, Any]:
 
 
 def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> MeasuredTable:
-    """Read and check one table ``[[orbits]]``: measured orbits and bifurcations.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
-    """
+    """Read and check one table ``[[orbits]]``; raise `SpecError` with all problems at once."""
     problems: list[str] = []
     measured = _read(spec, table, where)
     parameter = axis_name(table.parameter or ("" if measured is None else measured.attrs["parameter"]))
@@ -148,13 +142,7 @@ def _datum(data: Mapping[str, Any]) -> Datum:
 
 
 def read_orbits(spec: IdentificationSpec) -> list[MeasuredTable]:
-    """Read all tables ``[[orbits]]`` (measured orbits and bifurcations) of a specification.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
-    """
+    """Read all tables ``[[orbits]]`` of a specification; raise `SpecError` with all problems at once."""
     found, problems = [], []
     for i, table in enumerate(spec.orbits):
         try:
@@ -322,10 +310,7 @@ def _parameters(model: Model, values: Mapping[str, float]) -> Parameters:
 def first_orbits(tables: Sequence[MeasuredTable], values: Mapping[str, float]) -> tuple[OrbitData, ...]:
     """Find the computed orbit or bifurcation for each fitted measurement, at the first guess of the parameters.
 
-    Raises
-    ------
-    SpecError
-        If an orbit or a bifurcation has none; the message names all of them.
+    Raise `SpecError` with the names of all that have none.
     """
     found, problems = [], []
     for i, table in enumerate(tables):
@@ -403,11 +388,7 @@ def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
 def judge_orbits(table: MeasuredTable, values: Mapping[str, float]) -> xr.Dataset:
     """Compare the orbits and bifurcations of a measured table with newly computed branches.
 
-    Returns
-    -------
-    Dataset
-        As of `compare`, with ``held_out``, and over ``bifurcation`` the measured and computed values of
-        bifurcations.
+    Return a dataset as of `compare`, with ``held_out``, and over ``bifurcation`` the measured and computed values.
     """
     branches, computed = table.branches(values)
     found = xr.Dataset() if table.measured is None else compare(table.measured, branches, computed)
@@ -428,19 +409,11 @@ GROUPS = ("fitted", "held_out")
 
 
 def orbits_result(judged: Sequence[xr.Dataset]) -> list[dict[str, Any]]:
-    """Return the comparison of measured and computed orbits and bifurcations as plain data, one entry per table
-    ``[[orbits]]``.
+    """Return the judged orbits and bifurcations of each table as plain data: ``parameter``, ``orbits``,
+    ``bifurcations``, ``rms``.
 
-    Parameters
-    ----------
-    judged
-        From `judge_orbits`, one dataset per table.
-
-    Returns
-    -------
-    list of dict
-        For each table ``parameter``, ``orbits`` and ``bifurcations`` with a row each, and ``rms``: the root mean square
-        of the relative errors of amplitude and frequency, for fitted and for held-out orbits of each stability.
+    The last one is the root mean square of the relative errors of amplitude and frequency, for fitted and for held-out
+    orbits of each stability.
     """
     return [
         {

@@ -65,21 +65,8 @@ class _Motions(NamedTuple):
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
     """Compute the residuals of a fit, and on request their derivatives, for each row of a matrix of unknowns.
 
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    thetas
-        Unknowns, shape (n, n_free) [SI].
-    starts
-        Starts of the pieces, shape (n, n_piece, n_states) [SI].
-    slopes
-        Whether to compute slopes; `Problem.slopes` selects the method.
-
-    Returns
-    -------
-    list of Evaluation
-        One for each member.
+    `thetas` are unknowns, (n, n_free) [SI], and `starts` those of the pieces, (n, n_piece, n_states) [SI].
+    `Problem.slopes` selects the method of slopes.
     """
     of_orbits = orbit_rows(problem, thetas, slopes=slopes) if problem.orbits else [None] * len(thetas)
     if not problem.pieces:

@@ -155,16 +155,8 @@ class OrbitRows:
 
 
 def orbit_rows(problem: Problem, thetas: Array, *, slopes: bool) -> list[OrbitRows]:
-    """Compute the residuals of all measured orbits and bifurcations for each row of unknowns.
-
-    Parameters
-    ----------
-    problem
-        Problem with the tables `Problem.orbits`.
-    thetas
-        Unknowns, shape (n, n_free) [SI].
-    slopes
-        Whether to compute derivatives: central differences of the computed orbits.
+    """Compute the residuals of all measured orbits and bifurcations for each row of unknowns, with `slopes` also their
+    derivatives.
     """
     parts = [_table_rows(problem, table, thetas, slopes) for table in problem.orbits]
     found = []

@@ -42,27 +42,11 @@ LEAST_SHARE = 0.01
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
     """Draw parameter sets from the Gaussian that the estimates and their covariance define, truncated to the bounds.
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification.
-    n
-        Number of draws.
-    seed
-        Seed; the same one gives the same draws.
+    Return ``value`` over (draw, parameter): all parameters of the model, identified, tied and fixed [SI], with the
+    attributes ``identified`` (names), ``digest``, ``seed``, and ``outside``: the share of draws that the bounds
+    rejected. The same seed gives the same draws.
 
-    Returns
-    -------
-    Dataset
-        ``value`` over (draw, parameter): all parameters of the model, identified, tied and fixed [SI]. Attributes
-        ``identified`` (names), ``digest``, ``seed``, and ``outside``: the share of draws that the bounds rejected.
-
-    Raises
-    ------
-    SpecError
-        For parameters that are not determined, and if almost all draws lie outside the bounds.
-    RefusedError
-        If the identification is not finished.
+    Raise `SpecError` for parameters that are not determined, and if almost all draws lie outside the bounds.
     """
     result = read_result(directory)
     names = _identified(result)
@@ -88,31 +72,11 @@ def sample_draws(
 ) -> xr.Dataset:
     """Draw parameter sets from the chain of an ensemble of walkers in the posterior density (affine-invariant MCMC).
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification. It keeps the chain; a stopped sampling goes on to the same bytes.
-    n
-        Number of draws, taken at random from the chain.
-    seed
-        Seed of the chain.
-    sampling
-        Walkers and steps.
-    echo
-        Function that prints a line.
+    The directory keeps the chain; a stopped sampling goes on to the same bytes. The `n` draws are taken at random from
+    it. Return a dataset as of `draw_posterior`, with convergence figures of each unknown: ``autocorrelation_time``,
+    ``n_effective`` and ``split_rhat``; attributes ``converged``, ``not_converged_because``, ``accepted`` and others.
 
-    Returns
-    -------
-    Dataset
-        As of `draw_posterior`, with convergence figures of each unknown: ``autocorrelation_time``, ``n_effective`` and
-        ``split_rhat``; attributes ``converged``, ``not_converged_because``, ``accepted`` and others.
-
-    Raises
-    ------
-    SpecError
-        As `draw_posterior`, if emcee is missing, or if a specification is needed.
-    RefusedError
-        If the identification is not finished, or the specification is that of another one.
+    Raise `SpecError` as `draw_posterior`, if emcee is missing, or if a specification is needed.
     """
     from pipeline.rig.identify.mcmc import figures_of, log_posterior, require_emcee, sample_posterior
 
@@ -147,10 +111,7 @@ def sample_draws(
 def kept_draws(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
     """Return draws of the chain that `sample_draws` has stored in the directory, or else draws of the Gaussian.
 
-    Raises
-    ------
-    SpecError
-        If there are fewer draws of the chain than asked for; see also `draw_posterior`.
+    Raise `SpecError` if there are fewer draws of the chain than asked for.
     """
     path = local_path(directory) / POSTERIOR
     if path.is_file():
@@ -284,23 +245,10 @@ def _chain_lines(drawn: xr.Dataset) -> list[str]:
 def bands(table: MeasuredTable, best: dict[str, float], drawn: xr.Dataset) -> xr.Dataset:
     """Compute amplitudes on the branches and values of the bifurcations for each draw of the posterior.
 
-    Each orbit and each bifurcation is carried from the best parameters to those of a draw by Newton's method, in
-    steps where this is necessary. No branch is computed again.
-
-    Parameters
-    ----------
-    table
-        Measured orbits: model, parameter and interval.
-    best
-        Values of all parameters at the best fit.
-    drawn
-        From `draw_posterior`.
-
-    Returns
-    -------
-    Dataset
-        ``bifurcation_value`` over (draw, bifurcation) with ``kind`` and ``best_value``, and ``amplitude`` over (draw,
-        orbit) with ``branch``, ``parameter_value``, ``n_unstable`` and ``best_amplitude``; NaN where a draw has none.
+    Each orbit and each bifurcation is carried from the best parameters to those of a draw by Newton's method, in steps
+    where this is necessary; no branch is computed again. Return ``bifurcation_value`` over (draw, bifurcation) with
+    ``kind`` and ``best_value``, and ``amplitude`` over (draw, orbit) with ``branch``, ``parameter_value``,
+    ``n_unstable`` and ``best_amplitude``; NaN where a draw has none.
     """
     branches, _ = table.branches(best)
     points, states, _ = bifurcation_data(branches)
@@ -387,33 +335,10 @@ def write_posterior(
     figures: bool = True,
     echo: Echo = print,
 ) -> tuple[Table, Table, list[Path]]:
-    """Draw the posterior, compute the 95 % bands of branches and bifurcations, and write both to the identification's
-    directory.
+    """Draw the posterior, compute the 95 % bands of branches and bifurcations, and write both to the directory.
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification.
-    n, seed
-        Number of draws, and their seed.
-    sampling
-        Options of the chain that gives the draws; None for draws of the Gaussian.
-    figures
-        Whether to draw.
-    echo
-        Function that prints a line.
-
-    Returns
-    -------
-    tuple of Table, Table, list of Path
-        Parameters, bifurcations, and the written files.
-
-    Raises
-    ------
-    SpecError, RefusedError
-        See `draw_posterior` and `sample_draws`.
-    InterruptedRunError
-        After Ctrl-C or SIGTERM. The chain stays.
+    A `sampling` of None gives draws of the Gaussian. Return tables of the parameters and of the bifurcations, and the
+    paths of the written files. After Ctrl-C or SIGTERM the chain stays.
     """
     folder = local_path(directory)
     result, found, written = read_result(folder), [], [folder / POSTERIOR]

@@ -47,33 +47,14 @@ def run_posterior(
     workers: int | None = None,
     echo: Echo = print,
 ) -> Path:
-    """Run a specification at the best estimates of an identification and at each draw of its posterior.
+    """Run a specification at the best estimates of an identification and at each draw of its posterior; return the
+    folder.
 
-    Parameters
-    ----------
-    spec
-        TOML file, or the name of a shipped workflow, of the identified model.
-    identification
-        Directory of a finished identification.
-    n, seed
-        Number of draws, and their seed.
-    out
-        Folder; by default ``runs/<name>-posterior``. It has an ordinary run directory for each draw, ``draw-0000``
-        and so on, and one at the best estimates, ``best``. A stopped command continues.
-    smoke, workers, echo
-        See `pipeline.runs.run.run`.
+    The folder, by default ``runs/<name>-posterior``, has an ordinary run directory for each draw, ``draw-0000`` and so
+    on, and one at the best estimates, ``best``. A stopped command continues.
 
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    SpecError
-        If the model is not the identified one, or the specification sweeps an identified parameter.
-    RefusedError
-        If the folder holds the runs of another specification or posterior.
+    Raise `SpecError` if the model is not the identified one, or the specification sweeps an identified parameter, and
+    `RefusedError` if the folder holds the runs of another specification or posterior.
     """
     path, result = find_spec(spec), read_result(identification)
     parsed, _, default = read_given(path, smoke=smoke)
@@ -139,25 +120,9 @@ def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, name
 def spread(folder: str | Path, *, branches: bool = False, attractors: bool = False, echo: Echo = print) -> Table:
     """Return median and 95 % interval of cell fractions and bifurcation values over the runs of `run_posterior`.
 
-    Parameters
-    ----------
-    folder
-        Folder of the runs.
-    branches
-        Whether to follow the branches of each run, and to collect their bifurcations. Results are kept in the runs.
-    echo
-        Function that prints a line.
-
-    Returns
-    -------
-    Table
-        A row for each status and orbit period with the ``fraction`` of cells, and for each bifurcation of the best run
-        with its ``value``: ``best``, ``median``, ``low`` and ``high`` (95 %), and ``n_draws`` that have it.
-
-    Raises
-    ------
-    RefusedError
-        If the folder holds no such runs.
+    The table has a row for each status and orbit period with the ``fraction`` of cells, and, with `branches`, for each
+    bifurcation of the best run with its ``value``; with `attractors`, also those of `attractor_rows`. ``n_draws`` is
+    the number of draws that have it.
     """
     folder = local_path(folder)
     if not (folder / STUDY).is_file():
@@ -257,22 +222,12 @@ Row = Callable[[str, str, float, np.ndarray, int], dict[str, Any]]
 
 
 def attractor_rows(runs: Sequence[xr.Dataset], row: Row) -> tuple[Rows, Rows]:
-    """Return rows on the attractors of all runs, and those of them that are printed.
+    """Return rows on the attractors of all runs, the best run first, and those of them that are printed.
 
-    Parameters
-    ----------
-    runs
-        Results of the analysis ``attractors``: the best run first, then those of the draws.
-    row
-        Function that makes a row.
-
-    Returns
-    -------
-    tuple of list
-        For each attractor the ``share`` of all cells, and at each parameter point the share of its cells and the mean
-        of the section points in each state, over the draws that have it there; angles about their circular mean. Shares
-        of draws without it are 0. With more than `FEW_POINTS` parameter points only the shares of all cells are
-        printed.
+    For each attractor there is the ``share`` of all cells, and at each parameter point the share of its cells and the
+    mean of the section points in each state, over the draws that have it there; angles about their circular mean.
+    Shares of draws without it are 0. With more than `FEW_POINTS` parameter points only the shares of all cells are
+    printed.
     """
     ids = match_across(runs)
     runs = [dense(run, points=True) for run in runs]

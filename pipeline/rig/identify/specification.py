@@ -428,24 +428,14 @@ _KEYS = (
 
 
 def load_identification(path: str | Path) -> IdentificationSpec:
-    """Read and validate the TOML file that specifies an identification.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once; also if the file cannot be read or is not TOML.
-    """
+    """Read and validate the TOML file of an identification; raise `SpecError` with all problems at once."""
     path = Path(path)
     return parse_identification(read_toml(path), path.parent)
 
 
 def parse_identification(data: Mapping[str, Any], folder: Path) -> IdentificationSpec:
-    """Validate the TOML tables of an identification; file paths in them are relative to `folder`.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
+    """Validate the TOML tables of an identification, with paths relative to `folder`; raise `SpecError` with all
+    problems at once.
     """
     kind = data.get("kind")
     if kind in ("sweep", "continuation"):

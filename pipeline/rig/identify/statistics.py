@@ -113,21 +113,11 @@ class Covariance:
 
 
 def eliminate_starts(jacobian: np.ndarray, n_free: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the initial states from a least-squares problem; return the information matrix of the parameters.
+    """Eliminate the initial states from a least-squares problem whose Jacobian has the parameters' columns first.
 
-    Parameters
-    ----------
-    jacobian
-        (m, n_free + n_starts), the parameters' columns first.
-    n_free
-        Number of parameters.
-
-    Returns
-    -------
-    information : ndarray (n_free, n_free)
-        Schur complement of the starts' block of ``jacobian.T @ jacobian``.
-    following : ndarray (n_starts, n_free)
-        The matrix X of the module: minus the derivative of the starts' optimum by the parameters.
+    Return the information matrix of the parameters, the Schur complement of the starts' block of ``jacobian.T @
+    jacobian``, and the matrix X of the module, (n_starts, n_free): minus the derivative of the starts' optimum by the
+    parameters.
     """
     own, starts = jacobian[:, :n_free], jacobian[:, n_free:]
     # lstsq does not square the condition number, and gives 0 for undetermined starts
@@ -142,22 +132,10 @@ def pooled_autocorrelation(residuals: Sequence[np.ndarray], most: int) -> np.nda
 
 
 def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the autocorrelation (mean not subtracted) of one channel's residuals, and the number of pairs of
-    residuals, at each lag.
+    """Return the autocorrelation (mean not subtracted) of one channel's residuals by piece, and the number of pairs, at
+    each lag.
 
-    Parameters
-    ----------
-    residuals
-        Residuals of each piece, (n,); NaN where nothing was measured.
-    most
-        Largest lag.
-
-    Returns
-    -------
-    autocorrelation : ndarray (most + 1,)
-        At lags 0, 1, ...; NaN where no piece is long enough.
-    pairs : ndarray (most + 1,)
-        Number of pairs of residuals at each lag.
+    The lags are 0 to `most`; the autocorrelation is NaN where no piece is long enough.
     """
     products, pairs = np.zeros(most + 1), np.zeros(most + 1)
     for r in residuals:
@@ -173,12 +151,8 @@ def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray
 
 
 def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
-    """Return whether any channel's residuals are autocorrelated, by a Ljung-Box test over all pieces.
-
-    Parameters
-    ----------
-    residuals
-        Residuals of each piece, (n, n_channels).
+    """Return whether any channel's residuals, (n, n_channels) by piece, are autocorrelated: a Ljung-Box test over all
+    pieces.
     """
     n_channels = residuals[0].shape[1]
     shortest = min(len(r) for r in residuals)
@@ -193,22 +167,11 @@ def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
 
 
 def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
-    """Return the lag at which the residuals have lost their correlation, and the number of residuals that count as one
-    independent residual.
+    """Return the lag at which `n` residuals have lost their correlation, and the number of residuals per independent
+    one.
 
-    Parameters
-    ----------
-    rho
-        Autocorrelation at lags 0, 1, ...
-    n
-        Number of residuals.
-
-    Returns
-    -------
-    lag : int
-        First lag from which on the autocorrelation stays within the band of white noise for a while.
-    factor : float
-        ``1 + 2 sum rho`` up to that lag, at least 1: number of residuals per independent one.
+    From the lag on, the autocorrelation stays within the band of white noise for a while; the number is ``1 + 2 sum
+    rho`` up to it, at least 1.
     """
     band = stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(max(n, 1))
     outside = np.abs(np.nan_to_num(rho)) > 2.0 * band
@@ -233,14 +196,8 @@ def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
 
 
 def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return weight and curvature of each residual for a robust loss of `scipy.optimize.least_squares`.
-
-    Returns
-    -------
-    weight : ndarray
-        Derivative of half the loss, divided by the residual.
-    slope : ndarray
-        Second derivative of half the loss, at least 0.
+    """Return, for a robust loss of `scipy.optimize.least_squares`, the derivative of half the loss divided by the
+    residual, and the second derivative of half the loss, at least 0.
     """
     z = residuals**2
     if loss == "linear":
@@ -281,19 +238,8 @@ def _scores(fit: Linearised) -> _Scores:
 def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | None = None) -> Covariance:
     """Estimate the covariance of the fitted parameters, with allowance for autocorrelated residuals.
 
-    Parameters
-    ----------
-    fit
-        The fit near its optimum.
-    scale
-        (n_free,) size of each parameter, to detect singular directions.
-    estimator
-        Method; by default chosen by the residuals, see the module.
-
-    Returns
-    -------
-    Covariance
-        Covariance with its method and critical value.
+    `scale` is the size of each parameter, (n_free,), to detect singular directions. By default the residuals choose the
+    estimator, see the module.
     """
     if not fit.residuals:
         return _of_orbits(fit, scale)

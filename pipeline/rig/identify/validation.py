@@ -29,32 +29,13 @@ from pipeline.specification.problems import SpecError
 def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dict[str, Any]:
     """Test a finished identification on another recording; return the residuals' rms and the correlation by channel.
 
-    The file's pieces stay whole, and each has a free start. Every sample counts. The criterion is least
-    squares, whatever the loss of the fit. Sensors' zeros keep their identified values.
+    The file's pieces stay whole, and each has a free start. Every sample counts. The criterion is least squares,
+    whatever the loss of the fit. The mapping, drive and zeros are those of the fitted recording with the index `like`.
+    Return ``rms`` [SI] and ``correlation`` by channel, ``pieces`` with the rms of each, ``units`` by channel, ``file``,
+    ``sha256`` and ``directory``.
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification.
-    recording
-        A file with the same channels as one of the fitted recordings.
-    like
-        Index of that recording; its mapping, drive and zeros are used.
-
-    Returns
-    -------
-    dict
-        ``rms`` [SI] and ``correlation`` by channel, ``pieces`` with the rms of each, ``units`` by channel,
-        ``file``, ``sha256`` and ``directory``.
-
-    Raises
-    ------
-    SpecError
-        If the recording cannot be read through the mapping, or its pieces are too short.
-    RefusedError
-        If the identification is not finished.
-    NotConvergedError
-        If the starts could not be fitted.
+    Raise `SpecError` if the recording cannot be read through the mapping, or its pieces are too short, and
+    `NotConvergedError` if the starts could not be fitted.
     """
     info, result = read_info(directory), read_result(directory)
     if not result["recordings"]:
@@ -125,25 +106,9 @@ def is_table(path: str | Path) -> bool:
 def check_orbits(directory: str | Path, table: str | Path) -> dict[str, Any]:
     """Compare the orbits of a measured table with the branches of an identified model.
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification.
-    table
-        CSV table of orbits, or a specification with ``[measured.branch]``; see `read_branch`. Section, drive frequency
-        and state are those of the identification's first table ``[[orbits]]``, unless the file has its own.
-
-    Returns
-    -------
-    dict
-        ``orbits``, ``rms`` and ``parameter`` as in ``result.json``; ``file`` and ``directory``.
-
-    Raises
-    ------
-    SpecError
-        If the table cannot be read, or no section is known for a model without a drive.
-    RefusedError
-        If the identification is not finished.
+    The table is a CSV file of orbits, or a specification with ``[measured.branch]``; see `read_branch`. Section, drive
+    frequency and state are those of the identification's first table ``[[orbits]]``, unless the file has its own.
+    Return ``orbits``, ``rms`` and ``parameter`` as in ``result.json``; ``file`` and ``directory``.
     """
     info, result = read_info(directory), read_result(directory)
     spec, own = _stored(info.identity["spec"], result), _table(info.identity["spec"], Path(table))
@@ -187,29 +152,15 @@ def _table(spec: dict[str, Any], path: Path) -> OrbitsTable:
 
 
 def compare(directories: Sequence[str | Path]) -> Table:
-    """Compare finished identifications in a table, sorted by their residuals on held-out pieces.
+    """Compare finished identifications in a table, sorted by their residuals on held-out pieces, else held-out orbits,
+    else by the fit.
 
-    Parameters
-    ----------
-    directories
-        Directories of identifications of the same recordings, with the same pieces held out.
+    ``fit`` and ``held_out`` are the root mean squares over all channels of fitted and of held-out pieces, each channel
+    in units of its noise in the first identification, and ``fit_NAME`` and ``held_out_NAME`` those of each channel
+    [SI]. ``orbits_fit`` and ``orbits_held_out`` are the root mean squares of the amplitudes' relative errors of
+    measured orbits. Values that do not exist are NaN.
 
-    Returns
-    -------
-    Table
-        A row for each identification: directory, title and number of unknowns. ``fit`` and ``held_out`` are
-        the root mean squares over all channels of fitted and of held-out pieces, each channel in units of its
-        noise in the first identification. ``fit_NAME`` and ``held_out_NAME`` are those of each channel [SI].
-        ``orbits_fit`` and ``orbits_held_out`` are the root mean squares of the amplitudes' relative errors of measured
-        orbits. Rows are sorted by held-out pieces, else held-out orbits, else by the fit; without one of these its
-        values are NaN.
-
-    Raises
-    ------
-    SpecError
-        If recordings, channels or held-out pieces differ, since residuals cannot be compared then.
-    RefusedError
-        If one is not finished.
+    Raise `SpecError` if recordings, channels or held-out pieces differ, since residuals cannot be compared then.
     """
     found = [(Path(d), read_info(d), read_result(d)) for d in directories]
     _require_alike(found)

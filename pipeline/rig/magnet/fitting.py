@@ -67,19 +67,8 @@ def solve(
     """Solve a nonlinear least-squares problem by the Levenberg-Marquardt method, with tolerances at the level of
     rounding errors.
 
-    Parameters
-    ----------
-    residuals, slopes
-        Measured minus computed (n,), and its derivatives (n, n_free).
-    start
-        First guess.
-    what
-        Name of the fit, for error messages.
-
-    Raises
-    ------
-    ArithmeticError
-        If it does not converge, or the readings do not determine all free parameters.
+    `slopes` are the derivatives of the residuals, (n, n_free); `what` names the fit in messages. Raise
+    `ArithmeticError` if it does not converge, or the readings do not determine all free parameters.
     """
     with np.errstate(all="ignore"):
         found = least_squares(
@@ -120,24 +109,12 @@ def _inverse(jacobian: np.ndarray) -> np.ndarray:
 
 
 def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the standard errors of fitted parameters by a jackknife over clusters of readings. Residuals may be
-    correlated within a cluster.
+    """Return the standard errors of fitted parameters by a jackknife over clusters of rows, within which residuals may
+    correlate.
 
-    This is the jackknife over clusters about the fit to all readings (CR3): each cluster is left out in turn,
-    to first order. Unlike the plain sandwich, its errors are not too small with few clusters: MacKinnon,
-    Nielsen & Webb, J. Econometrics 232 (2023) 272-299.
-
-    Parameters
-    ----------
-    found
-        Solution of the fit.
-    clusters
-        Rows of each cluster; every row belongs to one cluster.
-
-    Returns
-    -------
-    ndarray
-        One error for each parameter; all NaN if one cluster alone determines some of them.
+    This is the jackknife over clusters about the fit to all readings (CR3): each cluster is left out in turn, to first
+    order. Unlike the plain sandwich, its errors are not too small with few clusters: MacKinnon, Nielsen & Webb, J.
+    Econometrics 232 (2023) 272-299. All are NaN if one cluster alone determines some parameter.
     """
     normal = _inverse(found.jacobian)
     squares = np.zeros(len(found.x))
@@ -215,19 +192,9 @@ class DipoleFit:
 
 
 def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
-    """Fit a Gaussian bump (Wojna et al. 2018, Eq. 17) to one torque curve.
+    """Fit a Gaussian bump (Wojna et al. 2018, Eq. 17) to the readings [rad], [N m] of one torque curve.
 
-    Parameters
-    ----------
-    angle, torque
-        Readings of the curve [rad], [N m].
-    curve
-        Side and locked angle of the curve.
-
-    Raises
-    ------
-    ArithmeticError
-        If the fit does not converge, or finds no peak among the readings.
+    Raise `ArithmeticError` if the fit does not converge, or finds no peak among the readings.
     """
     what = f"curve {curve}"
     peak = int(np.argmax(torque if curve.side == 0 else -torque))
@@ -250,13 +217,7 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
 
 
 def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
-    """Fit a bump to each torque curve separately.
-
-    Raises
-    ------
-    ArithmeticError
-        If a fit fails; the message names all such curves.
-    """
+    """Fit a bump to each torque curve separately; raise `ArithmeticError` with all curves whose fits fail."""
     found, problems = [], []
     for curve in measured.curves:
         try:
@@ -272,15 +233,10 @@ def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
 
 
 def fit_laws(curves: Sequence[CurveFit]) -> Laws:
-    """Fit the bumps' height by a Gaussian, their position by a line and their width by a constant, as functions of the
-    locked angle (Wojna et al. 2018, Eq. 18).
+    """Fit the bumps' height by a Gaussian, their position by a line and their width by a constant, over the locked
+    angle (Wojna et al. 2018, Eq. 18).
 
     Each value is weighted by its standard error. The laws' own errors come from the scatter about them.
-
-    Raises
-    ------
-    ArithmeticError
-        If the Gaussian does not converge.
     """
     values: dict[str, float] = {}
     errors: dict[str, float] = {}
@@ -341,21 +297,10 @@ def _constant(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
 
 
 def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping[str, float] | None = None) -> JointFit:
-    """Fit the law of the torque (Wojna et al. 2018, Eq. 18-19) to all readings at once.
+    """Fit the law of the torque (Wojna et al. 2018, Eq. 18-19) to all readings at once, with the parameters of `hold`
+    kept.
 
-    Parameters
-    ----------
-    measured
-        The readings.
-    start
-        First guess by name; several first guesses of the steepness are tried.
-    hold
-        Values of parameters that are not fitted, by name.
-
-    Raises
-    ------
-    ArithmeticError
-        If no first guess leads to a result.
+    Several first guesses of the steepness are tried besides `start`. Raise `ArithmeticError` if none leads to a result.
     """
     held = dict(hold or {})
     free = tuple(name for name in laws.FITTED if name not in held)
@@ -441,15 +386,11 @@ def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
 
 
 def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
-    """Fit the strength of two point dipoles (Wojna et al. 2018, Eq. 16). With `place`, fit the position of the fixed
+    """Fit the strength of two point dipoles (Wojna et al. 2018, Eq. 16), and with `place` the position of the fixed
     dipole as well.
 
-    The torque is linear in the strength. The place is sought below the end of the stretched pendulum.
-
-    Raises
-    ------
-    ArithmeticError
-        If no strength of repelling dipoles fits the readings.
+    The torque is linear in the strength. The place is sought below the end of the stretched pendulum. Raise
+    `ArithmeticError` if no strength of repelling dipoles fits.
     """
     p: dict[str, Any] = {**measured.parameters, "pole1": 1.0, "pole2": 1.0}
 

@@ -201,29 +201,15 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
 
 
 def find_measurement(name: str | Path) -> Path:
-    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package.
-
-    Raises
-    ------
-    SpecError
-        If there is neither.
-    """
+    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package."""
     return find_file("measurement", name, {path.stem: path for path in shipped_files("magnet/*.toml")})
 
 
 def read_measurement(path: str | Path) -> Measurement:
     """Read a measurement: its TOML header and its table of readings, corrected and in SI units.
 
-    Parameters
-    ----------
-    path
-        Path of the header; see `find_measurement`.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once: unknown or missing keys and columns, fields that are not numbers, angles
-        out of range, curves with too few readings, sides with too few curves.
+    Raise `SpecError` with all problems at once: unknown or missing keys and columns, fields that are not numbers,
+    angles out of range, curves with too few readings, sides with too few curves.
     """
     path = Path(path)
     header = validated(Header, read_toml(path))

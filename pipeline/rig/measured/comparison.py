@@ -42,19 +42,8 @@ _DRAWS = 8
 
 
 def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
-    """Return the Wasserstein-1 distance between two sets of section points with equal weights.
-
-    Parameters
-    ----------
-    a, b
-        Points, shapes (m, state) and (n, state). Every point of a set has the same weight.
-    geometry
-        Scales and circles of the states.
-
-    Returns
-    -------
-    float
-        Distance in units of the scales.
+    """Return the Wasserstein-1 distance between two sets of equally weighted points, (m, state) and (n, state), in
+    units of the scales.
     """
     ways = geometry.distance(a[:, None], b[None])
     if len(a) != len(b):
@@ -154,17 +143,8 @@ def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> floa
 def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
     """Return the mean Wasserstein-1 distance between an attractor and the two halves of the measured section points.
 
-    Parameters
-    ----------
-    candidate
-        The attractor. For each half, as many of its points are drawn, and the noise of the sections is added.
-        The distance from a correct model then equals that between the halves.
-    cloud
-        The recording's sections.
-    geometry
-        Scales and circles of the states.
-    rng
-        Generator of the samples.
+    For each half, as many points of the attractor are drawn, and the noise of the sections is added. The distance from
+    a correct model then equals that between the halves.
     """
     parts, blur = cloud.halves(), np.median(cloud.noise, axis=0)
     ways = []
@@ -265,14 +245,7 @@ def windows_of(measured: xr.Dataset) -> list[Window]:
 def window_edges(measured: xr.Dataset, winners: np.ndarray, computed: Computed) -> list[WindowEdge]:
     """Return the ends of the measured windows, each with the frequency at which the same regime ends in the model.
 
-    Parameters
-    ----------
-    measured
-        Result of `pipeline.rig.measured.diagram.measure`, with sides if the model has a classifier.
-    winners
-        Id of the nearest attractor of each step, -1 for none.
-    computed
-        Attractors of the model.
+    `winners` are the ids of each step's nearest attractor, -1 for none.
     """
     windows = windows_of(measured)
     found = []
@@ -350,36 +323,17 @@ NOBODY = -1
 def compare(
     measured: xr.Dataset, run: AnalysedRun, *, at: Mapping[str, float] | None = None, seed: int = 0
 ) -> xr.Dataset:
-    """Compare a measured bifurcation diagram with the attractors of a computed run.
+    """Compare a measured bifurcation diagram with the attractors of a run of the same model over the drive frequency.
 
-    Parameters
-    ----------
-    measured
-        Result of `pipeline.rig.measured.diagram.measure`.
-    run
-        Run of the same model, with the drive frequency as an axis.
-    at
-        Values of the run's other axes.
-    seed
-        Seed of the samples drawn from sets that do not close.
+    Return `measured` with further variables. By step: ``noise_floor``, Wasserstein-1 between the halves of the step's
+    sections; ``winner``, id of the nearest attractor, -1 outside the run's axis; ``distance`` from it and ``runner_up``
+    from the next (NaN if there is no other), in units of the states' scales; ``distance_in_noise``, the distance in
+    units of the floor; ``computed_period`` (0: a set that does not close) and ``computed_side`` of the winner;
+    ``same_period`` and ``same_side``: 1 if they agree, 0 if not, -1 if unknown. By step and attractor: ``distances``.
+    By window edge: the fields of `WindowEdge` after ``edge_``.
 
-    Returns
-    -------
-    Dataset
-        `measured` with further variables. By step: ``noise_floor``, Wasserstein-1 between the halves of the
-        step's sections; ``winner``, id of the nearest attractor, -1 outside the run's axis; ``distance`` from
-        it and ``runner_up`` from the next (NaN if there is no other), in units of the states' scales;
-        ``distance_in_noise``, the distance in units of the floor; ``computed_period`` (0: a set that does not
-        close) and ``computed_side`` of the winner; ``same_period`` and ``same_side``: 1 if they agree, 0 if
-        not, -1 if unknown. By step and attractor: ``distances``. By window edge, dim ``edge``:
-        ``edge_measured_hz``, ``edge_measured_error_hz``, ``edge_computed_hz``, ``edge_computed_error_hz``,
-        ``edge_shift_hz``, ``edge_shift_error_hz``, ``edge_direction``, ``edge_before_period``,
-        ``edge_before_side``, ``edge_after_period``, ``edge_after_side``, ``edge_note``.
-
-    Raises
-    ------
-    SpecError
-        If the run is of another model, has no frequency axis, or reaches none of the measured frequencies.
+    Raise `SpecError` if the run is of another model, has no frequency axis, or reaches none of the measured
+    frequencies.
     """
     computed = Computed.of(run, model_of(measured), at)
     return compare_with(with_sides(measured, computed.parameters), computed, seed=seed)

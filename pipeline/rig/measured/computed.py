@@ -26,13 +26,9 @@ Floats = npt.NDArray[np.float64]
 def cube_and_parameters(
     run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
-    """Return a run's result cube over the drive frequency, with one value chosen on every other axis, and the model's
-    parameters at the chosen values.
+    """Return a run's cube over the drive frequency, at one value of every other axis, and the parameters there.
 
-    Raises
-    ------
-    SpecError
-        If the run is of another model, sweeps no frequency, or has another axis with several values.
+    Raise `SpecError` if the run is of another model, sweeps no frequency, or has another axis with several values.
     """
     where = run.name
     model = load_model(model)
@@ -83,12 +79,8 @@ class Computed:
 
     @classmethod
     def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
-        """Read a run and its attractors. Compute the attractors if no stored result exists.
-
-        Raises
-        ------
-        SpecError
-            If the run is of another model, sweeps no frequency, or has another axis with several values.
+        """Read a run and its attractors; compute these if no stored result exists. See `cube_and_parameters` for
+        errors.
         """
         cube, parameters = cube_and_parameters(run, model, at)
         with refused(run.name):

@@ -59,26 +59,11 @@ class Regime:
 def find_period(
     points: Floats, noise: Floats, *, limit: float = LIMIT, max_period: int = MAX_PERIOD, seed: int = 0
 ) -> Regime:
-    """Estimate the period of a motion from its noisy section points.
+    """Estimate the period of a motion from consecutive noisy section points, (n, component), angles not wrapped.
 
-    Parameters
-    ----------
-    points
-        Consecutive sections, shape (n, component), angles not wrapped. A full turn per period is a trend,
-        which cancels in second differences.
-    noise
-        Standard deviation of each section, same shape, above 0.
-    limit
-        Largest closure of a closed motion, in units of noise.
-    max_period
-        Longest tested period; a period k needs 2 k + 6 sections.
-    seed
-        Seed of the resampling.
-
-    Returns
-    -------
-    Regime
-        With fewer than 8 sections, period 0 with confidence 0.
+    A full turn per period is a trend, which cancels in second differences. `limit` is the largest closure of a closed
+    motion, in units of noise. A period k needs 2 k + 6 sections; with fewer than 8 sections, the period is 0 with
+    confidence 0.
     """
     n = len(points)
     periods = [k for k in range(1, max_period + 1) if n - 2 * k >= _LEAST]
@@ -172,35 +157,18 @@ class _Step:
 def measure(
     recordings: Sequence[xr.Dataset], options: SweepOptions | None = None, *, parameters: Parameters | None = None
 ) -> xr.Dataset:
-    """Return section points, period and class of motion at each frequency step of one or more recorded sweeps.
+    """Return section points, period and class of motion at each frequency step of one or more recorded sweeps of one
+    model.
 
-    Parameters
-    ----------
-    recordings
-        Recordings from `pipeline.rig.recordings.read_recording`, all of one model, each with a drive.
-    options
-        How they are cut, sectioned and judged.
-    parameters
-        Parameters of the model, which its classifier needs; without them motions are not classified. The
-        model's forcing gives the phase of the sections in the drive period.
+    Without `parameters`, motions are not classified. The dims are ``step``, ``period_index`` (NaN beyond a step's own)
+    and ``state``. ``section`` and ``section_noise`` (step, period_index, state) have angles not wrapped; by step there
+    are ``frequency_error_hz``, ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (shared by all
+    its sections: it shifts angles by their rates and is not included in ``section_noise``), ``n_sections``, the fields
+    of `Regime`, and ``side`` (codes of the model's classifier). Coordinates of ``step``: ``frequency`` [Hz],
+    ``direction`` (up, down, none), ``recording``, ``start_s``, ``end_s``.
 
-    Returns
-    -------
-    Dataset
-        Dims ``step``, ``period_index`` (NaN beyond a step's own), ``state``. ``section`` and
-        ``section_noise`` (step, period_index, state), angles not wrapped; by step ``frequency_error_hz``,
-        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (shared by all its
-        sections: it shifts angles by their rates and is not included in ``section_noise``), ``n_sections``,
-        ``orbit_period`` (0: does not close at any tested period), ``confidence``, ``closure``, ``margin``
-        (`regimes.Regime`), ``side`` (codes of the model's classifier; absent without one or without
-        parameters). Coordinates of ``step``: ``frequency`` [Hz], ``direction`` (up, down, none),
-        ``recording``, ``start_s``, ``end_s``.
-
-    Raises
-    ------
-    SpecError
-        For recordings of different models or states, without a drive, without a stretch of one frequency or
-        without sections.
+    Raise `SpecError` for recordings of different models or states, without a drive, without a stretch of one frequency
+    or without sections.
     """
     options = options or SweepOptions()
     models = sorted({model_of(r) for r in recordings}, key=lambda model: model.name)

@@ -48,32 +48,10 @@ def plot_measured(
 ) -> style.DataFigure:
     """Draw measured section points over the drive frequency: alone, or beside or over a computed diagram.
 
-    Parameters
-    ----------
-    measured
-        Result of `pipeline.rig.measured.diagram.measure`.
-    cube
-        Cube of a run of the same model, with one value on every axis but the frequency.
-    state
-        Name of the state; by default the first that is measured.
-    degrees
-        Whether to use degrees instead of radians.
-    layout
-        ``side``: measured left, computed right. ``over``: measured points as open triangles over the computed
-        points; the triangles show the direction of the sweep.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Both diagrams share their axes. Its `data` hold the measured points (dims ``step``, ``period_index``)
-        and, under names that end in ``_diagram``, the computed ones.
-
-    Raises
-    ------
-    ValueError
-        For an unknown layout, or a state that was not measured.
+    `cube` has one value on every axis but the frequency. With the layout ``side``, measured points are left and
+    computed ones right, on the same axes; with ``over``, measured points are open triangles, which show the direction
+    of the sweep. The data hold the measured points (dims ``step``, ``period_index``) and, under names that end in
+    ``_diagram``, the computed ones. Raise `ValueError` for an unknown layout, or a state that was not measured.
     """
     style.check_choice("layout", layout, LAYOUTS)
     names = [str(n) for n in measured["state"].values]
@@ -203,35 +181,13 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
 def plot_comparison(
     compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw three panels: measured points over the computed attractors, distances in units of the noise floor, and
-    periods and classes of motion of rig and model.
+    """Draw measured points over the computed attractors, distances in noise floors, and periods and classes of rig and
+    model.
 
-    Parameters
-    ----------
-    compared
-        Result of `pipeline.rig.measured.comparison.compare`.
-    computed
-        Attractors that it was compared with.
-    state
-        Name of the state; by default the first that is measured.
-    degrees
-        Whether to use degrees instead of radians.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Three panels over one frequency axis. Top: the attractors, coloured if they are nearest at some step,
-        with the measured sections as open triangles. Middle: the distance from the nearest attractor in units
-        of the noise floor, in its colour; triangles show the direction of the sweep. Bottom: strips of the
-        regimes of rig and model, coloured by side, with their periods (a cross: unclosed). Its `data` are
-        `compared`.
-
-    Raises
-    ------
-    ValueError
-        For a state that was not measured.
+    Top: the attractors, coloured if they are nearest at some step, with the measured sections as open triangles.
+    Middle: the distance from the nearest attractor in units of the noise floor, in its colour; triangles show the
+    direction of the sweep. Bottom: strips of the regimes of rig and model, coloured by side, with their periods (a
+    cross: unclosed). Raise `ValueError` for a state that was not measured.
     """
     names = [str(n) for n in compared["state"].values]
     state = state or names[0]
@@ -411,25 +367,8 @@ SUFFIX = "_computed"
 def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw measured and computed time series from `pipeline.rig.measured.series.series_of`, and their phase portraits.
 
-    Parameters
-    ----------
-    ds
-        States and, with the suffix ``_computed``, those of the model, over ``time`` [s].
-    degrees
-        Whether to use degrees instead of radians.
-    frame
-        Width of the figure, and the range of time.
-
-    Returns
-    -------
-    DataFigure
-        A panel for each state with the root mean square of the difference, and one for each phase portrait.
-        Its `data` are `ds`.
-
-    Raises
-    ------
-    ValueError
-        If degrees are asked for without an angle.
+    Each state has a panel with the root mean square of the difference. Raise `ValueError` if degrees are asked for
+    without an angle.
     """
     model = model_of(ds)
     labels.some_angle(model, degrees, "series")
@@ -519,24 +458,10 @@ def write_comparison(
     degrees: bool = False,
     frame: Frame = WIDE,
 ) -> list[Path]:
-    """Write the figures and tables of the comparison of a measured with a computed diagram; return their paths.
+    """Write the figures and tables of a comparison into a folder, which is made if necessary; return their paths.
 
-    Parameters
-    ----------
-    compared
-        Result of `pipeline.rig.measured.comparison.compare_with`.
-    computed
-        Attractors that it was compared with.
-    folder
-        Folder, which is made if necessary; files of an earlier comparison are replaced.
-    state, degrees, frame
-        Options of the figures.
-
-    Returns
-    -------
-    list of Path
-        ``comparison``, ``beside`` and ``over`` as ``.png`` with their data as ``.nc``, ``steps.csv`` and
-        ``edges.csv``.
+    They are ``comparison``, ``beside`` and ``over`` as ``.png`` with their data as ``.nc``, ``steps.csv`` and
+    ``edges.csv``.
     """
     figures = {
         "comparison": plot_comparison(compared, computed, state=state, degrees=degrees, frame=frame),

@@ -43,11 +43,6 @@ class Channel:
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
     """Return the measured states of a recording. The slope of a state gives its rate if the rate itself is not
     measured.
-
-    Raises
-    ------
-    SpecError
-        If it holds none of the model's states.
     """
     names = model.state_names
 
@@ -72,30 +67,14 @@ def name_of(recording: xr.Dataset) -> str:
 def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER) -> xr.Dataset:
     """Return the states at the rising edges of the drive, from local polynomials with a kink at the edge.
 
-    Parameters
-    ----------
-    recording
-        Recording from `pipeline.rig.recordings.read_recording`; its attribute ``model`` names the states.
-    edges
-        Edges of its drive; windows end at neighbouring edges.
-    window_s
-        Width of the window about an edge [s]. Long windows average noise, short ones follow the motion.
-    order
-        Order of the polynomial on either side, at least 2.
+    Long windows `window_s` [s] average noise, short ones follow the motion; they end at neighbouring edges. The dims
+    are ``edge`` and ``state`` (the known ones). ``section``: states in the units of the model, angles not wrapped;
+    ``section_noise``: their standard deviation from the channels' noise; ``kink``: jump of the state's derivative at
+    the edge, NaN if unknown. The coordinate ``time`` is that of the edge [s]. An edge with too few samples on a side
+    (at a gap or an end) is left out. The attribute ``noise`` holds the noise of a sample by channel, from the
+    residuals, as JSON.
 
-    Returns
-    -------
-    Dataset
-        Dims ``edge``, ``state`` (the known ones). ``section`` (edge, state): states in the units of the
-        model, angles not wrapped; ``section_noise`` (edge, state): their standard deviation from the
-        channels' noise; ``kink`` (edge, state): jump of the state's derivative at the edge, NaN if unknown.
-        Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (at a gap or an end) is left
-        out. The attribute ``noise`` holds the noise of a sample by channel, from the residuals, as JSON.
-
-    Raises
-    ------
-    SpecError
-        If no state is measured, the window is too short for the sampling rate, or no edge has a window.
+    Raise `SpecError` if no state is measured, the window is too short for the sampling rate, or no edge has a window.
     """
     model = model_of(recording)
     channels = channels_of(recording, model)
@@ -232,19 +211,10 @@ _SNAP = 2e-3
 
 
 def section_phase(parameters: Parameters, frequency_hz: float) -> float:
-    """Return the phase of the model's stroboscopic section after the drive's rising edge, as a fraction of the period.
+    """Return the phase of the model's stroboscopic section after the drive's rising edge, a fraction of the period in
+    [0, 1).
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the model, for its forcing.
-    frequency_hz
-        Drive frequency [Hz].
-
-    Returns
-    -------
-    float
-        In [0, 1): 0 for sections at the rising edge, 0.25 at the maximum of a sine. Also 0 without a drive.
+    It is 0 for sections at the rising edge and without a drive, 0.25 at the maximum of a sine.
     """
     from magpend_core.pointwise import drive_level
 

@@ -54,28 +54,13 @@ class Stretch:
 
 
 def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) -> list[Stretch]:
-    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows.
+    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows, in the order
+    of time.
 
-    Parameters
-    ----------
-    edges
-        Edges of a recording.
-    transient
-        Periods that are dropped at the beginning of each constant stretch.
-    window
-        Periods of a window of a slow sweep; none are dropped. 0 never cuts into windows. By default windows
-        of 40 periods are used if stretches have only a few periods, or if most of them are curved the same
-        way.
-
-    Returns
-    -------
-    list of Stretch
-        Stretches in the order of time, each with at least 8 periods without the transient.
-
-    Raises
-    ------
-    SpecError
-        If a number is out of bounds, or nothing long enough is left.
+    The `transient` is dropped at the beginning of each constant stretch; a stretch keeps at least 8 periods. A `window`
+    of 0 never cuts into windows. By default windows of 40 periods are used if stretches have only a few periods, or if
+    most of them are curved the same way. Raise `SpecError` if a number is out of bounds, or nothing long enough is
+    left.
     """
     problems = []
     if transient < 0:

@@ -17,30 +17,12 @@ REST = 1e-3
 
 
 def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> xr.Dataset:
-    """Find the computed orbit nearest to each measured one. The computed orbit must have the measured stability, if
-    that is known.
+    """Find the computed orbit nearest to each measured one. It must have the measured stability, if that is known.
 
-    Parameters
-    ----------
-    measured
-        From `pipeline.rig.measured_branch.reading.read_branch`.
-    branches
-        Result of the analysis ``branches`` along the same parameter.
-    computed
-        From `amplitudes`.
-
-    Returns
-    -------
-    Dataset
-        `measured` with ``computed_amplitude``, ``computed_frequency``, ``relative_error`` of the amplitude and
-        ``frequency_error`` (computed over measured, less 1), ``distance`` (difference of the amplitudes in
-        units of their scatter, NaN without one), and ``branch``, -1 where no computed orbit has the parameter's
-        value and the stability.
-
-    Raises
-    ------
-    SpecError
-        If the branches were followed along another parameter.
+    `branches` is the result of the analysis ``branches`` along the same parameter, `computed` that of `amplitudes`.
+    Return `measured` with ``computed_amplitude``, ``computed_frequency``, ``relative_error`` of the amplitude and
+    ``frequency_error`` (computed over measured, less 1), ``distance`` (difference of the amplitudes in units of their
+    scatter, NaN without one), and ``branch``, -1 where no computed orbit has the parameter's value and the stability.
     """
     if str(branches.attrs["parameter"]) != str(measured.attrs["parameter"]):
         raise SpecError(
@@ -82,24 +64,9 @@ def nearest_orbit(
 ) -> tuple[int, int, float] | None:
     """Find the computed orbit at a value of the parameter whose amplitude is nearest to a given one.
 
-    Parameters
-    ----------
-    branches, computed
-        Result of the analysis ``branches``, and the amplitudes of its orbits.
-    value
-        Value of the parameter.
-    stability
-        Code of `STABILITIES`; only orbits of that stability count, unless it is unknown.
-    amplitude
-        Amplitude to be near to.
-    period
-        Only orbits of this period count; 0 for all.
-
-    Returns
-    -------
-    tuple of int, int, float, or None
-        Branch, index of the point before the value, and the share of the way to the next point; None without such
-        an orbit.
+    Only orbits of the `stability` (a code of `STABILITIES`) count, unless it is unknown, and only those of the
+    `period`, unless it is 0. Return branch, index of the point before the value, and the share of the way to the next
+    point.
     """
     best, least = None, np.inf
     for i in range(branches.sizes["branch"]):

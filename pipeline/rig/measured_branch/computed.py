@@ -28,21 +28,8 @@ TOLERANCE = 1e-8
 def branches_along(along: Along, parameters: Parameters, values: Sequence[float], states: np.ndarray) -> xr.Dataset:
     """Compute all branches connected to the orbits that trajectories converge to and, without a drive, to equilibria.
 
-    Parameters
-    ----------
-    along
-        Parameter and interval.
-    parameters
-        Parameters of the model.
-    values
-        Values of the parameter at which trajectories settle, shape (n,).
-    states
-        Their initial states, shape (n, n_states).
-
-    Returns
-    -------
-    Dataset
-        As of the analysis ``branches``.
+    Trajectories settle at `values` of the parameter, (n,), from `states`, (n, n_states). Return a dataset as of the
+    analysis ``branches``.
     """
     packed = parameters.pack()
     starts = _settled(along, packed, values, states)
@@ -105,20 +92,8 @@ def shapes_of(
 ) -> Shapes:
     """Integrate periodic orbits over one period, and return the shape (amplitude, mean, ...) of one state.
 
-    Parameters
-    ----------
-    model
-        Forced model, or a flow with its Poincare section.
-    packed
-        Packed parameters of each orbit, shape (n, n_parameters) [SI].
-    states
-        A section point of each orbit, shape (n, n_states) [SI].
-    seconds
-        Duration of each orbit, shape (n,) [s].
-    period
-        Drive periods or returns of each orbit.
-    state
-        Name of the state.
+    Each orbit has a row of packed parameters, a section point `states` [SI], and its duration `seconds`; `period`
+    counts the drive periods or returns of all. The model has a drive, or a Poincare section.
     """
     flow = model.flow if isinstance(model, SectionedModel) else model
     grid = np.arange(SAMPLES * period + 1) / (SAMPLES * period)
@@ -161,21 +136,9 @@ def _peak(values: np.ndarray) -> np.ndarray:
 
 
 def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray:
-    """Compute half of the peak-to-peak value of a state on every orbit of computed branches.
+    """Return half of the peak-to-peak value of a state on every orbit of computed branches, (branch, point).
 
-    Parameters
-    ----------
-    branches
-        Result of the analysis ``branches``.
-    base
-        Parameters of the run.
-    state
-        Name of the state.
-
-    Returns
-    -------
-    ndarray, (branch, point)
-        0 for equilibria, NaN beyond a branch's own points.
+    It is 0 for equilibria, NaN beyond a branch's own points; `base` are the parameters of the run.
     """
     parameter = str(branches.attrs["parameter"])
     found = np.full((branches.sizes["branch"], branches.sizes["point"]), np.nan)

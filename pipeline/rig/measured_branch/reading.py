@@ -57,19 +57,10 @@ class Cycles:
 
 
 def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
-    """Measure the cycles of a signal. Each cycle lies between two upward crossings of the signal's mean.
+    """Measure the cycles of a signal at rising, even times; each lies between two upward crossings of the signal's
+    mean.
 
-    Parameters
-    ----------
-    time
-        Rising, evenly spaced [s]; shape (n,).
-    values
-        The signal; shape (n,). Samples that are not finite end the signal.
-
-    Raises
-    ------
-    CyclesError
-        If there are fewer than `LEAST_CYCLES` whole cycles.
+    Samples that are not finite end the signal. Raise `CyclesError` if there are fewer than `LEAST_CYCLES` whole cycles.
     """
     last = len(values) if np.isfinite(values).all() else int(np.argmin(np.isfinite(values)))
     time, values = time[:last], values[:last]
@@ -148,30 +139,16 @@ class MeasuredBranch(Table):
 
 
 def read_branch(path: str | Path, model: Model | None = None, state: str = "") -> xr.Dataset:
-    """Read a measured branch from a CSV table of orbits, or from a specification of recorded orbits.
+    """Read a measured branch from a CSV table of orbits, or from a TOML specification of recorded orbits,
+    ``[measured.branch]``.
 
-    Parameters
-    ----------
-    path
-        A CSV file, or a TOML file with the table ``[measured.branch]``. The first column of a CSV file is the
-        parameter; others are ``amplitude``, ``amplitude_sd``, ``mean``, ``frequency`` (with ``_sd``), ``stable``
-        (yes, no, unknown) and ``name``. The tables that ``magpend measured branch --csv`` writes can be read as well.
-    model
-        Model of a CSV file; its parameter and state are looked up there.
-    state
-        State that a CSV file's amplitudes are of; by default the model's first.
+    The first column of a CSV file is the parameter of `model`; others are ``amplitude``, ``amplitude_sd``, ``mean``,
+    ``frequency`` (with ``_sd``), ``stable`` (yes, no, unknown) and ``name``. The tables that ``magpend measured branch
+    --csv`` writes can be read as well. `state` is by default the model's first. Return over the dim ``orbit`` the
+    parameter's ``value``, ``amplitude``, ``mean`` and ``frequency`` with the scatter ``..._sd``, ``harmonic``
+    amplitudes, ``stability`` (codes of `STABILITIES`), ``n_cycles``; NaN where unknown.
 
-    Returns
-    -------
-    Dataset
-        Over the dim ``orbit``: the parameter's ``value``, ``amplitude``, ``mean`` and ``frequency`` with the scatter
-        ``..._sd``, ``harmonic`` amplitudes, ``stability`` (codes of `STABILITIES`), ``n_cycles``; NaN where
-        unknown.
-
-    Raises
-    ------
-    SpecError
-        If the file cannot be read, or for unknown or missing keys, columns and numbers; all at once.
+    Raise `SpecError` if the file cannot be read, or for unknown or missing keys, columns and numbers; all at once.
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":

@@ -69,13 +69,7 @@ def to_json(findings: Iterable[Finding]) -> str:
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:
-    """Return findings as printed lines, the most severe first; findings of the same kind and channel share one line.
-
-    Returns
-    -------
-    list of str
-        Empty if there are no findings.
-    """
+    """Return findings as printed lines, the most severe first; findings of the same kind and channel share one line."""
     groups: dict[tuple[str, str, str], list[Finding]] = {}
     for f in sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)):
         groups.setdefault((f.severity, f.kind, f.channel), []).append(f)
@@ -90,20 +84,9 @@ def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) 
 
 
 def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
-    """Return the start and end index of each run of true entries in a mask. The end index is one after the last true
-    entry.
+    """Return the first index of each run of true entries in a mask, and the one after its last, (n_runs, 2).
 
-    Parameters
-    ----------
-    mask
-        Mask, (n,).
-    piece
-        Index of the piece, (n,); stretches end where a piece does.
-
-    Returns
-    -------
-    ndarray
-        First index of each stretch, and the one after its last, (n_runs, 2).
+    Runs end where a piece, given by its index for each sample, does.
     """
     inside = np.concatenate([[False], np.asarray(mask, dtype=bool), [False]])
     change = inside[1:] != inside[:-1]

@@ -57,30 +57,12 @@ def clock_of(
 ) -> Clock:
     """Give the channels of all stretches of a file the same uniform sample times.
 
-    Parameters
-    ----------
-    stretches
-        Channels that are used, by name, with time stamps or sampling intervals.
-    sampling_rate_hz
-        Rate from the mapping, which takes precedence over the file's.
-    source
-        Name of the file, for messages.
-    numbers
-        Piece numbers of the first channel's samples, (n,), one stretch after the other. A new piece begins
-        where the number changes.
-    apart
-        Whether each stretch is a piece, even if it continues the stretch before.
+    All channels begin at the latest start and end at the earliest end; samples left out are findings. A
+    `sampling_rate_hz` from the mapping takes precedence over the file's. A new piece begins where the piece number of
+    the first channel's samples, `numbers`, changes, and with `apart` at each stretch.
 
-    Returns
-    -------
-    Clock
-        All channels begin at the latest start and end at the earliest end; samples left out are findings.
-
-    Raises
-    ------
-    SpecError
-        If no sampling interval is known, channels have different ones, time stamps go backwards, or there
-        are no samples.
+    Raise `SpecError` if no sampling interval is known, channels have different ones, time stamps go backwards, or there
+    are no samples.
     """
     stated = None if sampling_rate_hz is None else 1.0 / sampling_rate_hz
     step = _common_step(stretches, stated, source)
@@ -108,11 +90,6 @@ def resampled(channel: Channel, rate_hz: float) -> Channel:
 
     A gap is a step of more than `GAP_STEPS` times the longest of 99 % of the steps, and more than that many steps of
     the new rate.
-
-    Raises
-    ------
-    SpecError
-        If the time stamps do not increase.
     """
     time = channel.time
     if time is None or len(time) < 2 or not (np.diff(time) > 0.0).all():

@@ -23,13 +23,7 @@ _INSTANT = re.compile(
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file, decoded as UTF-8 or else as cp1252, which LabVIEW on Windows writes.
-
-    Raises
-    ------
-    SpecError
-        If the file is not a text.
-    """
+    """Return the text of a file, decoded as UTF-8 or else as cp1252, which LabVIEW on Windows writes."""
     data = path.read_bytes()
     if b"\x00" in data[:4096]:
         raise SpecError(f"{path}: is not a text; state its format in the mapping if the suffix misleads.")
@@ -68,20 +62,9 @@ def split(line: str, delimiter: str) -> list[str]:
 
 
 def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal: str) -> np.ndarray:
-    """Convert chosen columns of text lines to an array of numbers; fields that are empty, missing or not numbers become
-    NaN.
+    """Convert the columns of text lines with the given indices to numbers, (n_lines, n_columns).
 
-    Parameters
-    ----------
-    lines
-        Lines without line ends.
-    columns
-        Indices of the wanted fields, from 0.
-
-    Returns
-    -------
-    ndarray
-        Numbers, (n_lines, n_columns).
+    Fields that are empty, missing or not numbers become NaN.
     """
     if not lines or not columns:
         return np.empty((len(lines), len(columns)))
@@ -113,11 +96,8 @@ def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal:
 def instants(fields: Sequence[str]) -> np.ndarray | None:
     """Convert dates or times of day to seconds since the first; return None if a field is anything else.
 
-    Parameters
-    ----------
-    fields
-        Texts in the order of ISO 8601, with a blank or a T between date and time, and a point or a comma
-        before the fraction of a second.
+    Their order is that of ISO 8601, with a blank or a T between date and time, and a point or a comma before the
+    fraction of a second.
     """
     found = [_INSTANT.fullmatch(f.strip().strip('"').replace("/", "-").replace(",", ".")) for f in fields]
     known = [m for m in found if m is not None]
@@ -170,24 +150,13 @@ class _Form:
 
 
 def read_csv(path: Path, stated: CsvMap) -> Raw:
-    """Read all columns of a CSV file.
+    """Read all columns of a CSV file; `stated` has properties that need not be detected.
 
-    Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels'
-    names. A second row of names gives their units, as do brackets after a name: ``angle [V]``. Without names
-    the columns are ``1``, ``2``, ... Empty fields and texts are NaN, and are dropped after the last number of
-    a column. Dates and times of day become seconds since the first. Other texts are left out.
-
-    Parameters
-    ----------
-    path
-        The file.
-    stated
-        Properties of the file that need not be detected.
-
-    Raises
-    ------
-    SpecError
-        If the file is not a table of numbers, or can be read in two ways.
+    Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels' names. A
+    second row of names gives their units, as do brackets after a name: ``angle [V]``. Without names the columns are
+    ``1``, ``2``, ... Empty fields and texts are NaN, and are dropped after the last number of a column. Dates and times
+    of day become seconds since the first. Other texts are left out. Raise `SpecError` if the file is not a table of
+    numbers, or can be read in two ways.
     """
     lines = read_text(path).splitlines()
     is_simulated = bool(lines) and lines[0].startswith(SIMULATED)

@@ -44,13 +44,7 @@ SUFFIXES = {
 
 
 def format_of(path: Path, stated: str | None = None) -> str:
-    """Return the format of a file: the stated one, otherwise that of its suffix.
-
-    Raises
-    ------
-    SpecError
-        If the suffix is unknown and nothing is stated.
-    """
+    """Return the stated format of a file, otherwise that of its suffix."""
     if stated is not None:
         return stated
     suffix = path.suffix.lower()
@@ -63,22 +57,7 @@ def format_of(path: Path, stated: str | None = None) -> str:
 
 
 def read_raw(path: Path, stated: str | None = None, csv: CsvMap | None = None) -> Raw:
-    """Read all channels of a recording's file with the reader for its format.
-
-    Parameters
-    ----------
-    path
-        The file.
-    stated
-        Format; by default given by the suffix.
-    csv
-        Form of a CSV file.
-
-    Raises
-    ------
-    SpecError
-        If the file does not exist, or does not have the format.
-    """
+    """Read all channels of a recording's file with the reader for its format, which by default the suffix gives."""
     name = format_of(path, stated)
     if not path.is_file():
         raise SpecError(f"{path}: there is no such file.")
@@ -142,22 +121,7 @@ def read_recording(
 
 
 def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
-    """Convert the channels already read from a file to a recording. See `read_recording`.
-
-    Parameters
-    ----------
-    raw
-        All channels of a file.
-    mapping
-        Mapping of the channels.
-    window_s
-        Start and end of the part to keep [s since the first sample]; takes precedence over the mapping's.
-
-    Raises
-    ------
-    SpecError
-        See `read_recording`.
-    """
+    """Convert the channels already read from a file to a recording. See `read_recording`."""
     columns = _resolved(raw, mapping)
     findings = list(raw.findings)
     parts = [_timed(s, mapping, columns, findings) for s in raw.stretches]

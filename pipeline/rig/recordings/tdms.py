@@ -30,14 +30,8 @@ _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 def read_tdms(path: Path) -> Raw:
     """Read all channels of numbers or times in a TDMS file, under the names ``GROUP/CHANNEL``.
 
-    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by
-    default rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a
-    finding.
-
-    Raises
-    ------
-    SpecError
-        If it is not a TDMS file.
+    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by default
+    rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a finding.
     """
     TdmsFile = import_extra("nptdms", "rig", str(path)).TdmsFile
     with _listening() as warnings:

@@ -83,19 +83,10 @@ def _is_one_waveform(ds: xr.Dataset) -> bool:
 
 
 def write_raw(raw: Raw, path: str | Path) -> Path:
-    """Write the channels of a file unchanged to a TDMS or CSV file.
+    """Write one stretch of channels of a file unchanged to a TDMS or CSV file.
 
-    Parameters
-    ----------
-    raw
-        One stretch of channels. In a CSV file the sampling interval becomes a column ``time``.
-    path
-        ``.tdms`` or ``.csv``.
-
-    Raises
-    ------
-    SpecError
-        If the suffix is another one, or the folder does not exist.
+    In a CSV file the sampling interval becomes a column ``time``. Raise `SpecError` if the suffix is another one, or
+    the folder does not exist.
     """
     target = check_new_file(path, SUFFIXES[:2])
     (channels,) = raw.stretches
