@@ -240,10 +240,9 @@ def branch(
     Lists amplitude, frequency and their scatter over the cycles. With --over also the computed orbit of the same
     stability, the error in per cent, and the distance in units of the scatter.
     """
-    from pipeline.rig.measured_branch.comparison import branch_table, compare
-    from pipeline.rig.measured_branch.computed import amplitudes
-    from pipeline.rig.measured_branch.figure import plot_branch
-    from pipeline.rig.measured_branch.reading import read_branch
+    from pipeline.rig.measured.branch import branch_table, compare, read_branch
+    from pipeline.rig.measured.branch_computed import amplitudes
+    from pipeline.rig.measured.branch_figure import plot_branch
     from pipeline.runs.workflows import find_spec
 
     _check_targets(out, csv)

@@ -405,7 +405,7 @@ def public() -> str:
 def measured_branch() -> str:
     """Return Markdown tables of the keys that describe measured branches, and a virtual rig under control."""
     from pipeline.rig.control import ControlTable
-    from pipeline.rig.measured_branch.reading import MeasuredBranch, RecordedOrbit
+    from pipeline.rig.measured.branch import MeasuredBranch, RecordedOrbit
 
     parts = [
         _keys(

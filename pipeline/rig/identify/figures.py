@@ -22,7 +22,7 @@ from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
 from pipeline.plots.files import save_data, save_figure
 from pipeline.rig.identify.statistics import LEVEL, pooled_autocorrelation
-from pipeline.rig.measured_branch.figure import plot_branch
+from pipeline.rig.measured.branch_figure import plot_branch
 
 # ---- data of the residuals -------------------------------------------------------------------------
 

@@ -19,8 +19,7 @@ from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
 from pipeline.rig.identify.build import Built, build, read_all
 from pipeline.rig.identify.directory import Outcomes, Source
-from pipeline.rig.identify.drive_frequency import estimate_frequencies
-from pipeline.rig.identify.identifiability import Curvature, Profile, following, profile
+from pipeline.rig.identify.identifiability import Curvature, Profile, estimate_frequencies, following, profile
 from pipeline.rig.identify.judgement import judge, judge_fit
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.measured_orbits import judge_orbits, read_orbits

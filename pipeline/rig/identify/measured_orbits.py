@@ -21,9 +21,8 @@ from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
 from pipeline.layout.writing import json_value
 from pipeline.rig.identify.specification import OrbitsTable, setting_problems
-from pipeline.rig.measured_branch.comparison import branch_table, compare, nearest_orbit
-from pipeline.rig.measured_branch.computed import amplitudes, branches_along
-from pipeline.rig.measured_branch.reading import STABILITIES, read_branch
+from pipeline.rig.measured.branch import STABILITIES, branch_table, compare, nearest_orbit, read_branch
+from pipeline.rig.measured.branch_computed import amplitudes, branches_along
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, problems_of
 from pipeline.specification.section import SectionTable

@@ -22,7 +22,7 @@ from pipeline.analysis.branches.carrying import NEWTON, ORBIT, PARAMETER, Array,
 from pipeline.analysis.branches.following import problem_of
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.rig.identify.problem import Problem
-from pipeline.rig.measured_branch.computed import shapes_of
+from pipeline.rig.measured.branch_computed import shapes_of
 
 BESIDE = 1e-3
 """Arclength to a neighbour on the branch, for derivatives along it."""

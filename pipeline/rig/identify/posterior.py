@@ -22,7 +22,7 @@ from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result, s
 from pipeline.rig.identify.measured_orbits import MeasuredTable
 from pipeline.rig.identify.orbit_residuals import quantities_of
 from pipeline.rig.identify.statistics import root_of
-from pipeline.rig.measured_branch.figure import Bands, plot_branch
+from pipeline.rig.measured.branch_figure import Bands, plot_branch
 from pipeline.runs.stopping import stoppable
 from pipeline.specification.problems import SpecError
 from pipeline.store.files import FIGURES, local_path

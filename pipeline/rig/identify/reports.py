@@ -14,8 +14,7 @@ from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import json_value
 from pipeline.rig.identify.directory import Source
-from pipeline.rig.identify.drive_frequency import DriveFrequency
-from pipeline.rig.identify.identifiability import Direction, Profile
+from pipeline.rig.identify.identifiability import Direction, DriveFrequency, Profile
 from pipeline.rig.identify.judgement import Judgement
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.measured_orbits import orbit_lines, orbits_result

@@ -16,7 +16,7 @@ from magpend_core.status import Status
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore
 from pipeline.analysis.branches.carrying import Along
 from pipeline.layout.vocabulary import FREQUENCY_DIM
-from pipeline.rig.measured_branch.reading import N_HARMONICS
+from pipeline.rig.measured.branch import N_HARMONICS
 
 SETTLING = 2000
 """Most drive periods or returns for which a trajectory settles."""

@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.plots import labels, style
-from pipeline.rig.measured_branch.reading import STABILITIES
+from pipeline.rig.measured.branch import STABILITIES
 
 
 @dataclass(frozen=True)
