@@ -33,18 +33,12 @@ class SchedulerError(Exception):
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a dask scheduler, with the setting from which it was read.
-
-    Attributes
-    ----------
-    source : str
-        Source of the address, for messages: the option, a variable, or a file.
-    """
+    """Address of a dask scheduler, with the setting from which it was read."""
 
     scheme: str
     host: str
     port: int
-    source: str
+    source: str  # source of the address, for messages: the option, a variable, or a file
 
     @property
     def url(self) -> str:

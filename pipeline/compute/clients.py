@@ -32,25 +32,16 @@ _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Where:
-    """Choice of where tasks run: in threads or processes of this machine, on a dask scheduler or as batch jobs.
+    """Choice of where tasks run: in threads or processes of this machine, on a dask scheduler or as batch jobs."""
 
-    Attributes
-    ----------
-    scheduler : str, optional
-        ``threads`` or ``processes`` of this machine, ``none`` for the calling thread, a scheduler's address or
-        JSON file, or the name of a batch system. By default ``DASK_SCHEDULER_ADDRESS``, else ``threads``.
-    cluster_file : Path, optional
-        File with the ``[cluster]`` table of a batch system; by default the value of ``MAGPEND_CLUSTER``.
-    dashboard : bool
-        Whether to serve dask's dashboard on loopback, and print its address; not for places on this machine.
-    place : str, optional
-        Place of the run directory, which all workers must see (`open_files`).
-    """
-
+    # ``threads`` or ``processes`` of this machine, ``none`` for the calling thread, a scheduler's address or JSON file,
+    # or the name of a batch system. By default ``DASK_SCHEDULER_ADDRESS``, else ``threads``.
     scheduler: str | None = None
+    # file with the ``[cluster]`` table of a batch system; by default the value of ``MAGPEND_CLUSTER``
     cluster_file: Path | None = None
+    # whether to serve dask's dashboard on loopback, and print its address; not for places on this machine
     dashboard: bool = False
-    place: str | None = None
+    place: str | None = None  # place of the run directory, which all workers must see (`open_files`)
 
     @classmethod
     def of(cls, scheduler: Where | str | None) -> Where:

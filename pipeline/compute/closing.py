@@ -25,22 +25,14 @@ TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
 
 
 class Closing(NamedTuple):
-    """How far a trajectory is from a periodic orbit, and how long it would take to close on it.
+    """How far a trajectory is from a periodic orbit, and how long it would take to close on it."""
 
-    Attributes
-    ----------
-    period : int
-        Drive periods after which the motion comes back closest.
-    distance : float
-        Bound on the distance from the orbit if the motion is closed or closes, else the largest distance
-        of late sections that are `period` apart; in the scales of the states, angles on the circle.
-    to_go : float
-        Drive periods until the motion closes if it goes on as it does: 0 if it has closed, infinite if
-        the distance does not shrink.
-    """
-
-    period: int
+    period: int  # drive periods after which the motion comes back closest
+    # bound on the distance from the orbit if the motion is closed or closes, else the largest distance of late sections
+    # that are `period` apart; in the scales of the states, angles on the circle
     distance: float
+    # drive periods until the motion closes if it goes on as it does: 0 if it has closed, infinite if the distance does
+    # not shrink
     to_go: float
 
     @property

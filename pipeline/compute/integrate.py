@@ -17,19 +17,11 @@ from pipeline.specification.parsing import Spec
 
 @dataclass(frozen=True)
 class Job:
-    """Integrated cells with their specification and inputs, from which products are computed.
-
-    Attributes
-    ----------
-    inputs : Inputs
-        What `run_branches` took.
-    cells : Sections
-        Result of the integration, with leading dims (branch, point).
-    """
+    """Integrated cells with their specification and inputs, from which products are computed."""
 
     spec: Spec
-    inputs: Inputs
-    cells: Sections
+    inputs: Inputs  # what `run_branches` took
+    cells: Sections  # result of the integration, with leading dims (branch, point)
 
 
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:

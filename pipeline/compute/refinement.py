@@ -51,18 +51,10 @@ Integrate = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 @dataclass
 class Orbits:
-    """Periodic orbits found so far in a block of cells, numbered in the order in which they were found.
+    """Periodic orbits found so far in a block of cells, numbered in the order in which they were found."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Largest scaled distance between sections of one orbit.
-    system : System
-        Gives scales and circles of the states.
-    """
-
-    tolerance: float
-    system: System
+    tolerance: float  # largest scaled distance between sections of one orbit
+    system: System  # gives scales and circles of the states
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -41,18 +41,10 @@ ABSENT = (Status.PENDING, Status.INFERRED)
 
 @dataclass
 class Source:
-    """An earlier run from which a new run copies cells.
+    """An earlier run from which a new run copies cells."""
 
-    Attributes
-    ----------
-    run : Run
-        The run, with the tasks that were committed when it was opened.
-    wanted : Spec
-        Specification of the run that takes its cells.
-    """
-
-    run: Run
-    wanted: Spec
+    run: Run  # the run, with the tasks that were committed when it was opened
+    wanted: Spec  # specification of the run that takes its cells
     finder: Finder = field(init=False)
     names: list[str] = field(init=False)
     missing: list[str] = field(init=False)

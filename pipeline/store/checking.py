@@ -23,37 +23,18 @@ _TASKS_PER_REPORT = 50
 
 @dataclass(frozen=True)
 class Verification:
-    """Result of `verify`: the number of intact tasks, and lists of damaged and leftover files.
+    """Result of `verify`: the number of intact tasks, and lists of damaged and leftover files."""
 
-    Attributes
-    ----------
-    n_tasks, n_committed : int
-        Tasks of the run, and those that are committed and intact.
-    damaged : dict
-        Problem by the file name of the commit record; see `packing.withdraw`.
-    skeleton : list of str
-        Problems of metadata and coordinates.
-    leftovers : list of str
-        Files without a valid commit record. They are harmless; the next run removes them.
-    derived : dict
-        Problem by product name: products whose content has changed.
-    rebuilt : list of str
-        Problems of the skeleton that have been repaired.
-    odd : list of str
-        Folders at the places of files, and files at the places of folders.
-    copies : list of str
-        Problem of the copy of commit records, if it differs from them.
-    """
-
+    # tasks of the run, and those that are committed and intact
     n_tasks: int
     n_committed: int
-    damaged: dict[str, str]
-    skeleton: list[str]
-    leftovers: list[str]
-    derived: dict[str, str] = field(default_factory=dict)
-    rebuilt: list[str] = field(default_factory=list)
-    odd: list[str] = field(default_factory=list)
-    copies: list[str] = field(default_factory=list)
+    damaged: dict[str, str]  # problem by the file name of the commit record; see `packing.withdraw`
+    skeleton: list[str]  # problems of metadata and coordinates
+    leftovers: list[str]  # files without a valid commit record. They are harmless; the next run removes them.
+    derived: dict[str, str] = field(default_factory=dict)  # problem by product name: products whose content has changed
+    rebuilt: list[str] = field(default_factory=list)  # problems of the skeleton that have been repaired
+    odd: list[str] = field(default_factory=list)  # folders at the places of files, and files at the places of folders
+    copies: list[str] = field(default_factory=list)  # problem of the copy of commit records, if it differs from them
 
     @property
     def sound(self) -> bool:

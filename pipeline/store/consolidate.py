@@ -42,21 +42,11 @@ PRIVATE = ("host",)
 
 @dataclass(frozen=True)
 class Layer:
-    """An additional array that is stored with the result cube: one value, or an array of values, for each cell.
+    """An additional array that is stored with the result cube: one value, or an array of values, for each cell."""
 
-    Attributes
-    ----------
-    values : ndarray
-        In the shape of the cells, followed by `own_dims`.
-    attrs : mapping
-        Attributes of the array, such as its unit.
-    own_dims : tuple of str
-        Dims after those of the cells.
-    """
-
-    values: np.ndarray
-    attrs: Mapping[str, Any]
-    own_dims: tuple[str, ...] = ()
+    values: np.ndarray  # in the shape of the cells, followed by `own_dims`
+    attrs: Mapping[str, Any]  # attributes of the array, such as its unit
+    own_dims: tuple[str, ...] = ()  # dims after those of the cells
 
 
 Layers = Mapping[str, Layer]

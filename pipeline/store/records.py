@@ -32,21 +32,11 @@ _OPEN_PACKS = 8
 
 @dataclass(frozen=True)
 class Commit:
-    """A valid commit record: the number of cells by status, and size and sha256 of the task's files.
+    """A valid commit record: the number of cells by status, and size and sha256 of the task's files."""
 
-    Attributes
-    ----------
-    task : int
-        Index of the task.
-    status : dict
-        Number of cells by status name.
-    objects : dict
-        Size and sha256 of the task's files, by key below ``cube.zarr``.
-    """
-
-    task: int
-    status: dict[str, int]
-    objects: dict[str, dict[str, Any]]
+    task: int  # index of the task
+    status: dict[str, int]  # number of cells by status name
+    objects: dict[str, dict[str, Any]]  # size and sha256 of the task's files, by key below ``cube.zarr``
 
 
 # ---- names -------------------------------------------------------------------------------------
@@ -98,21 +88,11 @@ def line_of(commit: Commit, digest: str) -> bytes:
 
 @dataclass(frozen=True)
 class Pack:
-    """Summary in the last line of a pack, a file of many commit records.
+    """Summary in the last line of a pack, a file of many commit records."""
 
-    Attributes
-    ----------
-    block : int
-        Index of the block.
-    cells : dict
-        Number of committed cells by status name.
-    without : tuple of int
-        Tasks of the block without a record: they were withdrawn.
-    """
-
-    block: int
-    cells: dict[str, int]
-    without: tuple[int, ...]
+    block: int  # index of the block
+    cells: dict[str, int]  # number of committed cells by status name
+    without: tuple[int, ...]  # tasks of the block without a record: they were withdrawn
 
     @property
     def tasks(self) -> list[int]:

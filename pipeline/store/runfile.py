@@ -25,39 +25,17 @@ from pipeline.store.stored_json import StoredRun, parsed
 
 @dataclass(frozen=True)
 class RunInfo:
-    """The content of ``run.json``.
+    """The content of ``run.json``."""
 
-    Attributes
-    ----------
-    files : Files
-        Files of the run directory.
-    digest : str
-        Digest of `identity`.
-    identity : dict
-        Everything that decides the numbers and the layout.
-    title : str
-        Title from the specification.
-    spec : dict
-        Specification as plain data for `parse_spec`.
-    spec_text : str
-        Text of the TOML file.
-    versions : dict
-        Versions of the packages that made the run.
-    provenance : dict
-        See `pipeline.store.provenance`.
-    skeleton : dict
-        Size and sha256 of the files written by the set-up.
-    """
-
-    files: Files
-    digest: str
-    identity: dict[str, Any]
-    title: str
-    spec: dict[str, Any]
-    spec_text: str
-    versions: dict[str, str]
-    provenance: dict[str, str]
-    skeleton: dict[str, dict[str, Any]]
+    files: Files  # files of the run directory
+    digest: str  # digest of `identity`
+    identity: dict[str, Any]  # everything that decides the numbers and the layout
+    title: str  # title from the specification
+    spec: dict[str, Any]  # specification as plain data for `parse_spec`
+    spec_text: str  # text of the TOML file
+    versions: dict[str, str]  # versions of the packages that made the run
+    provenance: dict[str, str]  # see `pipeline.store.provenance`
+    skeleton: dict[str, dict[str, Any]]  # size and sha256 of the files written by the set-up
 
     @property
     def name(self) -> str:
