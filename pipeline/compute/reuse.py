@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Sections, Status
-from pipeline.compute.continuation import WALKED, going_on
-from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
+from pipeline.compute.integrate import WALKED, Integrate, Job, going_on, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
@@ -26,9 +25,9 @@ from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.reading import read_block
 from pipeline.store.run import Run
 from pipeline.store.runfile import read_run
-from pipeline.store.task_cells import read_block
 
 Origin = tuple[str, str]
 """Directory and digest of a run that cells are taken from."""

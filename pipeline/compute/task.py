@@ -18,8 +18,7 @@ import numpy as np
 from magpend_core import Status
 from magpend_core.engine.threads import using_threads
 from magpend_core.models import import_model
-from pipeline.compute.continuation import WALKED, going_on
-from pipeline.compute.integrate import Integrate, integrate
+from pipeline.compute.integrate import WALKED, Integrate, going_on, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap
@@ -31,8 +30,8 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
+from pipeline.store.reading import read_cells
 from pipeline.store.runfile import RunInfo, read_run
-from pipeline.store.task_cells import read_cells
 
 _PREPARING = threading.Lock()
 """Lock for reading a run and those that it copies from: the first of its threads reads them for all."""

@@ -32,7 +32,7 @@ from pipeline.specification.parsing import Spec, load_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.run import Run
 from pipeline.store.runfile import is_run
 

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from pipeline.layout.plan import Plan
 from pipeline.runs.progress import duration
 from pipeline.store.checking import damaged_records
-from pipeline.store.commits import scan, sweep
-from pipeline.store.packing import withdraw
+from pipeline.store.commits import scan, sweep, withdraw
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.view import VERIFY, checks_chunks

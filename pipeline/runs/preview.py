@@ -23,7 +23,7 @@ from pipeline.runs.workflows import read_given
 from pipeline.specification.parsing import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.run import Run
 from pipeline.store.setup import check
 

@@ -27,11 +27,10 @@ from pipeline.runs.workflows import read_given
 from pipeline.specification.parsing import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import log_timing, sweep
+from pipeline.store.commits import Packer, log_timing, sweep
 from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files
-from pipeline.store.packing import Packer
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo

@@ -31,7 +31,7 @@ from pipeline.specification.parsing import load_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.setup import check
 
 SCRIPT, SENT, TABLE = "job.sh", "job.json", "cluster.toml"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import platform
 import shutil
 import stat
 import uuid
@@ -12,15 +13,28 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from pipeline.layout.writing import open_plain, sync_folder, write_atomically, writing
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
-from pipeline.store.files import ASIDE, COMMITS, CUBE, HOLDER, LOCK, OWN_FILES, OWN_NAMES, RUN_FILE
-from pipeline.store.lease import holder, in_words
+from pipeline.store.files import (
+    ASIDE,
+    COMMITS,
+    CUBE,
+    HOLDER,
+    LOCK,
+    OWN_FILES,
+    OWN_NAMES,
+    RUN_FILE,
+    Files,
+    is_url,
+    local_path,
+)
 
 
 @dataclass(frozen=True)
@@ -379,3 +393,65 @@ def _named(path: Path) -> Iterator[None]:
                 is_own = file.read() == content  # else another run's note: the folder was renamed meanwhile
             if is_own:
                 path.unlink()
+
+
+def holder() -> dict[str, Any]:
+    """Return a note that names this process as the holder of a lock: host, process id, and the time (UTC)."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"host": platform.node(), "pid": os.getpid(), "since": now}
+
+
+def in_words(content: bytes) -> str:
+    """Return a phrase that names the process holding a lock; empty if the note about it is damaged."""
+    found = _holder_in(content)
+    return f" (process {found['pid']} on {found['host']} since {found['since']})" if found else ""
+
+
+def _holder_in(content: bytes) -> dict[str, Any] | None:
+    try:
+        data = json.loads(content)
+        data = {"host": str(data["host"]), "pid": int(data["pid"]), "since": str(data["since"])}
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return data if all(text.isprintable() for text in (data["host"], data["since"])) else None
+
+
+def has_ended(content: bytes) -> bool:
+    """Return whether the holder of a lock was a process of this machine that has ended."""
+    found = _holder_in(content)
+    if found is None or found["host"] != platform.node():
+        return False
+    try:
+        os.kill(found["pid"], 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return False
+
+
+def is_note(content: bytes) -> bool:
+    """Return whether a file's content is a note that names the holder of a lock."""
+    return _holder_in(content) is not None
+
+
+# ---- folders and object stores ---------------------------------------------------------------------
+
+
+def open_files(place: str | Path | Files) -> Files:
+    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``.
+
+    `Files` are returned unchanged.
+
+    Raises
+    ------
+    RefusedError
+        If `place` is another URL, or the object store cannot be used.
+    """
+    if not isinstance(place, (str, Path)):
+        return place
+    if is_url(place):
+        from pipeline.store.objects import parse_url  # an optional dependency
+
+        return parse_url(str(place))
+    return LocalFiles(local_path(place))

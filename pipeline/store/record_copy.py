@@ -12,10 +12,10 @@ import json
 from collections.abc import Mapping
 
 from pipeline.layout.plan import Plan
-from pipeline.store.checksums import fits, seal
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.records import Commit, Records, line_of, marker_key, read_record
 from pipeline.store.runfile import RunInfo
+from pipeline.store.stored_json import fits, seal
 
 
 def copy_text(singles: Mapping[int, Commit], digest: str) -> bytes:

@@ -19,10 +19,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.store.checksums import CHECKSUM, fits, seal, unseal
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import COMMITS, Files
-from pipeline.store.stored_json import StoredCommit, StoredPack, WrongTypeError, parsed
+from pipeline.store.stored_json import CHECKSUM, StoredCommit, StoredPack, WrongTypeError, fits, parsed, seal, unseal
 
 BLOCK = 1000
 """Tasks whose records make a pack; this number is part of the directory's format."""

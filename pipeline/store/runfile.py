@@ -15,12 +15,11 @@ from pipeline.layout.schema import FORMAT
 from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.recorded_drive import is_whole
-from pipeline.store.checksums import CHECKSUM, fits, has_seal, seal
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.provenance import provenance, versions
-from pipeline.store.stored_json import StoredRun, parsed
+from pipeline.store.stored_json import CHECKSUM, StoredRun, fits, has_seal, parsed, seal
 
 
 @dataclass(frozen=True)

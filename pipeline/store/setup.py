@@ -11,17 +11,15 @@ from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
+from pipeline.store.arrays import METADATA
 from pipeline.store.checking import ODD, odd_keys, verify
-from pipeline.store.checksums import fits
-from pipeline.store.declared import METADATA
+from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
-from pipeline.store.lease import is_note
-from pipeline.store.local import run_around
-from pipeline.store.packing import withdraw
-from pipeline.store.places import open_files
+from pipeline.store.local import is_note, open_files, run_around
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
 from pipeline.store.skeleton import entries_of, skeleton_files, skeleton_keys, skeleton_problems, write_skeleton
+from pipeline.store.stored_json import fits
 
 Echo = Callable[[str], None]
 

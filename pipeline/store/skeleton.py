@@ -22,8 +22,7 @@ from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
-from pipeline.store.arrays import create_array, write_whole
-from pipeline.store.declared import METADATA, consolidated_metadata, disagreements
+from pipeline.store.arrays import METADATA, consolidated_metadata, create_array, disagreements, write_whole
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files, compared, entry_of
 from pipeline.store.runfile import RunInfo

@@ -20,7 +20,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
-from pipeline.store.declared import Declared
+from pipeline.store.arrays import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files
 from pipeline.store.keys import Owners
@@ -31,7 +31,7 @@ VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 SMALL = 200_000
-"""Largest size in bytes of a chunk that `pipeline.store.parallel_reads` reads; zarr reads larger ones."""
+"""Largest size in bytes of a chunk that `pipeline.store.reading` reads; zarr reads larger ones."""
 
 
 def checks_chunks() -> bool:

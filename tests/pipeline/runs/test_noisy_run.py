@@ -19,7 +19,7 @@ from pipeline.runs.noise import warn_of_steps
 from pipeline.runs.run import run
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from tests.pipeline.factories import WELL, finished, quietly
 
 S = (0.45, 0.55, 0.7)
