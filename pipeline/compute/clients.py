@@ -50,13 +50,7 @@ def installation() -> dict[str, str]:
 
 
 def check_versions(client: Any, workers: Iterable[str]) -> None:
-    """Raise SchedulerError unless all workers have the same software versions as this process.
-
-    Raises
-    ------
-    SchedulerError
-        If they differ; the message names workers, differences and the remedy.
-    """
+    """Raise `SchedulerError` unless all workers have the same software versions as this process."""
     here = installation()
     answers = client.run(installation, workers=list(workers), on_error="return")
     different = {address: _difference(here, answer) for address, answer in answers.items()}
@@ -80,14 +74,9 @@ def _difference(here: Mapping[str, str], there: Any) -> str:
 
 
 def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
-    """Raise SchedulerError unless all workers can read and write the run directory.
+    """Raise `SchedulerError` unless all workers can read and write the run directory.
 
     All workers must read a temporary file there, so that another directory with the same name is detected.
-
-    Raises
-    ------
-    SchedulerError
-        If workers do not; the message names them and the remedy.
     """
     files, token = open_files(place), uuid.uuid4().hex
     # where, and named as, leftovers are swept by the next run, should this process be killed here
@@ -148,12 +137,7 @@ class MisfitError(Exception):
 class Fitting:
     """Task that first checks whether its worker has the same software versions as the process that sent it.
 
-    Parameters
-    ----------
-    task
-        Function of an index.
-    programs
-        Required programs, see `installation`; by default those of this process.
+    The required `programs` are by default those of this process, see `installation`.
     """
 
     def __init__(self, task: Callable[[int], dict[str, Any]], programs: dict[str, str] | None = None) -> None:
@@ -202,11 +186,6 @@ class Where:
     def resolved(self) -> Address | Cluster | str:
         """Decide where tasks run, without starting anything: an address, a batch system's settings, or a place on this
         machine.
-
-        Raises
-        ------
-        SpecError
-            If the statement is invalid, or not available here.
         """
         found = self._resolved()
         if self.dashboard and isinstance(found, str):
@@ -255,13 +234,7 @@ class Where:
 
 
 def reach(where: Where) -> None:
-    """Check within seconds that the chosen dask scheduler answers; do nothing if none was chosen.
-
-    Raises
-    ------
-    SpecError, SchedulerError
-        If the place is invalid or no scheduler answers; the message gives the remedy.
-    """
+    """Check within seconds that the chosen dask scheduler answers; do nothing if none was chosen."""
     target = where.resolved()
     if isinstance(target, Address):
         ask(target)
@@ -271,17 +244,7 @@ def reach(where: Where) -> None:
 def connected(where: Where, echo: Echo = print) -> Iterator[Any]:
     """Yield a dask client when it has workers that have the same software and see the run directory.
 
-    Parameters
-    ----------
-    where
-        Choice of where tasks run: a dask scheduler or a batch system.
-    echo
-        Function that prints a line.
-
-    Raises
-    ------
-    SpecError, SchedulerError
-        If there are no such workers, before anything is computed.
+    Raise `SpecError` or `SchedulerError` if there are no such workers, before anything is computed.
     """
     import dask
     import distributed  # noqa: F401  its defaults come with it, and would go with a setting made before them

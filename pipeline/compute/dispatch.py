@@ -38,12 +38,8 @@ MORE = 2.0
 
 
 class Limits:
-    """Limits of the run time of tasks, from estimated and measured times.
-
-    Parameters
-    ----------
-    seconds
-        Estimated time of a task on one core [s]; None sets no limit.
+    """Limits of the run time of tasks, from estimated times on one core [s] and measured ones; without estimates there
+    are none.
     """
 
     def __init__(self, seconds: Callable[[int], float] | None) -> None:
@@ -104,18 +100,8 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 class Window:
     """Sends the tasks of an `Order` to the workers of a dask client, with a limited number of tasks at a time.
 
-    Parameters
-    ----------
-    client
-        Dask client.
-    task
-        Function that computes the task with a given index; it must be importable on the workers.
-    order
-        Queue of the tasks, which says when each may start.
-    seconds
-        Function that returns the estimated time of a task on one core [s], from its index.
-    echo
-        Function that prints a line on a problem that the window has dealt with.
+    The task's function must be importable on the workers. `seconds` estimates the time of a task on one core [s];
+    `echo` prints a line on a problem that the window has dealt with.
     """
 
     def __init__(
@@ -143,12 +129,8 @@ class Window:
     def results(self) -> Iterator[dict[str, Any]]:
         """Yield the results of tasks in the order in which the tasks finish.
 
-        Raises
-        ------
-        TaskFailedError
-            As soon as so many tasks have failed that the cause cannot lie in single tasks.
-        SchedulerError
-            If the scheduler is gone.
+        Raise `TaskFailedError` as soon as so many tasks have failed that the cause cannot lie in single tasks, and
+        `SchedulerError` if the scheduler is gone.
         """
         self._client.subscribe_topic(self._topic, self._on_start)
         self._look()

@@ -61,13 +61,8 @@ WALKED = ("section", "rest_state", "status", "step_size")
 def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
     """Replace the initial states of branches by the states in which the preceding task ended.
 
-    Parameters
-    ----------
-    inputs
-        Branches as if they began here.
-    before
-        Variables `WALKED` of the cell before each branch's first one, in the order of the branches: any
-        leading dims, a point of the path among them, then the variable's own.
+    `before` has the variables `WALKED` of the cell before each branch's first one, in the order of the branches: any
+    leading dims, a point of the path among them, then the variable's own.
     """
     n_branches, n_states = inputs.initial_states.shape
     section = before["section"]

@@ -120,15 +120,7 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
 
 
 def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
-    """Return the reasons why a new run cannot copy the cells of an earlier run; an empty list if it can.
-
-    Parameters
-    ----------
-    run
-        Run whose cells may be copied.
-    wanted, identity
-        Specification and identity of the run that would copy them.
-    """
+    """Return the reasons why a new run, with its specification and identity, cannot copy the cells of another one."""
     lines = unlike(run.info.identity, identity)
     if line := _no_extension(run.spec, wanted):
         lines.append(line)
@@ -157,15 +149,7 @@ def _no_extension(old: Spec, new: Spec) -> str:
 
 
 class Pool:
-    """Earlier runs from which a new run copies cells.
-
-    Parameters
-    ----------
-    spec
-        Specification of the run that takes the cells.
-    runs
-        Runs that hold cells; the first one that has a cell provides it.
-    """
+    """Earlier runs from which a new run copies cells; the first one that has a cell provides it."""
 
     def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
         self.spec = spec
@@ -278,19 +262,9 @@ def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], name
 
 @lru_cache(maxsize=2)
 def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
-    """Open the earlier runs from which a run copies cells, once per worker.
+    """Open the earlier runs from which the run in a directory copies cells, once per worker.
 
-    Parameters
-    ----------
-    directory, digest
-        The run that takes them.
-    sources
-        The others.
-
-    Raises
-    ------
-    RefusedError
-        If a directory holds another run now.
+    Raise `RefusedError` if a directory holds another run now.
     """
     runs = []
     for place, expected in sources:

@@ -82,23 +82,11 @@ class Closing(NamedTuple):
 
 
 def closing_of(sections: np.ndarray, system: System) -> Closing | None:
-    """Decide whether a trajectory has closed on a periodic orbit, by comparing its stroboscopic points.
+    """Decide whether a trajectory has closed on a periodic orbit, by comparing its last sections, shape (n, n_states).
 
-    The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter
-    to quarter, the sum of all that follow bounds the distance from the orbit, as in
-    `magpend_core.engine.observers.closed_period`.
-
-    Parameters
-    ----------
-    sections
-        Consecutive last sections of a trajectory, shape (n, n_states) [the states' units].
-    system
-        System that was integrated; gives the scales of the states and the angles.
-
-    Returns
-    -------
-    Closing or None
-        None for fewer than `FEWEST` sections.
+    The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter to quarter,
+    the sum of all that follow bounds the distance from the orbit, as in `magpend_core.engine.observers.closed_period`.
+    Return None for fewer than `FEWEST` sections.
     """
     n = len(sections)
     if n < FEWEST:
@@ -344,19 +332,10 @@ def _labelled(
 
 
 def start_of(model: str | Model, given: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the initial state of a model from values by name; names ending in ``_deg`` take degrees.
+    """Return the initial state of a model from values by name; names ending in ``_deg`` take degrees, the other states
+    are 0.
 
-    Parameters
-    ----------
-    model
-        The model, or its name.
-    given
-        Values by name: ``x``, or ``x_deg`` for a state in rad or rad/s; the other states are 0.
-
-    Raises
-    ------
-    SpecError
-        If a name is unknown, or a state is given twice.
+    Raise `SpecError` if a name is unknown, or a state is given twice.
     """
     found = load_model(model)
     in_degrees = [f"{s.name}{DEGREES}" for s in found.states if s.unit.startswith("rad")]

@@ -174,14 +174,11 @@ def consolidated_metadata(group: bytes) -> dict[str, Any]:
 
 
 def disagreements(contents: Mapping[str, bytes]) -> list[str]:
-    """Return a line for each array whose metadata differ from their copy in the group's ``zarr.json``.
+    """Return a line for each array whose metadata differ from their copy in the group's ``zarr.json``, by contents of
+    files.
 
-    A group without copies has no problem: earlier versions of magpend have made such groups.
-
-    Parameters
-    ----------
-    contents
-        Contents of files by key. Arrays without a ``zarr.json`` among them are not compared.
+    A group without copies has no problem: earlier versions of magpend have made such groups. Arrays without a
+    ``zarr.json`` among the files are not compared.
     """
     copies = consolidated_metadata(contents.get(METADATA, b""))
     own = {key.rpartition("/")[0]: content for key, content in contents.items() if key.endswith(f"/{METADATA}")}

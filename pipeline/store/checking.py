@@ -43,13 +43,8 @@ class Verification:
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
-    """Read every stored file of a run and compare its sha256 with the recorded one; return which files are damaged or
-    left over.
-
-    Raises
-    ------
-    UnreadableError
-        If a file exists and cannot be read.
+    """Read every stored file of a run and compare its sha256 with the recorded one; return what is damaged or left
+    over.
     """
     info.files.refuse_links(CUBE)
     records, damaged = damaged_records(info, plan, contents=True)
@@ -71,12 +66,7 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
 def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
     """Return the keys of folders found where a run should have files, and of files where it should have folders.
 
-    Parameters
-    ----------
-    files
-        Files of the run directory.
-    skeleton
-        Keys of the set-up's files, below the cube.
+    `skeleton` has the keys of the set-up's files, below the cube.
     """
     folders = dict.fromkeys(key.rpartition("/")[0] for key in skeleton)
     return files.odd([CUBE, *(f"{CUBE}/{folder}" for folder in folders if folder), COMMITS])
@@ -92,14 +82,8 @@ def name_of(index: int) -> str:
 def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
     """Return the valid commit records of a run's tasks, and the problems of the damaged records by file name.
 
-    A record is damaged, too, if a file that it lists is missing or has changed.
-
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    contents
-        Whether to compare the contents of files. Otherwise only their sizes are compared.
+    A record is damaged, too, if a file that it lists is missing or has changed: in its content, or, without `contents`,
+    in its size.
     """
     records, rejected = scan(info, plan)
     damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}

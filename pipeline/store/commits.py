@@ -65,25 +65,12 @@ def write_task(
 ) -> None:
     """Write the results of a task, then the commit record that proves them complete.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    index
-        Index of the task.
-    values
-        Array by variable name, in the shape of the task's block followed by the variable's own dims.
-    counts
-        Number of cells by status name, for the command `status`.
+    Arrays have the shape of the task's block followed by the variable's own dims; `counts` has the number of cells by
+    status name.
 
-    Raises
-    ------
-    ValueError
-        If an array has another shape or dtype than the store, or a block cuts a chunk.
-    DamagedError
-        If the metadata of a variable have changed since the set-up.
-    RefusedError
-        If the run directory was removed meanwhile.
+    Raise `ValueError` if an array has another shape or dtype than the store, or a block cuts a chunk, `DamagedError` if
+    the metadata of a variable have changed since the set-up, and `RefusedError` if the run directory was removed
+    meanwhile.
     """
     info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
     cube = info.files.below(CUBE)
@@ -181,24 +168,12 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
-    If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this
-    check would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the
-    reading of chunks.
+    If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this check
+    would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of
+    chunks. `echo` prints a line for every record that does not count, with the reason.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    echo
-        Function that prints a line: one for every record that does not count, with the reason.
-
-    Raises
-    ------
-    UnreadableError
-        If a record or a folder exists and cannot be read. Its tasks are not taken for pending: a failing disk
-        must not cause a sweep.
-    RefusedError
-        If a folder is a link.
+    Raise `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending,
+    since a failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
     records, rejected = scan(info, plan, copies=info.files.local is None)
     problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
@@ -231,13 +206,7 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
 
 
 def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
-    """Return the valid commit record of one task, or None; the files that it lists are not checked.
-
-    Raises
-    ------
-    UnreadableError
-        If the record exists and cannot be read.
-    """
+    """Return the valid commit record of one task, or None; the files that it lists are not checked."""
     return scan(info, plan, (index // BLOCK,))[0].get(index)
 
 
@@ -246,21 +215,8 @@ def scan(
 ) -> tuple[Records, dict[str, str]]:
     """Read the folder ``commits``; return the valid commit records, and the problems of the others by file name.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    blocks
-        Blocks of tasks to read; by default all.
-    copies
-        Whether the copy of a record (`pipeline.store.record_copy`) may be read in the place of its file.
-
-    Raises
-    ------
-    UnreadableError
-        If a file exists and cannot be read, or if the folder changes at every attempt.
-    RefusedError
-        If the folder is a link.
+    With `copies`, the copy of a record (`pipeline.store.record_copy`) may be read in the place of its file. Raise
+    `UnreadableError` if a file exists and cannot be read, or if the folder changes at every attempt.
     """
     info.files.refuse_links(COMMITS)
     folder = info.files.below(COMMITS)
@@ -396,17 +352,8 @@ def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
 def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None) -> int:
     """Remove files in ``cube.zarr`` and ``commits`` that belong to no valid commit record; return their number.
 
-    Only the holder of the lock may call this. Files outside ``cube.zarr`` and ``commits`` stay. A link inside
-    them is removed, its target stays.
-
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    commits
-        All valid records, as `read_commits` has just returned them.
-    echo
-        Function that prints a line about the removed files.
+    Only the holder of the lock may call this, with all valid records, as `read_commits` has just returned them. Files
+    outside ``cube.zarr`` and ``commits`` stay. A link inside them is removed, its target stays.
     """
     leftovers = leftover_keys(info, plan, commits)
     info.files.remove(leftovers)
@@ -420,15 +367,8 @@ def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None)
 
 
 class Packer:
-    """Merger of commit records: it counts committed tasks, and merges the records of each complete block of tasks into
-    one file (a pack).
-
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    commits
-        Records that are committed already.
+    """Merger of commit records: it counts committed tasks, and packs the records of each complete block of tasks in one
+    file.
     """
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
@@ -468,13 +408,8 @@ def pack_block(info: RunInfo, plan: Plan, block: int) -> bool:
 def withdraw(info: RunInfo, names: Iterable[str]) -> None:
     """Remove commit records, so that the next run computes their tasks again.
 
-    Parameters
-    ----------
-    info
-        The run.
-    names
-        File names of the records, as if each had its own file; or the name of a damaged pack, whose
-        whole records stay.
+    `names` are file names of the records, as if each had its own file; or the name of a damaged pack, whose whole
+    records stay.
     """
     info.files.refuse_links(COMMITS)
     remove_copy(info)

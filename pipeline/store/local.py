@@ -68,7 +68,10 @@ class LocalFiles:
             return sorted(entry.name for entry in entries)
 
     def is_there(self, key: str) -> bool:
-        """Return whether a plain file exists at a key."""
+        """Return whether a plain file exists at a path. A link or a folder does not count.
+
+        Raise `UnreadableError` if the file system cannot tell.
+        """
         return is_there(self.root / key)
 
     def read(self, key: str) -> bytes:
@@ -248,10 +251,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 def is_there(path: Path) -> bool:
     """Return whether a plain file exists at a path. A link or a folder does not count.
 
-    Raises
-    ------
-    UnreadableError
-        If the file system cannot tell.
+    Raise `UnreadableError` if the file system cannot tell.
     """
     try:
         with unreadable(path):
@@ -262,14 +262,8 @@ def is_there(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn file system errors inside this context into `UnreadableError`, except for missing files.
-
-    A missing file is not turned: it may be missing rightly.
-
-    Raises
-    ------
-    UnreadableError
-        For any `OSError` but `FileNotFoundError` and `NotADirectoryError`.
+    """Turn file system errors inside this context into `UnreadableError`, except for missing files, which may miss
+    rightly.
     """
     try:
         yield
@@ -311,19 +305,8 @@ def run_around(path: Path) -> Path | None:
 def refuse_place(path: Path, option: str = "", within: str = "") -> None:
     """Raise `RefusedError` for a result path that lies inside a run directory or is a broken symbolic link.
 
-    Parameters
-    ----------
-    path
-        A file or a folder; it need not exist.
-    option
-        Option of the command that gave it, for the message.
-    within
-        Folder of a run directory in which results may lie; empty for none.
-
-    Raises
-    ------
-    RefusedError
-        In both cases.
+    `option` is that of the command that gave the path, for the message; `within` a folder of a run directory in which
+    results may lie.
     """
     name = f"{option} {path}".strip()
     if path.is_symlink() and not path.exists():
@@ -346,12 +329,8 @@ def remove_tree(path: Path) -> None:
 def writer_lock(directory: Path) -> Iterator[bool]:
     """Hold a file lock on a run directory against other writers inside this context.
 
-    The system frees the lock when its process ends, however it ends. Yields False where locks fail.
-
-    Raises
-    ------
-    LockedError
-        If another process holds it; the message names that process.
+    The system frees the lock when its process ends, however it ends. Yields False where locks fail. Raise
+    `LockedError`, which names the other process, if it is held.
     """
     from filelock import FileLock, Timeout
 
@@ -439,14 +418,10 @@ def is_note(content: bytes) -> bool:
 
 
 def open_files(place: str | Path | Files) -> Files:
-    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``.
+    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``; `Files` are returned
+    unchanged.
 
-    `Files` are returned unchanged.
-
-    Raises
-    ------
-    RefusedError
-        If `place` is another URL, or the object store cannot be used.
+    Raise `RefusedError` if it is another URL, or the object store cannot be used.
     """
     if not isinstance(place, (str, Path)):
         return place

@@ -63,10 +63,7 @@ _AGAIN = "committed results stay; give the same command again to continue."
 def parse_url(text: str) -> ObjectFiles:
     """Parse a URL such as ``s3://bucket/prefix`` and return the files there.
 
-    Raises
-    ------
-    RefusedError
-        If `text` is no such URL, or if the package obstore or the credentials are missing.
+    Raise `RefusedError` if it is no such URL, or if the package obstore or the credentials are missing.
     """
     if "@" in text or "?" in text:  # the message does not repeat the text, which may hold a password
         raise RefusedError("The URL of a run has no user, password or query: credentials are environment.")
@@ -91,10 +88,7 @@ _CREDENTIALS_HELP = (
 class ObjectFiles:
     """Files of a run in a bucket of an object store, by key; see `pipeline.store.files.Files`.
 
-    Parameters
-    ----------
-    bucket, prefix
-        Place of the files. The prefix neither begins nor ends with a slash and may be empty.
+    The prefix neither begins nor ends with a slash and may be empty.
     """
 
     local = None
@@ -199,12 +193,8 @@ class ObjectFiles:
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Write an object unless it exists. An existing object must have the same content.
-
-        Raises
-        ------
-        DamagedError
-            If an object with another content exists.
+        """Write an object unless it exists. An existing object must have the same content; otherwise raise
+        `DamagedError`.
         """
         import obstore
 
@@ -375,14 +365,7 @@ def _endpoint() -> str:
 def explain(place: str, error: Exception, *, writing: bool = False) -> Exception:
     """Translate an error of an object store into an exception with a one-line message, without request data.
 
-    Parameters
-    ----------
-    place
-        URL that the request was for.
-    error
-        Error from obstore. Its text holds the whole answer, which may name an access key.
-    writing
-        Whether the request was to write.
+    The text of an obstore error holds the whole answer, which may name an access key.
     """
     text = str(error)
     status = re.search(r"status code: (\d{3})", text)
@@ -426,13 +409,7 @@ RENEW_S, LEASE_S = 30.0, 150.0
 
 @contextlib.contextmanager
 def lease(files: ObjectFiles) -> Iterator[None]:
-    """Hold the lease of a run in an object store inside this context: a lock that expires unless it is renewed.
-
-    Raises
-    ------
-    LockedError
-        If another process holds it.
-    """
+    """Hold the lease of a run in an object store inside this context: a lock that expires unless it is renewed."""
     content = json.dumps({**holder(), "token": uuid.uuid4().hex}, sort_keys=True).encode()
     tag = [_take(files, content)]
     stop = threading.Event()

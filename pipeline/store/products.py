@@ -53,16 +53,8 @@ Digests = list[tuple[str, str]]
 def write_product(place: Place, ds: xr.Dataset) -> None:
     """Write a dataset (the result of an analysis) to its path, whole or not at all.
 
-    Labels are stored as codes, which the attribute ``words`` lists, since zarr format 3 has no strings of
-    fixed length. If another process first puts a sound product with the same attributes there, that
-    product stays.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written to.
-    RefusedError
-        If the folder is a link.
+    Labels are stored as codes, which the attribute ``words`` lists, since zarr format 3 has no strings of fixed length.
+    If another process first puts a sound product with the same attributes there, that product stays.
     """
     files = open_files(place)
     if files.local is None:
@@ -100,21 +92,10 @@ def _put_product(files: Files, ds: xr.Dataset) -> None:
 
 
 def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
-    """Read a product (the stored result of an analysis) into memory.
+    """Read a product (the stored result of an analysis) into memory; with `lazy`, numbers are read when they are used.
 
-    Parameters
-    ----------
-    place
-        Its folder.
-    lazy
-        Whether numbers are read when they are used. The content is compared with its digest now.
-
-    Raises
-    ------
-    FileNotFoundError
-        If it does not exist.
-    DamagedError
-        If its content has changed since it was written.
+    The content is compared with its digest now. Raise `FileNotFoundError` if there is none, and `DamagedError` if its
+    content has changed since it was written.
     """
     import xarray as xr
 
@@ -144,12 +125,7 @@ def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
 def read_product_attrs(place: Place) -> dict[str, Any]:
     """Compare the files of a product (stored analysis result) with the digest in its attributes; return the attributes.
 
-    Raises
-    ------
-    FileNotFoundError
-        If it does not exist.
-    DamagedError
-        If its content has changed since it was written.
+    Raise `FileNotFoundError` if there is none, and `DamagedError` if its content has changed since it was written.
     """
     files = open_files(place)
     if (path := files.local) is not None:
@@ -197,13 +173,7 @@ def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests
 
 
 def remove_product(place: Place) -> None:
-    """Remove a product (stored analysis result) if it exists; of a symbolic link, remove the link but not its target.
-
-    Raises
-    ------
-    RefusedError
-        If the folder that holds it is a link.
-    """
+    """Remove a product (stored analysis result) if it exists; remove a symbolic link, but not its target."""
     files = open_files(place)
     if files.local is None:
         keys = files.everything()
@@ -228,13 +198,7 @@ def leftover_products(files: Files, older_than: float) -> list[Files]:
 
 
 def products_in(files: Files) -> list[Files]:
-    """Return all products (stored results of analyses) in a folder, damaged ones included.
-
-    Raises
-    ------
-    RefusedError
-        If the folder is a link.
-    """
+    """Return all products (stored results of analyses) in a folder, damaged ones included."""
     files.refuse_links("")
     try:
         names = files.names()
@@ -394,12 +358,7 @@ def write_block(files: Files, key: str, ds: xr.Dataset) -> None:
 def read_block(files: Files, key: str) -> xr.Dataset:
     """Read a dataset that `write_block` has written.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is none.
-    DamagedError
-        If its content has changed.
+    Raise `FileNotFoundError` if there is none, and `DamagedError` if its content has changed.
     """
     import xarray as xr
 

@@ -174,32 +174,10 @@ def quick_reading() -> Iterator[None]:
 def read_cells(
     info: RunInfo, plan: Plan, index: int, region: tuple[slice, ...], names: Iterable[str]
 ) -> dict[str, np.ndarray]:
-    """Read variables of some cells of a committed task.
+    """Read variables of some cells of a committed task, in slices of the cell dims that lie in the task's block.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    index
-        Index of the task.
-    region
-        Slices of the cell dims; they lie in the task's block.
-    names
-        Variables of the cube.
-
-    Returns
-    -------
-    dict
-        By variable, an array in the shape of `region` followed by the variable's own dims.
-
-    Raises
-    ------
-    IncompleteError
-        If the task is not committed here.
-    UnreadableError
-        If its record exists and cannot be read.
-    DamagedError
-        If the content of a chunk has changed since it was written.
+    Raise `IncompleteError` if the task is not committed here, `UnreadableError` if its record cannot be read, and
+    `DamagedError` if the content of a chunk has changed since it was written.
     """
     commit = read_commit(info, plan, index)
     if commit is None:
@@ -211,15 +189,10 @@ def read_cells(
 
 
 def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read variables of one committed task of an open run. The dims of the task's block of cells come first, then those
-    of the variable.
+    """Read variables of one committed task of an open run. The dims of the task's block come first, then the
+    variable's.
 
-    Raises
-    ------
-    DamagedError
-        If the content of a chunk has changed since it was written.
-    KeyError
-        If the task is not committed.
+    Raise `DamagedError` if the content of a chunk has changed since it was written.
     """
     return _read(run.info, run.plan, index, run.commits[index], run.plan.task(index), names)
 

@@ -152,16 +152,7 @@ def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
 class Records(Mapping[int, Commit]):
     """Valid commit records of a run by task; records in packs (files of many records) are read on demand.
 
-    Parameters
-    ----------
-    files
-        Files of the run directory.
-    digest
-        Digest of the run.
-    singles
-        Records by task that have their own files, or were salvaged from a damaged pack.
-    packs
-        Whole packs by block.
+    `singles` have their own files, or were salvaged from a damaged pack; `packs` are whole.
     """
 
     def __init__(

@@ -68,12 +68,8 @@ def is_run(files: Files) -> bool:
 def read_run(place: str | Path | Files) -> RunInfo:
     """Read and check ``run.json``.
 
-    Raises
-    ------
-    RefusedError
-        If it does not exist, or has another format.
-    DamagedError
-        If its content has changed since it was written.
+    Raise `RefusedError` if it does not exist or has another format, and `DamagedError` if it has changed since it was
+    written.
     """
     files = open_files(place)
     directory, path = files.name, files.below(RUN_FILE).name

@@ -27,15 +27,8 @@ Echo = Callable[[str], None]
 def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | None:
     """Check whether a run can be started or continued in a directory, without changing anything there.
 
-    Returns
-    -------
-    RunInfo or None
-        The run that is there already; None if it can be set up, or its ``run.json`` must be rebuilt.
-
-    Raises
-    ------
-    RefusedError
-        If the directory holds another run (the message lists the differences) or other files.
+    Return the run that is there already; None if it can be set up, or its ``run.json`` must be rebuilt. Raise
+    `RefusedError` if the directory holds another run (the message lists the differences) or other files.
     """
     files = open_files(place)
     if files.local is not None:
@@ -199,15 +192,9 @@ def establish(
 ) -> RunInfo:
     """Create a run directory or, if it exists, open it and rebuild damaged metadata and coordinates of its result cube.
 
-    Only the holder of the lock may call this.
-
-    If ``run.json`` or a file of the skeleton had to be rebuilt, the committed tasks are compared with their
-    records, and tasks that do not fit are withdrawn.
-
-    Raises
-    ------
-    RefusedError
-        See `check`.
+    Only the holder of the lock may call this. If ``run.json`` or a file of the skeleton had to be rebuilt, the
+    committed tasks are compared with their records, and tasks that do not fit are withdrawn. Raise `RefusedError` as
+    `check`.
     """
     files = open_files(place)
     for key in odd_keys(files, skeleton_keys(spec, plan)):

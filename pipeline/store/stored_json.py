@@ -50,13 +50,7 @@ def fits(content: bytes) -> bool:
 
 
 def unseal(content: bytes) -> dict[str, Any]:
-    """Check the checksum at the end of a JSON object; return the object without it.
-
-    Raises
-    ------
-    SealError
-        If the checksum is missing or does not fit the content.
-    """
+    """Check the checksum at the end of a JSON object; return the object without it, or raise `SealError`."""
     if not fits(content):
         raise SealError("its checksum does not fit" if has_seal(content) else "it ends without its checksum")
     data: dict[str, Any] = json.loads(content)
@@ -154,13 +148,7 @@ class WrongTypeError(ValueError):
 
 
 def parsed(model: type[S], data: Any) -> dict[str, Any]:
-    """Compare stored JSON with its types; return it as plain data.
-
-    Raises
-    ------
-    WrongTypeError
-        If a key is missing or unknown, or a value has another type.
-    """
+    """Compare stored JSON with its types; return it as plain data, or raise `WrongTypeError`."""
     try:
         return model.model_validate(data).model_dump(exclude_unset=True)
     except ValidationError as error:
