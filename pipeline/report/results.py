@@ -17,7 +17,7 @@ from pipeline.specification.spec import Spec
 if TYPE_CHECKING:
     import xarray as xr
 
-    from pipeline.rig.simulation import Rig
+    from pipeline.rig.virtual import Rig
 
 Echo = Callable[[str], None]
 
@@ -105,7 +105,7 @@ class Results:
 
     def rig(self, name: str) -> Rig:
         """Return the simulated test rig that makes a recording of the study."""
-        from pipeline.rig.simulation import load_rig
+        from pipeline.rig.virtual import load_rig
 
         return load_rig(self.study.file(self.study.table.recordings[name].rig))
 
@@ -114,7 +114,7 @@ class Results:
         if name not in self._recordings:
             from pipeline.rig.recordings import read_recording
             from pipeline.rig.recordings.writing import write_raw
-            from pipeline.rig.simulation import simulated
+            from pipeline.rig.virtual import simulated
 
             self._echo(f"{name}: recording of a virtual rig")
             raw, mapping = simulated(self.rig(name), is_csv=True)

@@ -17,13 +17,13 @@ from pipeline.runs.derive import derive
 from pipeline.specification.models import KEPT
 from pipeline.specification.spec import Spec
 from pipeline.store import products
-from pipeline.store.checksums import seal, unseal
+from pipeline.store.arrays import Declared, declared_bytes
 from pipeline.store.commits import read_commits
-from pipeline.store.declared import Declared, declared_bytes
 from pipeline.store.errors import DamagedError
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import SQUARE, duffing, finished
 
 ROOT = Path(__file__).parents[3]

@@ -13,13 +13,13 @@ import pytest
 from pipeline.compute import execute, task
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits, local
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.run import RunDirectory
 from pipeline.store.setup import check, establish
 from pipeline.store.skeleton import skeleton_files
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import duffing, finished, quietly, silent
 
 SPEC = duffing(execution="trajectories_per_task = 2", tolerance=1e-5)

@@ -15,11 +15,10 @@ from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
-from pipeline.store import commits, packing, records
-from pipeline.store.commits import marker_key, read_commits, sweep, write_task
+from pipeline.store import commits, records
+from pipeline.store.commits import Packer, marker_key, pack_block, read_commits, sweep, withdraw, write_task
 from pipeline.store.errors import DamagedError
 from pipeline.store.keys import Owners, keys_of
-from pipeline.store.packing import Packer, pack_block, withdraw
 from pipeline.store.records import block_of_pack
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
@@ -32,7 +31,7 @@ PACKED = ["000000-000001.jsonl", "000002-000003.jsonl", "000004.json"]
 @pytest.fixture(autouse=True)
 def pairs(monkeypatch):
     """Two tasks a pack: of the five tasks one stays alone."""
-    for module in (records, commits, packing):
+    for module in (records, commits):
         monkeypatch.setattr(module, "BLOCK", 2)
 
 

@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from magpend_core.models.model import Model, State
+from magpend_core.models.model import Model, Parameters, State
 from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import WINDOW_S
-from pipeline.rig.edges import Edges
+from pipeline.rig.edges import Edges, find_edges
 from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
@@ -32,34 +32,17 @@ _LEAST_SPARE = 3
 
 @dataclass(frozen=True)
 class Channel:
-    """Measured state of a recording. The slope of the state gives its rate if the rate itself is not measured.
-
-    Attributes
-    ----------
-    name : str
-        Name of the state.
-    place : int
-        Index among the model's states.
-    slope : int
-        Index of the rate's state; -1 if the slope is no state or is measured.
-    smooth : bool
-        Whether the slope is continuous across an edge.
-    """
+    """Measured state of a recording. The slope of the state gives its rate if the rate itself is not measured."""
 
     name: str
-    place: int
-    slope: int
-    smooth: bool
+    place: int  # index among the model's states
+    slope: int  # index of the rate's state; -1 if the slope is no state or is measured
+    smooth: bool  # whether the slope is continuous across an edge
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
     """Return the measured states of a recording. The slope of a state gives its rate if the rate itself is not
     measured.
-
-    Raises
-    ------
-    SpecError
-        If it holds none of the model's states.
     """
     names = model.state_names
 
@@ -84,30 +67,14 @@ def name_of(recording: xr.Dataset) -> str:
 def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER) -> xr.Dataset:
     """Return the states at the rising edges of the drive, from local polynomials with a kink at the edge.
 
-    Parameters
-    ----------
-    recording
-        Recording from `pipeline.rig.recordings.read_recording`; its attribute ``model`` names the states.
-    edges
-        Edges of its drive; windows end at neighbouring edges.
-    window_s
-        Width of the window about an edge [s]. Long windows average noise, short ones follow the motion.
-    order
-        Order of the polynomial on either side, at least 2.
+    Long windows `window_s` [s] average noise, short ones follow the motion; they end at neighbouring edges. The dims
+    are ``edge`` and ``state`` (the known ones). ``section``: states in the units of the model, angles not wrapped;
+    ``section_noise``: their standard deviation from the channels' noise; ``kink``: jump of the state's derivative at
+    the edge, NaN if unknown. The coordinate ``time`` is that of the edge [s]. An edge with too few samples on a side
+    (at a gap or an end) is left out. The attribute ``noise`` holds the noise of a sample by channel, from the
+    residuals, as JSON.
 
-    Returns
-    -------
-    Dataset
-        Dims ``edge``, ``state`` (the known ones). ``section`` (edge, state): states in the units of the
-        model, angles not wrapped; ``section_noise`` (edge, state): their standard deviation from the
-        channels' noise; ``kink`` (edge, state): jump of the state's derivative at the edge, NaN if unknown.
-        Coordinates ``time`` (edge) [s]. An edge with too few samples on a side (at a gap or an end) is left
-        out. The attribute ``noise`` holds the noise of a sample by channel, from the residuals, as JSON.
-
-    Raises
-    ------
-    SpecError
-        If no state is measured, the window is too short for the sampling rate, or no edge has a window.
+    Raise `SpecError` if no state is measured, the window is too short for the sampling rate, or no edge has a window.
     """
     model = model_of(recording)
     channels = channels_of(recording, model)
@@ -234,3 +201,28 @@ def _basis(x: Floats, order: int, smooth: bool) -> Floats:
     shared = [np.ones_like(x), x] if smooth else [np.ones_like(x)]
     own = [side**k for k in range(first, order + 1) for side in (left, right)]
     return np.stack([*shared, *own], axis=1)
+
+
+# ---- phase of the model's section ------------------------------------------------------------------
+
+_SAMPLES = 4096
+_SNAP = 2e-3
+"""Fraction of a period below which a phase counts as 0, since a flank is as wide."""
+
+
+def section_phase(parameters: Parameters, frequency_hz: float) -> float:
+    """Return the phase of the model's stroboscopic section after the drive's rising edge, a fraction of the period in
+    [0, 1).
+
+    It is 0 for sections at the rising edge and without a drive, 0.25 at the maximum of a sine.
+    """
+    from magpend_core.pointwise import drive_level
+
+    period = 1 / frequency_hz
+    time = np.arange(2 * _SAMPLES) * period / _SAMPLES
+    try:
+        rising = find_edges(time, drive_level(time, parameters, frequency_hz)).rising
+    except SpecError:
+        return 0.0
+    share = float(-rising[0] / period % 1.0)
+    return 0.0 if min(share, 1.0 - share) < _SNAP else share

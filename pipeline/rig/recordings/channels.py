@@ -1,15 +1,19 @@
-"""Define findings: reports of faults in a recording and of corrections made to it."""
+"""Define the channels that all readers return, and findings: faults of a recording and corrections made to it."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import xarray as xr
+
+# ---- findings --------------------------------------------------------------------------------------
 
 Severity = Literal["note", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
@@ -17,29 +21,17 @@ SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding: a fault in a recording, or a correction made to it, with its time, severity and description.
+    """Finding: a fault in a recording, or a correction made to it, with its time, severity and description."""
 
-    Attributes
-    ----------
-    kind : str
-        One word, such as ``gap``; `KINDS` describes each.
-    channel : str
-        Name in the dataset, or in the file before it is mapped; empty if it concerns all channels.
-    start_s, end_s : float
-        Place in the recording [s since its first sample]; NaN if it is unknown.
-    severity : str
-        ``note``: a correction as requested, nothing is lost. ``warning``: some samples cannot be used, or are
-        less exact. ``error``: results from this recording will be wrong unless it is corrected.
-    text : str
-        A sentence with the remedy, if there is one.
-    """
-
-    kind: str
-    channel: str = ""
+    kind: str  # one word, such as ``gap``; `KINDS` describes each
+    channel: str = ""  # name in the dataset, or in the file before it is mapped; empty if it concerns all channels
+    # place in the recording [s since its first sample]; NaN if it is unknown
     start_s: float = math.nan
     end_s: float = math.nan
+    # ``note``: a correction as requested, nothing is lost. ``warning``: some samples cannot be used, or are less exact.
+    # ``error``: results from this recording will be wrong unless it is corrected.
     severity: Severity = "warning"
-    text: str = field(kw_only=True)
+    text: str = field(kw_only=True)  # a sentence with the remedy, if there is one
 
 
 KINDS = {
@@ -77,13 +69,7 @@ def to_json(findings: Iterable[Finding]) -> str:
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:
-    """Return findings as printed lines, the most severe first; findings of the same kind and channel share one line.
-
-    Returns
-    -------
-    list of str
-        Empty if there are no findings.
-    """
+    """Return findings as printed lines, the most severe first; findings of the same kind and channel share one line."""
     groups: dict[tuple[str, str, str], list[Finding]] = {}
     for f in sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)):
         groups.setdefault((f.severity, f.kind, f.channel), []).append(f)
@@ -98,20 +84,9 @@ def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) 
 
 
 def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
-    """Return the start and end index of each run of true entries in a mask. The end index is one after the last true
-    entry.
+    """Return the first index of each run of true entries in a mask, and the one after its last, (n_runs, 2).
 
-    Parameters
-    ----------
-    mask
-        Mask, (n,).
-    piece
-        Index of the piece, (n,); stretches end where a piece does.
-
-    Returns
-    -------
-    ndarray
-        First index of each stretch, and the one after its last, (n_runs, 2).
+    Runs end where a piece, given by its index for each sample, does.
     """
     inside = np.concatenate([[False], np.asarray(mask, dtype=bool), [False]])
     change = inside[1:] != inside[:-1]
@@ -124,3 +99,47 @@ def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
     starts = np.sort(np.concatenate([places[::2], cuts]))
     ends = np.sort(np.concatenate([places[1::2], cuts]))
     return np.column_stack([starts, ends])
+
+
+# ---- channels --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """Channel of a file: readings with unit and sample times, in one stretch."""
+
+    name: str  # name as a mapping gives it
+    values: np.ndarray  # readings as in the file, (n,) float64; NaN for fields that are not numbers
+    unit: str = ""  # unit that the file states; empty if it does not
+    # time of the first sample on a clock that the file's channels share [s]; NaN if it is not stated
+    start_s: float = math.nan
+    step_s: float = math.nan  # sampling interval that the file states [s]; NaN if it does not
+    time: np.ndarray | None = None  # time stamps, (n,) [s], if the file has one for each sample
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """Content of a recording's file before any mapping: its channels, in one or more stretches."""
+
+    path: Path
+    format: str
+    sha256: str  # digest of its bytes
+    # channels by name; several if the file separates recordings, such as the cells of MATLAB
+    stretches: tuple[Mapping[str, Channel], ...]
+    findings: tuple[Finding, ...] = ()  # faults of the file itself
+    simulated: bool = False  # whether the file states that its readings are simulated
+    apart: bool = False  # whether each stretch is a piece, even if it continues another
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all channels, in the file's order."""
+        return tuple(dict.fromkeys(name for stretch in self.stretches for name in stretch))
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,24 +1,140 @@
-"""Measure a bifurcation diagram: section points, period and class of motion at each frequency of recorded sweeps."""
+"""Measure a bifurcation diagram: section points, period and class of motion at each frequency of recorded sweeps.
+
+A motion of period k repeats every k sections, up to noise and the rest of a transient. Second differences at
+lag k, x[n + 2k] - 2 x[n + k] + x[n], suppress a transient: if it decays by a factor m per k sections, they
+keep the fraction (1 - m)^2 of it, while first differences keep 1 - m. In units of the sections' own noise
+their root mean square is 1 for a motion of period k, and as large as the motion for any other. The least k
+with a small value is the period. Its confidence is the fraction of resampled sections, with limits between
+half and twice the chosen one, that give the same period.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.sides import UNKNOWN, flags_of
+from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values
 from pipeline.layout.vocabulary import model_attribute, model_of
-from pipeline.products.measured import SweepOptions
+from pipeline.products.measured import MAX_PERIOD, SweepOptions
+from pipeline.products.product import Table
 from pipeline.rig.edges import Edges, edges_of
-from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import find_sections, name_of
-from pipeline.rig.measured.regimes import Regime, find_period
+from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import LEAST, Stretch, cut
 from pipeline.specification.problems import SpecError
+
+# ---- periods ---------------------------------------------------------------------------------------
+
+Floats = npt.NDArray[np.float64]
+
+LIMIT = 2.5
+"""Root mean square of second differences, in units of noise, below which a motion is closed."""
+_LEAST = 6
+"""Fewest second differences that decide on a period."""
+_RESAMPLES = 200
+
+
+@dataclass(frozen=True)
+class Regime:
+    """The estimated period of a motion, with its confidence."""
+
+    orbit_period: int  # period in drive periods; 0 if the motion closes at no tested period
+    confidence: float  # fraction of resamples that give the same period, 0 to 1
+    # root mean square of the second differences at that period, in units of noise. Without a period, the least over all
+    # tested periods.
+    closure: float
+    # ratio by which the decision clears the limit: the least of closure/limit over all shorter periods, and of
+    # limit/closure at this period. Without a period, the least closure/limit.
+    margin: float
+    max_period: int
+
+
+def find_period(
+    points: Floats, noise: Floats, *, limit: float = LIMIT, max_period: int = MAX_PERIOD, seed: int = 0
+) -> Regime:
+    """Estimate the period of a motion from consecutive noisy section points, (n, component), angles not wrapped.
+
+    A full turn per period is a trend, which cancels in second differences. `limit` is the largest closure of a closed
+    motion, in units of noise. A period k needs 2 k + 6 sections; with fewer than 8 sections, the period is 0 with
+    confidence 0.
+    """
+    n = len(points)
+    periods = [k for k in range(1, max_period + 1) if n - 2 * k >= _LEAST]
+    if not periods:
+        return Regime(0, 0.0, np.inf, 0.0, 0)
+    squares = np.full((len(periods), n), np.nan)
+    for row, k in enumerate(periods):
+        squares[row, : n - 2 * k] = _second(points, noise, k)
+    closure = _closure(squares)
+    found = _least(closure, limit)
+    share = _share(squares, found, limit, np.random.default_rng(seed))
+    if found < 0:
+        best = float(closure.min())
+        return Regime(0, share, best, best / limit, periods[-1])
+    rivals = closure[:found] / limit
+    margin = min(limit / float(closure[found]), float(rivals.min()) if found else np.inf)
+    return Regime(periods[found], share, float(closure[found]), margin, periods[-1])
+
+
+def _second(points: Floats, noise: Floats, k: int) -> Floats:
+    """Return the squared second differences of section points at lag `k`, in units of their noise, averaged over the
+    states.
+    """
+    difference = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
+    variance = noise[2 * k :] ** 2 + 4 * noise[k:-k] ** 2 + noise[: -2 * k] ** 2
+    return np.asarray((difference**2 / variance).mean(axis=1))
+
+
+def _closure(squares: Floats) -> Floats:
+    """Return the rms second difference of the section points for each tested period. It is computed for all points and
+    for the later half, and the smaller value is kept.
+    """
+    known = np.isfinite(squares)
+    values = np.where(known, squares, 0.0)
+    later = np.zeros(squares.shape[1], bool)
+    later[squares.shape[1] // 2 :] = True
+    # a lag whose later half is too short is judged by all sections
+    found = []
+    for chosen in (np.ones_like(later), later):
+        count = (known & chosen).sum(axis=1)
+        mean = (values * chosen).sum(axis=1) / np.maximum(count, 1)
+        found.append(np.where(count >= _LEAST, mean, np.inf))
+    return np.asarray(np.sqrt(np.minimum(*found)))
+
+
+def _least(closure: Floats, limit: float) -> int:
+    """Return the index of the least tested period at which the motion closes, or -1 if it closes at none."""
+    closed = np.flatnonzero(closure <= limit)
+    return int(closed[0]) if closed.size else -1
+
+
+def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) -> float:
+    """Return the fraction of bootstrap resamples of the section points that give the same period as all points do.
+
+    Sections are drawn in blocks as long as second differences overlap, for all lags together. The limit is
+    drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor
+    of two.
+    """
+    n = squares.shape[1]
+    block = min(max(4, squares.shape[0]), n)
+    number = -(-n // block)
+    same = 0
+    for _ in range(_RESAMPLES):
+        begins = rng.integers(0, n, number)
+        chosen = (begins[:, None] + np.arange(block)).ravel() % n
+        closure = _closure(squares[:, np.sort(chosen)])
+        same += _least(closure, limit * 2.0 ** rng.uniform(-1, 1)) == found
+    return same / _RESAMPLES
+
+
+# ---- diagram ---------------------------------------------------------------------------------------
 
 _MEMORY = 3.0
 """Scatter of a jittered motion relative to the effect of one edge: each period has two, and effects last."""
@@ -41,35 +157,18 @@ class _Step:
 def measure(
     recordings: Sequence[xr.Dataset], options: SweepOptions | None = None, *, parameters: Parameters | None = None
 ) -> xr.Dataset:
-    """Return section points, period and class of motion at each frequency step of one or more recorded sweeps.
+    """Return section points, period and class of motion at each frequency step of one or more recorded sweeps of one
+    model.
 
-    Parameters
-    ----------
-    recordings
-        Recordings from `pipeline.rig.recordings.read_recording`, all of one model, each with a drive.
-    options
-        How they are cut, sectioned and judged.
-    parameters
-        Parameters of the model, which its classifier needs; without them motions are not classified. The
-        model's forcing gives the phase of the sections in the drive period.
+    Without `parameters`, motions are not classified. The dims are ``step``, ``period_index`` (NaN beyond a step's own)
+    and ``state``. ``section`` and ``section_noise`` (step, period_index, state) have angles not wrapped; by step there
+    are ``frequency_error_hz``, ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (shared by all
+    its sections: it shifts angles by their rates and is not included in ``section_noise``), ``n_sections``, the fields
+    of `Regime`, and ``side`` (codes of the model's classifier). Coordinates of ``step``: ``frequency`` [Hz],
+    ``direction`` (up, down, none), ``recording``, ``start_s``, ``end_s``.
 
-    Returns
-    -------
-    Dataset
-        Dims ``step``, ``period_index`` (NaN beyond a step's own), ``state``. ``section`` and
-        ``section_noise`` (step, period_index, state), angles not wrapped; by step ``frequency_error_hz``,
-        ``jitter_s``, ``duty_cycle``, ``duty_cycle_error``, ``instant_error_s`` (shared by all its
-        sections: it shifts angles by their rates and is not included in ``section_noise``), ``n_sections``,
-        ``orbit_period`` (0: does not close at any tested period), ``confidence``, ``closure``, ``margin``
-        (`regimes.Regime`), ``side`` (codes of the model's classifier; absent without one or without
-        parameters). Coordinates of ``step``: ``frequency`` [Hz], ``direction`` (up, down, none),
-        ``recording``, ``start_s``, ``end_s``.
-
-    Raises
-    ------
-    SpecError
-        For recordings of different models or states, without a drive, without a stretch of one frequency or
-        without sections.
+    Raise `SpecError` for recordings of different models or states, without a drive, without a stretch of one frequency
+    or without sections.
     """
     options = options or SweepOptions()
     models = sorted({model_of(r) for r in recordings}, key=lambda model: model.name)
@@ -240,3 +339,55 @@ def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:
         wrapped = np.where(angles, np.pi - np.mod(np.pi - points, 2 * np.pi), points)
         codes[i] = classifier.classify(wrapped, turns, measured["frequency"].values[i], parameters)
     return measured.assign(side=("step", codes, flags_of(classifier)))
+
+
+def steps_table(measured: xr.Dataset) -> Table:
+    """Return a table of the frequency steps: frequency, jitter, duty cycle, period, confidence, and the comparison with
+    a computed run if there is one.
+    """
+    rows = [_row(measured.isel(step=i)) for i in range(measured.sizes["step"])]
+    return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
+
+
+_MEASURED = ("frequency_error_hz", "direction", "recording", "start_s", "jitter_s", "duty_cycle", "duty_cycle_error")
+
+
+_ORBIT = ("n_sections", "orbit_period", "confidence", "closure", "side")
+
+
+_NEAREST = ("distance", "distance_in_noise", "runner_up", "noise_floor", "winner")
+
+
+_COMPUTED = ("computed_period", "same_period", "same_side")
+
+
+def _row(one: xr.Dataset) -> Row:
+    labelled = ("computed_side",) if model_of(one).classifier else ()
+    names = (*_MEASURED, *_ORBIT, *_NEAREST, *_COMPUTED, *labelled)
+    return {"frequency_hz": float(one["frequency"]), **values(one, *names)}
+
+
+def _words(row: Row) -> Words:
+    error = row["frequency_error_hz"]
+    digits = int(np.clip(1 - math.floor(math.log10(error)), 0, 8)) if 0 < error < 1 else 6
+    words = {
+        "frequency Hz": f"{row['frequency_hz']:.{digits}f} ± {error:.{digits}f}",
+        "way": row["direction"],
+        "jitter ms": number(1e3 * row["jitter_s"], ".3f"),
+        "duty cycle": f"{row['duty_cycle']:.5f} ± {row['duty_cycle_error']:.5f}",
+        "sections": str(row["n_sections"]),
+        "period": str(row["orbit_period"] or "-"),
+        "sure": f"{row['confidence']:.2f}",
+        "side": row.get("side"),
+    }
+    if "winner" not in row:
+        return words
+    nobody = row["winner"] < 0
+    return words | {
+        "nearest": "-" if nobody else str(row["winner"]),
+        "its period": "-" if nobody else str(row["computed_period"] or "-"),
+        "its side": "-" if nobody and "computed_side" in row else row.get("computed_side"),
+        "distance": number(row["distance"], ".4f"),
+        "in noise": number(row["distance_in_noise"], ".2f"),
+        "next": number(row["runner_up"], ".4f"),
+    }

@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.plots import labels, style
-from pipeline.rig.measured_branch.reading import STABILITIES
+from pipeline.rig.measured.branch import STABILITIES
 
 
 @dataclass(frozen=True)
@@ -40,25 +40,12 @@ def plot_branch(
     bands: Bands | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the amplitudes of measured orbits over the parameter, with computed branches if there are any.
+    """Draw the amplitudes of measured orbits over the parameter, with computed branches and their bands if there are
+    any.
 
-    Parameters
-    ----------
-    measured
-        From `read_branch`, compared or not.
-    branches, computed
-        Result of the analysis ``branches``, and the amplitudes of its orbits.
-    bands
-        95 % bands of the branches and intervals of the bifurcations, to be shaded.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Computed branches are solid where stable and dashed where not. Measured orbits are filled where they were
-        stable, open where not, squares where unknown; bars are `BARS` scatters of single cycles to both sides.
-        Its `data` are the measured orbits, with the computed ``branch_parameter`` and ``branch_amplitude``.
+    Computed branches are solid where stable and dashed where not. Measured orbits are filled where they were stable,
+    open where not, squares where unknown; bars are `BARS` scatters of single cycles to both sides. The data are the
+    measured orbits, with the computed ``branch_parameter`` and ``branch_amplitude``.
     """
     data = measured.drop_vars([k for k, v in measured.variables.items() if v.dtype == object])
     if branches is not None and computed is not None:

@@ -20,50 +20,23 @@ LONG = 1.5
 
 @dataclass(frozen=True)
 class DriveFile:
-    """The text of a drive file, with a summary: timing, row and sample counts, interpolation error.
-
-    Attributes
-    ----------
-    text : str
-        Content of the file.
-    timing : Timing or None
-        Frequency, jitter and duty cycle of its edges; None for a torque that is not periodic.
-    n_rows : int
-        Rows of the file's table.
-    n_samples : int
-        Samples of the recording.
-    error : float
-        Largest distance of the torque's samples from the file's interpolated torque; 0 for edges.
-    notes : tuple of str
-        Warnings about periods that may have lost an edge.
-    """
+    """The text of a drive file, with a summary: timing, row and sample counts, interpolation error."""
 
     text: str
-    timing: Timing | None
-    n_rows: int
-    n_samples: int
-    error: float = 0.0
-    notes: tuple[str, ...] = ()
+    timing: Timing | None  # frequency, jitter and duty cycle of its edges; None for a torque that is not periodic
+    n_rows: int  # rows of the file's table
+    n_samples: int  # samples of the recording
+    error: float = 0.0  # largest distance of the torque's samples from the file's interpolated torque; 0 for edges
+    notes: tuple[str, ...] = ()  # warnings about periods that may have lost an edge
 
 
 def drive_file(recording: xr.Dataset, kind: str, *, tolerance: float = 0.0) -> DriveFile:
-    """Make a drive file from a recording: switching times, or values of the torque.
+    """Make a drive file from a recording in one piece: switching times (``edges``), or values of the ``torque``.
 
-    Parameters
-    ----------
-    recording
-        Recording from `pipeline.rig.recordings.read_recording`, with a drive, in one piece.
-    kind
-        ``"edges"`` for the times at which the drive switches; ``"torque"`` for its values.
-    tolerance
-        Samples of a torque are dropped if linear interpolation between the others meets them within this
-        distance [N m].
+    Samples of a torque are dropped if linear interpolation between the others meets them within `tolerance` [N m].
 
-    Raises
-    ------
-    SpecError
-        If there is no drive, if a torque is asked for and the drive is a signal, if the recording has a gap,
-        or if it lacks two rising edges with one falling edge between each two.
+    Raise `SpecError` if there is no drive, if a torque is asked for and the drive is a signal, if the recording has a
+    gap, or if it lacks two rising edges with one falling edge between each two.
     """
     problems = _problems(recording, kind, tolerance)
     if problems:
@@ -153,20 +126,11 @@ def _torque(recording: xr.Dataset, tolerance: float) -> DriveFile:
 
 
 def thinned(time: Floats, level: Floats, tolerance: float) -> npt.NDArray[np.int64]:
-    """Select samples such that linear interpolation between them reproduces all others within a tolerance.
+    """Select samples (their indices, the first and the last included) between which linear interpolation meets all
+    others.
 
-    Parameters
-    ----------
-    time, level
-        Samples, shape (n,); time rises.
-    tolerance
-        Largest distance of a sample from the lines, in the level's unit.
-
-    Returns
-    -------
-    ndarray
-        Indices of the selected samples; the first and the last are included. Each line is extended as long as
-        one slope meets all samples on the way.
+    `tolerance` is the largest distance of a sample from the lines. Each line is extended as long as one slope meets all
+    samples on the way.
     """
     kept, low, high = [0], -np.inf, np.inf
     for i in range(1, len(time)):

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.layout.writing import json_value
-from pipeline.rig.identify.first_guesses import fit_starts
-from pipeline.rig.identify.local import Fit, fit_local
+from pipeline.rig.identify.local import Fit, fit_local, fit_starts
 from pipeline.rig.identify.problem import Piece, Problem
 from pipeline.rig.identify.search import slowest_period
 
@@ -23,21 +22,11 @@ The length is then doubled until it covers the piece: a long piece does not tole
 
 @dataclass(frozen=True)
 class Judgement:
-    """Residuals of measured pieces, with root mean squares and correlations.
-
-    Attributes
-    ----------
-    channels : tuple of str
-        Channels that are compared.
-    pieces : tuple of Piece
-        Pieces that are judged.
-    residuals : tuple of ndarray (n, n_channels)
-        Measured less computed [SI]; NaN where nothing was measured.
-    """
+    """Residuals of measured pieces, with root mean squares and correlations."""
 
     channels: tuple[str, ...]
     pieces: tuple[Piece, ...]
-    residuals: tuple[np.ndarray, ...]
+    residuals: tuple[np.ndarray, ...]  # (n, n_channels) measured less computed [SI]; NaN where nothing was measured
 
     @property
     def rms(self) -> dict[str, float]:
@@ -101,16 +90,7 @@ def known_problem(
 ) -> Problem:
     """Return a least-squares problem in which only the initial states of the given pieces are unknown.
 
-    Parameters
-    ----------
-    problem
-        Problem that was fitted.
-    values
-        All parameters by name [SI].
-    zeros
-        Sensors' zeros by the names of their unknowns [SI].
-    pieces
-        Pieces to be judged.
+    `values` are all parameters by name [SI], `zeros` the sensors' zeros by the names of their unknowns [SI].
     """
     free = tuple(f for f in problem.free if f.name in zeros)
     known = replace(
@@ -128,20 +108,10 @@ def known_problem(
 def judge(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> tuple[Judgement, Fit]:
-    """Judge known parameters on pieces that they were not fitted to. Only the initial states of these pieces are
+    """Judge known parameters on pieces that they were not fitted to; only the initial states of these pieces are
     fitted.
 
-    Parameters
-    ----------
-    problem, values, zeros, pieces
-        See `known_problem`.
-
-    Returns
-    -------
-    Judgement
-        Residuals of the pieces.
-    Fit
-        Fit of the starts. Check that it converged.
+    Return the judgement and the fit of the starts, which may not have converged.
     """
     known = known_problem(problem, values, zeros, pieces)
     longest = max(float(p.time[-1]) for p in known.pieces)
