@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.explorer import RequestError
 from pipeline.explorer.copies.content import Copied
-from pipeline.explorer.copies.packing import packed
-from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import orbit
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.arrays import pack_zipped, unpack_arrays
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import orbit
 from pipeline.products.reporting import report
 
 NONE = np.uint32(0xFFFFFFFF)
@@ -173,8 +173,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
             arrays, said[str(k)] = _orbit(copied.run, int(chosen.cells[k]), count, room)
             held |= {f"{k}.{name}": values for name, values in arrays.items()}
             report("integrating orbits", k + 1, n)
-        copied.objects[f"orbits-{number}"] = packed(held, said)
-    copied.objects["orbit-index"] = packed({"orbit": chosen.orbit, "how": chosen.how})
+        copied.objects[f"orbits-{number}"] = pack_zipped(held, said)
+    copied.objects["orbit-index"] = pack_zipped({"orbit": chosen.orbit, "how": chosen.how})
     missing = "" if n else "This copy was made without orbits; magpend explore integrates them."
     copied.about["orbits"] = {"blocks": blocks, "missing": missing}
     copied.sentences += [missing] if missing else []
@@ -191,7 +191,7 @@ def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -
     sizes = []
     for cell in some.tolist():
         arrays, attrs = _orbit(copied.run, cell, count, room)
-        sizes.append(len(packed(arrays, attrs)))
+        sizes.append(len(pack_zipped(arrays, attrs)))
     return max(1.0, float(np.mean(sizes))) if sizes else 1.0
 
 
@@ -199,7 +199,7 @@ def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[
     """Integrate the orbit from the last section point of a cell, and round it to the precision of the export."""
     try:
         arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
-    except (ExplorerError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
+    except (RequestError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
         return {}, {"cell": cell, "failed": str(error)}
     del arrays["section"]  # the columns have it, of every cell
     if room.brief:

@@ -5,11 +5,13 @@ what follows begins at a multiple of 8; then come the arrays in C order, each pa
 
     {"attrs": {...}, "arrays": {"y": {"dtype": "float64", "shape": [3, 2], "offset": 0}, ...}}
 
-Offsets count from the end of the header. `page/src/arrays.js` is the other end.
+Offsets count from the end of the header. `page/src/arrays.js` is the other end, and `page/src/export-data.js` that
+of the zipped objects of an exported page.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -68,3 +70,44 @@ def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         count = int(np.prod(shape, dtype=np.int64))
         arrays[name] = np.frombuffer(data, dtype, count, begin + place["offset"]).reshape(shape)
     return arrays, header["attrs"]
+
+
+GZIP_LEVEL = 6
+"""Of gzip: beyond it, data of this kind shrink by less than a percent."""
+
+
+def pack_zipped(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
+    """Pack arrays and attributes into gzip-compressed bytes.
+
+    Parameters
+    ----------
+    arrays
+        Arrays by name, of a type in `pipeline.explorer.data.arrays.DTYPES`.
+    attrs
+        Values that JSON can store.
+
+    Raises
+    ------
+    ValueError
+        As `pack_arrays`.
+    """
+    apart: dict[str, dict[str, Any]] = {}
+    stored = {}
+    for name, values in arrays.items():
+        stored[name] = values
+        if values.dtype.itemsize > 1:
+            apart[name] = {"dtype": values.dtype.name, "shape": list(values.shape)}
+            plain = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+            planes = plain.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize)
+            stored[name] = np.ascontiguousarray(planes.T)
+    return _zipped(pack_arrays(stored, {**(attrs or {}), "apart": apart}))
+
+
+def zip_json(value: Any) -> bytes:
+    """Pack a JSON value into gzip-compressed bytes; ValueError if it has NaN or infinity."""
+    return _zipped(json.dumps(value, allow_nan=False, separators=(",", ":")).encode())
+
+
+def _zipped(content: bytes) -> bytes:
+    # no time stamp, so that equal content gives equal bytes
+    return gzip.compress(content, GZIP_LEVEL, mtime=0)

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import NONE, Scheme, schemes
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.verticals import Vertical, vertical
 from pipeline.layout.vocabulary import PENDING
 from pipeline.plots.points import DRAWN, selections
@@ -74,7 +75,7 @@ def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
 
     Raises
     ------
-    ExplorerError
+    RequestError
         If an axis or an index is not there, or the cells are too many.
     DamagedError
         If a chunk is not what was written.
@@ -109,7 +110,7 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
     sizes = tuple(ds.sizes[d] for d in run.plan.dims)
     n_cells = int(np.prod(sizes, dtype=np.int64))
     if n_cells > MOST_POINTS:
-        raise ExplorerError(
+        raise RequestError(
             f"a diagram shows {MOST_POINTS:,} cells at most, and there are {n_cells:,} here; "
             "look at the plane of initial states, or at a zoom of the run."
         )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from pipeline.explorer import RequestError
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
 from pipeline.motion.inputs import Inputs
@@ -29,10 +30,6 @@ T = TypeVar("T")
 
 MOST_LARGE = 2
 """Diagrams that are kept in memory, of up to some 200 MB each."""
-
-
-class ExplorerError(ValueError):
-    """Raised if the page requests something that does not exist; the page shows the message."""
 
 
 @dataclass(frozen=True)
@@ -176,11 +173,11 @@ class ExploredRun(Run):
         return (Axis(first, first, np.array([self.parameters[first]]), False),)
 
     def axis(self, name: str) -> Axis:
-        """Return an axis by name; raise ExplorerError with similar names if there is none."""
+        """Return an axis by name; raise RequestError with similar names if there is none."""
         for axis in self.axes:
             if axis.name == name:
                 return axis
-        raise ExplorerError(unknown_name("axis", name, [a.name for a in self.axes]))
+        raise RequestError(unknown_name("axis", name, [a.name for a in self.axes]))
 
     @property
     def start_dims(self) -> tuple[str, ...]:
@@ -193,11 +190,11 @@ class ExploredRun(Run):
         return int(self.plan.sizes["period_index"])
 
     def check_axes(self, at: Mapping[str, int]) -> None:
-        """Raise ExplorerError if the run has no axis of one of the given names."""
+        """Raise RequestError if the run has no axis of one of the given names."""
         known = [a.name for a in self.axes]
         for name in at:
             if name not in known:
-                raise ExplorerError(unknown_name("axis", name, known or ["none"]))
+                raise RequestError(unknown_name("axis", name, known or ["none"]))
 
     def place(self, at: Mapping[str, int], *, but: str = "") -> dict[str, int]:
         """Check an index on every swept axis except `but`, and return these indices by axis name.
@@ -211,21 +208,21 @@ class ExploredRun(Run):
 
         Raises
         ------
-        ExplorerError
+        RequestError
             If an axis is unknown or missing, or an index lies off it.
         """
         wanted = {a.name: len(a.values) for a in self.axes if a.swept and a.name != but}
         shared = {a.name for a in self.axes if not a.swept or a.name == but}
         for name in at:
             if name not in wanted and name not in shared:
-                raise ExplorerError(unknown_name("axis", name, list(wanted) or ["none"]))
+                raise RequestError(unknown_name("axis", name, list(wanted) or ["none"]))
         found = {}
         for name, size in wanted.items():
             index = at.get(name, 0 if size == 1 else None)
             if index is None:
-                raise ExplorerError(f"at.{name} is missing: give an index from 0 to {size - 1}.")
+                raise RequestError(f"at.{name} is missing: give an index from 0 to {size - 1}.")
             if not 0 <= index < size:
-                raise ExplorerError(f"at.{name} = {index} is out of bounds: it must be 0 to {size - 1}.")
+                raise RequestError(f"at.{name} = {index} is out of bounds: it must be 0 to {size - 1}.")
             found[name] = int(index)
         return found
 
@@ -234,11 +231,11 @@ class ExploredRun(Run):
 
         Raises
         ------
-        ExplorerError
+        RequestError
             If there is no such cell.
         """
         if not 0 <= number < self.plan.n_cells:
-            raise ExplorerError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
+            raise RequestError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
         index = np.unravel_index(number, self.plan.shape)
         return {dim: int(i) for dim, i in zip(self.plan.dims, index, strict=True)}
 

@@ -13,10 +13,10 @@ from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
-from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
-from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import TOLERANCE, finite, fixed_points, orbit_series
 from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
 from pipeline.plots.branches import NAMES
@@ -120,7 +120,7 @@ def curve_orbit(run: Run, curve: int, point: int) -> bytes:
 
     Raises
     ------
-    ExplorerError
+    RequestError
         If there is no such point.
     ArithmeticError
         If the trajectory ends early.
@@ -129,10 +129,10 @@ def curve_orbit(run: Run, curve: int, point: int) -> bytes:
     found = explored.bifurcation_curves()
     n_curves = 0 if found is None else found.sizes["curve"]
     if found is None or not 0 <= curve < n_curves:
-        raise ExplorerError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
+        raise RequestError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
     n_points = int(found["n_points"][curve])
     if not 0 <= point < n_points:
-        raise ExplorerError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
+        raise RequestError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
     source = explored if explored.curves is None else ExploredRun.of(explored.curves)
     parameters, clock_hz = _parameters_at(source, found.isel(curve=curve, point=point))
     state, period = found["section"].values[curve, point], int(found["orbit_period"][curve])

@@ -65,7 +65,7 @@ def plane(run: Run, at: Mapping[str, int]) -> bytes:
 
     Raises
     ------
-    ExplorerError
+    RequestError
         If an axis or an index is not there.
     DamagedError
         If a chunk is not what was written.

@@ -13,9 +13,8 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import FRACTION, NON_NEGATIVE, POSITIVE, Parameter
 from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import Axis, ExploredRun
-from pipeline.explorer.data.plain_text import plain
-from pipeline.explorer.data.series import fixed_points
-from pipeline.explorer.data.verticals import verticals
+from pipeline.explorer.data.orbits import fixed_points
+from pipeline.explorer.data.verticals import plain, verticals
 from pipeline.layout.period_names import period_of, section_name
 from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
 from pipeline.products.registry import ANALYSES

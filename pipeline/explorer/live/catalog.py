@@ -33,7 +33,7 @@ from pipeline.analysis.attractors.finding.spirals import Recurrence
 from pipeline.analysis.ragged import N_IDS, dense, dims_of, isel
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import SAME_SECONDS, STRICT
-from pipeline.explorer.data.series import orbit_series
+from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.settling import Place
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
 from pipeline.products.attractors import IdentifyOptions

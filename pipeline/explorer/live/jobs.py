@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from magpend_core.models.parameters import ParameterError
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
-from pipeline.explorer.live.messages import Request, RequestError
+from pipeline.explorer.live.messages import Request
 from pipeline.explorer.live.settling import CancelledError
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import StoreError
@@ -21,10 +22,10 @@ LOG = logging.getLogger(__name__)
 PATIENCE_S = 8.0
 """Time that the run of a region has to end in order, until it is killed [s]."""
 
-Answer = dict[str, Any] | bytes
+Piece = dict[str, Any] | bytes
 """JSON, or what `pack_arrays` gives."""
 
-Emit = Callable[[Answer], None]
+Emit = Callable[[Piece], None]
 
 
 class Job:
@@ -71,7 +72,7 @@ class Job:
         self._emit(pack_arrays(arrays, {"id": self.id, "kind": kind, **attrs}))
 
 
-def _nowhere(answer: Answer) -> None:
+def _nowhere(answer: Piece) -> None:
     """Ignore an answer; used until a job has a receiver."""
 
 

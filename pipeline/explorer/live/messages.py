@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from pipeline.explorer import RequestError
+
 MOST_BYTES = 65_536
 """Longest message [bytes]."""
 
@@ -26,20 +28,6 @@ MOST_NOISE = 10.0
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Values = Annotated[dict[Name, float], Field(max_length=200)]
 Pair = tuple[float, float]
-
-
-class RequestError(ValueError):
-    """Raised if a message of the page is invalid or cannot be carried out.
-
-    Attributes
-    ----------
-    job : int or None
-        Its ``id``, if that could be read.
-    """
-
-    def __init__(self, sentence: str, job: int | None = None) -> None:
-        super().__init__(sentence)
-        self.job = job
 
 
 class Message(BaseModel):
@@ -162,6 +150,14 @@ def read_request(text: str | bytes) -> Request:
         return _READER.validate_json(text)
     except ValidationError as error:
         raise RequestError(sentence_of(error), number_in(text)) from None
+
+
+def read_region(text: bytes) -> Region:
+    """Read and check a region of the page; raise RequestError if it is invalid."""
+    try:
+        return Region.model_validate_json(text)
+    except ValidationError as error:
+        raise RequestError(sentence_of(error)) from None
 
 
 def sentence_of(error: ValidationError) -> str:

@@ -23,9 +23,10 @@ from pipeline.analysis.attractors.describing import features
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.lockstep import run_alone
 from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
-from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.explorer import RequestError
+from pipeline.explorer.data.orbits import fixed_points, orbit_series
 from pipeline.explorer.live.jobs import Job
-from pipeline.explorer.live.messages import CellPoint, FollowRequest, RequestError
+from pipeline.explorer.live.messages import CellPoint, FollowRequest
 from pipeline.explorer.live.settling import Place, system_at
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.vocabulary import PERIODIC_ORBIT, axis_name

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import KEY
+from pipeline.explorer import RequestError
 from pipeline.explorer.live.jobs import PATIENCE_S, Job
-from pipeline.explorer.live.messages import Region, RequestError, RunRequest
+from pipeline.explorer.live.messages import Region, RunRequest
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.identity import canonical
 from pipeline.layout.limits import check_plan

@@ -33,7 +33,7 @@ from pipeline.analysis.chaos.dimensions import kaplan_yorke_dimension as kaplan_
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
 from pipeline.compute.simulate import simulate as simulate
-from pipeline.explorer.notebook.showing import explorer as explorer
+from pipeline.explorer.notebook import explorer as explorer
 from pipeline.plots import DataFigure as DataFigure
 from pipeline.plots import Frame as Frame
 from pipeline.plots import draw_figure as draw_figure

@@ -14,8 +14,7 @@ from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
-from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.live import Legend, LiveRun
 from pipeline.explorer.live.messages import MOST_BYTES, Region
 from pipeline.explorer.live.regions import zoom_toml, zoomed
 from pipeline.explorer.live.settling import settle_cells

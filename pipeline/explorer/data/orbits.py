@@ -1,28 +1,117 @@
-"""Integrate the orbit through a clicked point of the diagram."""
+"""Integrate orbits for the page: through a clicked point of the diagram, or from an initial state."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Parameters
+from magpend_core import evaluate, trajectory
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.sectioned import of_flow
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import share_interval
 from pipeline.analysis.ragged import dense, isel
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
-from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
 from pipeline.plots.motions import motion_codes, motions_of
 from pipeline.store.run import Run
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+SAMPLES = 128
+"""Instants per drive period or return."""
+
+
+def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarray) -> np.ndarray | None:
+    """Return the positions of the moving points of the model's drawing, shape (n, n_points, 2); None if it has no
+    drawing.
+
+    They are in the order in which `Drawing.points` names them.
+    """
+    if model.drawing is None:
+        return None
+    places = model.drawing.points(states, parameters)
+    return np.stack([np.broadcast_to(p, (len(states), 2)) for p in places.values()], axis=1).astype(float)
+
+
+def fixed_points(model: Model, parameters: Mapping[str, float]) -> dict[str, list[float]]:
+    """Return the positions of those points of the model's drawing that do not move, by name."""
+    if model.drawing is None:
+        return {}
+    return {name: [float(x) for x in place] for name, place in model.drawing.fixed(parameters).items()}
+
+
+def series(
+    parameters: Parameters,
+    clock_hz: float,
+    state: np.ndarray,
+    times: np.ndarray,
+    *,
+    rtol: float,
+    atol: float,
+    with_quantities: bool = True,
+) -> dict[str, np.ndarray]:
+    """Integrate from a section point; return the states over time, the quantities and the drawing's points.
+
+    Parameters
+    ----------
+    parameters
+        Parameters of the model, with or without its Poincare section.
+    clock_hz
+        Drive frequency [Hz]; for a flow any frequency, which affects only the limit on steps.
+    state
+        At time 0, shape (n_states,).
+    times
+        Rising [s], shape (n,).
+    rtol, atol
+        Tolerances.
+    with_quantities
+        Whether the model's quantities are wanted.
+
+    Returns
+    -------
+    dict
+        ``time`` (n,), ``states`` (n, n_states) with angles that run on, ``quantities`` (n, n_quantities), and
+        ``drawing`` (n, n_points, 2) if the model has one.
+
+    Raises
+    ------
+    ArithmeticError
+        If the trajectory ends before the last time.
+    """
+    own = of_flow(parameters)
+    states = trajectory(own, clock_hz, state, times, rtol=rtol, atol=atol)
+    found = {"time": np.asarray(times, np.float64), "states": states}
+    if with_quantities:
+        names = [q.name for q in own.model.quantities]
+        found["quantities"] = evaluate(names, times, states, own, clock_hz)
+    drawing = drawn_points(own.model, own, states)
+    if drawing is not None:
+        found["drawing"] = drawing
+    return found
+
+
+def orbit_series(
+    parameters: Parameters,
+    clock_hz: float,
+    state: np.ndarray,
+    n_periods: int,
+    seconds: float,
+    *,
+    rtol: float = 1e-9,
+    atol: float = 1e-9,
+) -> dict[str, np.ndarray]:
+    """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
+    n = max(1, min(n_periods * SAMPLES, 65_536))
+    times = seconds * np.arange(n + 1) / n
+    return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)
+
 
 TOLERANCE = 1e-9
 """Relative and absolute, of what is integrated here; the run's own where that is smaller."""
@@ -77,7 +166,7 @@ class Cell:
 
 
 def cell_of(run: ExploredRun, number: int) -> Cell:
-    """Read a cell of the run by its number; raise ExplorerError if there is no such cell."""
+    """Read a cell of the run by its number; raise RequestError if there is no such cell."""
     index = run.cell(number)
     cube = run.cube()
     names = [n for n in ("section", "turns", "status", "orbit_period", "lyapunov") if n in cube]
@@ -104,19 +193,19 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
 
     Raises
     ------
-    ExplorerError
+    RequestError
         If there is no such section, or the run's motion has no orbits.
     ArithmeticError
         If the trajectory ends early.
     """
     explored = ExploredRun.of(run)
     if problem := run.spec.motion.refusal("an orbit"):
-        raise ExplorerError(f"{run.name}: {problem}")
+        raise RequestError(f"{run.name}: {problem}")
     found = cell_of(explored, cell)
     section = found.section
     kept = np.isfinite(section).all(axis=1)
     if not 0 <= point < len(section) or not kept[point]:
-        raise ExplorerError(_no_point(found, point, int(kept.sum())))
+        raise RequestError(_no_point(found, point, int(kept.sum())))
     attractor = _attractor(explored, found)
     period = found.period or attractor["period"]
     n_periods = period or N_PERIODS
@@ -147,14 +236,14 @@ def facts(run: ExploredRun, cell: int, point: int | None = None) -> dict[str, An
 
     Raises
     ------
-    ExplorerError
+    RequestError
         If there is no such section.
     """
     found = cell_of(run, cell)
     kept = np.flatnonzero(np.isfinite(found.section).all(axis=1))
     chosen = point if point is not None else int(kept[-1]) if len(kept) else 0
     if chosen not in kept:
-        raise ExplorerError(_no_point(found, chosen, len(kept)))
+        raise RequestError(_no_point(found, chosen, len(kept)))
     attractor = _attractor(run, found)
     said = _attrs(run, found, attractor, False)
     for name in ("fixed", "quantities", "seeds", "note"):  # for drawings of the orbit
@@ -198,7 +287,7 @@ def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndar
     times = np.cumsum(np.asarray(result.return_time)[0, 0])
     reached = times[np.isfinite(times)]
     if not len(reached):
-        raise ExplorerError("the trajectory does not come back to the section from here.")
+        raise RequestError("the trajectory does not come back to the section from here.")
     return np.asarray(reached)
 
 

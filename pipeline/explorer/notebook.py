@@ -1,9 +1,9 @@
-"""Answer the pages of a widget: read their messages, and send what the server would send.
+"""Show a run in a cell of a notebook, whose kernel answers the pages: read their messages, send what the server would.
 
 A page is one output that shows the widget; a notebook can show it several times. Messages of pages are objects with
 ``page``, a name that the page has chosen, and one of
 
-    {"page", "id", "ask": NAME, "words": {...}, "body": TEXT}   a request for data, see `serving.answers`
+    {"page", "id", "ask": NAME, "words": {...}, "body": TEXT}   a request for data, see `answers`
     {"page", "live": TEXT}                                      a message of `live.messages`
     {"page", "open": true}, {"page", "close": true}             the page begins or ends to compute live
 
@@ -21,12 +21,25 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pipeline.explorer.live.jobs import Answer
+from pipeline.explorer.answers import ANSWERS, Answering, Query, RefusedRequestError, Reply
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.live.jobs import Piece
 from pipeline.explorer.live.session import LiveSession
-from pipeline.explorer.serving.answering import Answering, RefusedRequestError
-from pipeline.explorer.serving.answers import ANSWERS, Query, Reply
+from pipeline.specification.extras import import_extra
+from pipeline.specification.problems import SpecError
+from pipeline.store.run import Run
+
+if TYPE_CHECKING:
+    from pipeline.explorer.widget import Explorer
+
+
+LEAST_HEIGHT = 320
+"""Lowest widget in which the diagram has its axes [CSS px]."""
+
 
 LOG = logging.getLogger(__name__)
 
@@ -108,7 +121,7 @@ class Connection:
         if live is None:
             return None
 
-        def emit(answer: Answer) -> None:
+        def emit(answer: Piece) -> None:
             if isinstance(answer, bytes):
                 self._send({"page": page, "live": True}, [answer])
             else:
@@ -154,3 +167,38 @@ class Connection:
             self.close()
         except Exception as error:  # such as a connection that was just lost: nobody is left to be told
             LOG.info("a page of a notebook takes nothing: %s", error)
+
+
+def explorer(run: str | Path | Run, *, curves: str | Path | Run | None = None, height: int = 720) -> Explorer:
+    """Show a run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
+
+    The kernel answers the page: there is no server, and nothing is read from elsewhere.
+
+    Parameters
+    ----------
+    run
+        Run directory, ``s3://BUCKET/PREFIX``, or an opened run.
+    curves
+        Run whose bifurcation curves are shown over the map of two parameters; by default those of the run.
+    height
+        Height of the page [CSS px].
+
+    Returns
+    -------
+    Explorer
+        Widget; as the last value of a cell it is shown. Its ``selected`` is the selected point.
+
+    Raises
+    ------
+    SpecError
+        If anywidget is not installed, or the height is too small.
+    RefusedError, DamagedError, UnreadableError
+        As `Run.open`.
+    """
+    if height < LEAST_HEIGHT:
+        raise SpecError(f"height = {height}: must be {LEAST_HEIGHT} pixels or more.")
+    import_extra("anywidget", "notebook", "explorer")
+    from pipeline.explorer.widget import Explorer
+
+    found = ExploredRun.of(run)
+    return Explorer(found if curves is None else replace(found, curves=Run.open(curves)), height=height)
