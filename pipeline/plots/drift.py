@@ -15,8 +15,7 @@ from pipeline.analysis.tipping.delay import moving_parameter
 from pipeline.layout.moving import at_section
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.selection import at_points
+from pipeline.plots.figure import Run, at_points, frame_of, noted, values_of
 from pipeline.products.figures import DriftFigureOptions
 
 DARKEST, LIGHTEST = 0.0, 0.85

@@ -20,7 +20,7 @@ from pipeline.layout.period_names import once
 from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
+from pipeline.plots.trajectory import Motion, draw_path, draw_portrait, equalise, fixed_handles
 from pipeline.products.product import FigureOptions
 
 MAX_ROWS = 8

@@ -19,7 +19,7 @@ from magpend_core.models.model import Drawing
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
 from pipeline.plots.labels import Measure
-from pipeline.plots.portrait import Motion, draw_portrait
+from pipeline.plots.trajectory import Motion, draw_portrait
 
 TRAIL_S = 0.8
 """Seconds of film that what moves leaves a trail for."""

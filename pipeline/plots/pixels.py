@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 
 from pipeline.layout.attributes import code_flags
 from pipeline.plots import style
-from pipeline.plots.motions import Motions
+from pipeline.plots.palette import Motions
 from pipeline.plots.points import Points, Range, View
 
 MARKER_LIMIT = 200_000

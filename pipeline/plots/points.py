@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout import vocabulary
-from pipeline.plots.motions import Motions, motion_codes, motions_of
+from pipeline.plots.palette import Motions, motion_codes, motions_of
 from pipeline.products.reporting import track
 
 DRAWN = (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED)

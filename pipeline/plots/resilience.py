@@ -17,8 +17,7 @@ from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import ATTRACTS, model_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.selection import at_points
+from pipeline.plots.figure import Run, at_points, frame_of, noted, values_of
 from pipeline.products.figures import ResilienceFigureOptions
 from pipeline.products.resilience import ResilienceOptions
 

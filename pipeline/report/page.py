@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.report.verdicts import Verdict
+from pipeline.report.estimates import Verdict
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -139,7 +139,7 @@ class Outcome:
     found : str
         The measured result with its interval.
     verdict : str
-        See `pipeline.report.verdicts`.
+        See `pipeline.report.estimates`.
     reason : str
         Reason for the verdict, if the numbers alone do not show it.
     required : bool

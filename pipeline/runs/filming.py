@@ -76,7 +76,7 @@ def animation(
     Returns
     -------
     Animation
-        Animation that `pipeline.plots.films.save_animation` draws and writes.
+        Animation that `pipeline.plots.animation.save_animation` draws and writes.
 
     Raises
     ------
@@ -86,8 +86,7 @@ def animation(
         If a trajectory diverges.
     """
     from pipeline.plots.animation import plot_animation, portraits_of
-    from pipeline.plots.figure import run_provenance
-    from pipeline.plots.files import with_provenance
+    from pipeline.plots.figure import run_provenance, with_provenance
 
     if isinstance(options, AnimationOptions):
         wanted = options

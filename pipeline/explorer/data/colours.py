@@ -13,7 +13,7 @@ from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import N_IDS
 from pipeline.layout.vocabulary import BRANCH, split_dims
 from pipeline.plots import palette, style
-from pipeline.plots.motions import motion_codes, motions_of
+from pipeline.plots.palette import motion_codes, motions_of
 
 if TYPE_CHECKING:
     import xarray as xr

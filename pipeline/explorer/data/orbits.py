@@ -21,7 +21,7 @@ from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
-from pipeline.plots.motions import motion_codes, motions_of
+from pipeline.plots.palette import motion_codes, motions_of
 from pipeline.store.run import Run
 
 SAMPLES = 128

@@ -19,8 +19,7 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import TOLERANCE, finite, fixed_points, orbit_series
 from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
-from pipeline.plots.branches import NAMES
-from pipeline.plots.curve_lines import POINT_NAMES
+from pipeline.plots.branches import NAMES, POINT_NAMES
 from pipeline.plots.labels import swept_label
 from pipeline.store.run import Run
 

@@ -22,7 +22,7 @@ from pipeline.explorer.data.verticals import vertical
 from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import told_by
 from pipeline.layout.writing import netcdf_bytes
-from pipeline.plots.files import with_provenance
+from pipeline.plots.figure import with_provenance
 from pipeline.specification.problems import unknown_name
 from pipeline.store.run import Run
 

@@ -28,8 +28,8 @@ from pipeline.explorer.live.settling import Flight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES, axis_name
-from pipeline.plots.motions import COLOURS as MOTION_COLOURS
 from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
+from pipeline.plots.palette import MOTION_COLOURS as MOTION_COLOURS
 from pipeline.runs.derive import stored
 from pipeline.specification.tables import FREQUENCY
 from pipeline.store.run import Run

@@ -55,7 +55,7 @@ from pipeline.plots import plot_section as plot_section
 from pipeline.plots import plot_trajectory as plot_trajectory
 from pipeline.plots import save_data as save_data
 from pipeline.plots import save_figure as save_figure
-from pipeline.plots.films import save_animation as save_animation
+from pipeline.plots.animation import save_animation as save_animation
 from pipeline.rig.identify.identification import identify as identify
 from pipeline.rig.recordings import findings_of as findings_of
 from pipeline.rig.recordings import load_mapping as load_mapping

@@ -17,7 +17,7 @@ from scipy.interpolate import PchipInterpolator
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.plots.files import save_data, save_figure
+from pipeline.plots.figure import save_data, save_figure
 from pipeline.rig.identify.residuals import Series, per_piece, pieces_in, rate_of, residual_views
 from pipeline.rig.measured_branch.figure import plot_branch
 

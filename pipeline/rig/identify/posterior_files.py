@@ -9,7 +9,7 @@ import xarray as xr
 
 from pipeline.analysis.draws import LEVELS
 from pipeline.layout.writing import write_netcdf
-from pipeline.plots.files import save_data, save_figure
+from pipeline.plots.figure import save_data, save_figure
 from pipeline.products.product import Table
 from pipeline.rig.identify.bands import bands, bands_table, stored_tables, tubes
 from pipeline.rig.identify.directory import POSTERIOR, read_result

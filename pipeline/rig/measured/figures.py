@@ -18,7 +18,7 @@ from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.motions import Motions, motions_of
+from pipeline.plots.palette import Motions, motions_of
 from pipeline.rig.measured.computed import Computed
 
 LAYOUTS = ("side", "over")

@@ -7,7 +7,7 @@ from pathlib import Path
 import xarray as xr
 
 from pipeline.layout.writing import write_atomically
-from pipeline.plots.files import save_data, save_figure
+from pipeline.plots.figure import save_data, save_figure
 from pipeline.plots.style import WIDE, Frame
 from pipeline.rig.measured.computed import Computed
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
