@@ -11,10 +11,7 @@ from __future__ import annotations
 class RequestError(ValueError):
     """Raised if a page requests what does not exist or cannot be computed; the page shows the message.
 
-    Attributes
-    ----------
-    job : int or None
-        ``id`` of the live message, if that could be read.
+    `job` is the ``id`` of the live message, if that could be read.
     """
 
     def __init__(self, sentence: str, job: int | None = None) -> None:

@@ -40,13 +40,7 @@ class Query:
     body: bytes = b""
 
     def read(self, name: str) -> Any:
-        """Return an argument: text, a whole number, or for ``at`` the index on each axis from arguments ``at.NAME``.
-
-        Raises
-        ------
-        RequestError
-            If the argument is missing, or is no whole number where one is needed.
-        """
+        """Return an argument: text, a whole number, or for ``at`` the index on each axis from arguments ``at.NAME``."""
         if name == "at":
             return {n.removeprefix(_AT): _whole(n, text) for n, text in self.words.items() if n.startswith(_AT)}
         if name not in self.words:
@@ -166,10 +160,7 @@ THREADS, MOST_WAITING = 3, 12
 class RefusedRequestError(Exception):
     """Raised for a request that is not answered with data.
 
-    Attributes
-    ----------
-    status : int
-        As in HTTP: 400 the request is wrong, 429 too many wait, 500 the run cannot be read.
+    `status` is as in HTTP: 400 the request is wrong, 429 too many wait, 500 the run cannot be read.
     """
 
     def __init__(self, status: int, sentence: str) -> None:
@@ -178,15 +169,7 @@ class RefusedRequestError(Exception):
 
 
 class Answering:
-    """A run that answers requests for data, with the state that all its requests share.
-
-    Requests are answered in a few threads, and what waits is bounded.
-
-    Parameters
-    ----------
-    run
-        Run to show.
-    """
+    """A run that answers requests for data in a few threads; what waits is bounded."""
 
     def __init__(self, run: Run) -> None:
         self.run = ExploredRun.of(run)
@@ -213,14 +196,9 @@ class Answering:
         first.add_done_callback(lambda done: None if done.cancelled() else live.warm(tell))
 
     def ask(self, name: str, query: Query) -> Future[Reply]:
-        """Start to answer a request, and return at once.
+        """Start to answer a request, and return at once. The future gives the reply, or raises RefusedRequestError.
 
         A request that integrates first waits until the code is compiled, and takes no thread meanwhile.
-
-        Returns
-        -------
-        Future
-            The reply; RefusedRequestError if there is none.
         """
         found: Future[Reply] = Future()
         found.set_running_or_notify_cancel()

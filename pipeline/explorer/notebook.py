@@ -56,13 +56,8 @@ class GoneError(Exception):
 class Connection:
     """Messages between the pages of a widget and the run that answers them.
 
-    Parameters
-    ----------
-    answering
-        Run that answers.
-    send
-        ``send(content, buffers)`` sends a message to all pages; called from several threads, one call at a time.
-        If it raises GoneError, all jobs are cancelled.
+    ``send(content, buffers)`` sends a message to all pages; it is called from several threads, one call at a time. If
+    it raises GoneError, all jobs are cancelled.
     """
 
     def __init__(self, answering: Answering, send: Send) -> None:

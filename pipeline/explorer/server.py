@@ -212,15 +212,7 @@ def static_files() -> dict[str, tuple[bytes, str]]:
 
 
 class Service:
-    """State that all request handlers share: the run that answers, the check of requests, and rate limits.
-
-    Parameters
-    ----------
-    run
-        Run to show.
-    guard
-        Check of a request's origin and token.
-    """
+    """State that all request handlers share: the run that answers, the check of requests, and rate limits."""
 
     def __init__(self, run: Run, guard: Guard) -> None:
         from pipeline.explorer.answers import Answering
@@ -399,13 +391,7 @@ def _live_routes(service: Service) -> list[Any]:
 
 
 def listening(port: int) -> socket.socket:
-    """Open a socket that listens on this machine only, at the given or a free port.
-
-    Raises
-    ------
-    SpecError
-        If the port is taken or not ours to take.
-    """
+    """Open a socket that listens on this machine only, at the given or a free port; raise SpecError if it is taken."""
     if not 0 <= port <= 65535:
         raise SpecError(f"--port {port}: must be 0 to 65535; 0 takes a free one.")
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)

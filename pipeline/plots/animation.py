@@ -47,18 +47,10 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Animation:
-    """A film, whose frames are drawn when they are needed.
+    """A film, whose frames are drawn when they are needed."""
 
-    Attributes
-    ----------
-    figure : DataFigure
-        The figure; its `data` hold the numbers drawn.
-    movers : tuple
-        Moving parts; each places its artists for a given sample.
-    """
-
-    figure: style.DataFigure
-    movers: tuple[Any, ...]
+    figure: style.DataFigure  # the figure; its `data` hold the numbers drawn
+    movers: tuple[Any, ...]  # moving parts; each places its artists for a given sample
 
     @property
     def n_frames(self) -> int:

@@ -263,17 +263,11 @@ def plot_bifurcation(
 
 @dataclass(frozen=True)
 class Diagram:
-    """A bifurcation diagram that can be drawn into axes of any figure.
-
-    Attributes
-    ----------
-    measure : Measure
-        The vertical axis.
-    """
+    """A bifurcation diagram that can be drawn into axes of any figure."""
 
     view: View
     survey: Survey
-    measure: Measure
+    measure: Measure  # the vertical axis
     parameter: str
     frame: style.Frame
 

@@ -32,25 +32,13 @@ MATH_SPACE = r"\ "
 
 @dataclass(frozen=True)
 class Measure:
-    """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit.
-
-    Attributes
-    ----------
-    symbol : str
-        For an axis: between dollar signs, or the plain name.
-    unit : str
-        Unit on the axis.
-    factor : float
-        Factor from the stored unit to the unit on the axis.
-    on_circle : bool
-        Whether values that differ by full turns are the same.
-    """
+    """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit."""
 
     name: str
-    symbol: str
-    unit: str
-    factor: float = 1.0
-    on_circle: bool = False
+    symbol: str  # for an axis: between dollar signs, or the plain name
+    unit: str  # unit on the axis
+    factor: float = 1.0  # factor from the stored unit to the unit on the axis
+    on_circle: bool = False  # whether values that differ by full turns are the same
 
     @property
     def label(self) -> str:

@@ -158,30 +158,15 @@ def sizes() -> Sizes:
 
 @dataclass(frozen=True)
 class Look:
-    """A look while it is applied.
+    """A look while it is applied."""
 
-    Attributes
-    ----------
-    rc : dict
-        Its rcParams that differ from matplotlib's defaults; empty in axes of the user.
-    width_mm : float
-        Width of figures for which none is given.
-    dpi : float
-        Resolution of files.
-    asked_dpi : float, optional
-        Resolution for which the user asked.
-    line : float
-        Width of lines [pt] that have the width 1 in magpend's style.
-    colours : tuple of str
-        Colours of data, each once.
-    """
-
+    # its rcParams that differ from matplotlib's defaults; empty in axes of the user
     rc: Mapping[str, Any] = field(default_factory=dict)
-    width_mm: float = WIDE_MM
-    dpi: float = DPI
-    asked_dpi: float | None = None
-    line: float = 1.0
-    colours: tuple[str, ...] = PALETTE
+    width_mm: float = WIDE_MM  # width of figures for which none is given
+    dpi: float = DPI  # resolution of files
+    asked_dpi: float | None = None  # resolution for which the user asked
+    line: float = 1.0  # width of lines [pt] that have the width 1 in magpend's style
+    colours: tuple[str, ...] = PALETTE  # colours of data, each once
 
 
 _PLAIN = Look()

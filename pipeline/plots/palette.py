@@ -61,17 +61,11 @@ PLAIN = "#1A3A5C"
 
 @dataclass(frozen=True)
 class Motions:
-    """Names and colours of the classes of motion of a run, by code.
-
-    Attributes
-    ----------
-    drawn : tuple of int
-        Codes in the order of legends: motions, then what is neutral.
-    """
+    """Names and colours of the classes of motion of a run, by code."""
 
     words: tuple[str, ...]
     colours: tuple[str, ...]
-    drawn: tuple[int, ...]
+    drawn: tuple[int, ...]  # codes in the order of legends: motions, then what is neutral
 
     @property
     def told(self) -> bool:
@@ -146,24 +140,12 @@ def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cast:
-    """Colours and names of the attractors (and other sets) of a run.
+    """Colours and names of the attractors (and other sets) of a run."""
 
-    Attributes
-    ----------
-    colours : dict
-        Colour by id; of a set that attracts nowhere the grey of its stability.
-    names : dict
-        Name by id, such as ``A: period 1, left``.
-    main : tuple of int
-        Ids with a colour of their own: attractors.
-    order : tuple of int
-        All ids as legends list them: by rising period, then tori, chaotic sets and others.
-    """
-
-    colours: dict[int, str]
-    names: dict[int, str]
-    main: tuple[int, ...]
-    order: tuple[int, ...]
+    colours: dict[int, str]  # colour by id; of a set that attracts nowhere the grey of its stability
+    names: dict[int, str]  # name by id, such as ``A: period 1, left``
+    main: tuple[int, ...]  # ids with a colour of their own: attractors
+    order: tuple[int, ...]  # all ids as legends list them: by rising period, then tori, chaotic sets and others
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:

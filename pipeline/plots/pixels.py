@@ -28,21 +28,11 @@ TINT = 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """Marker style for the points of one direction of a continuation.
+    """Marker style for the points of one direction of a continuation."""
 
-    Attributes
-    ----------
-    diameter : float
-        [pt]
-    tint : float
-        Share of white in its colour.
-    faintest : float
-        Opacity of a pixel of an image that holds a single point, where others hold many.
-    """
-
-    diameter: float
-    tint: float = 0.0
-    faintest: float = 0.5
+    diameter: float  # [pt]
+    tint: float = 0.0  # share of white in its colour
+    faintest: float = 0.5  # opacity of a pixel of an image that holds a single point, where others hold many
 
 
 def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:

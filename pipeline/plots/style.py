@@ -143,21 +143,12 @@ STRIP = "<strip>"
 
 @dataclass
 class Target:
-    """Function that makes the next figure, and the figure that it has made.
+    """Function that makes the next figure, and the figure that it has made."""
 
-    Attributes
-    ----------
-    make : callable
-        ``make(figsize=..., layout=..., dpi=...)`` returns the empty figure; `dpi` may be None.
-    is_guest : bool
-        Whether it lies in axes or a figure of the caller, who sets its look.
-    made : DataFigure, optional
-        The figure, once it is made.
-    """
-
+    # ``make(figsize=..., layout=..., dpi=...)`` returns the empty figure; `dpi` may be None.
     make: Callable[..., DataFigure]
-    is_guest: bool = False
-    made: DataFigure | None = None
+    is_guest: bool = False  # whether it lies in axes or a figure of the caller, who sets its look
+    made: DataFigure | None = None  # the figure, once it is made
 
 
 TARGET: ContextVar[Target | None] = ContextVar("TARGET", default=None)

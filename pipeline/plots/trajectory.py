@@ -24,22 +24,12 @@ _AIR = 1.16
 
 @dataclass(frozen=True)
 class Motion:
-    """One motion to draw: its trajectory, its section points and its colour.
+    """One motion to draw: its trajectory, its section points and its colour."""
 
-    Attributes
-    ----------
-    orbit : dict of ndarray
-        Values of each state along the motion, angles not wrapped.
-    section : dict of ndarray
-        The same at the stroboscopic section; may be empty arrays.
-    gid : str
-        Ends the identifiers of what is drawn.
-    """
-
-    orbit: Mapping[str, np.ndarray]
-    section: Mapping[str, np.ndarray]
+    orbit: Mapping[str, np.ndarray]  # values of each state along the motion, angles not wrapped
+    section: Mapping[str, np.ndarray]  # the same at the stroboscopic section; may be empty arrays
     colour: str
-    gid: str = ""
+    gid: str = ""  # ends the identifiers of what is drawn
 
 
 def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:

@@ -18,31 +18,15 @@ NOWHERE = math.nan
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured value with its 95 % confidence interval.
+    """A measured value with its 95 % confidence interval."""
 
-    Attributes
-    ----------
-    value : float
-        The estimate; NaN if nothing could be measured.
-    low, high : float
-        95 % interval; NaN if nothing could be measured.
-    text : str
-        A phrase on the counted or located objects.
-    step : float or None
-        Largest step of the axis there, if it limits the resolution.
-    n : int or None
-        Number of independent cells, curves or periods behind the estimate.
-    missing : str
-        Reason why nothing could be measured; otherwise empty.
-    """
-
-    value: float
-    low: float
+    value: float  # the estimate; NaN if nothing could be measured
+    low: float  # low, high: 95 % interval; NaN if nothing could be measured
     high: float
-    text: str = ""
-    step: float | None = None
-    n: int | None = None
-    missing: str = ""
+    text: str = ""  # a phrase on the counted or located objects
+    step: float | None = None  # largest step of the axis there, if it limits the resolution
+    n: int | None = None  # number of independent cells, curves or periods behind the estimate
+    missing: str = ""  # reason why nothing could be measured; otherwise empty
 
 
 def absent(why: str, step: float | None = None) -> Estimate:

@@ -133,30 +133,14 @@ Echo = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Judgement:
-    """A claim with its measured estimate and the verdict.
+    """A claim with its measured estimate and the verdict."""
 
-    Attributes
-    ----------
-    figure : str
-        Number of the figure.
-    claim : ClaimTable
-        The claim.
-    estimate : Estimate
-        The measured value with its interval.
-    verdict : Verdict
-        The verdict.
-    plain : Verdict
-        The verdict as if nothing had been calibrated on the claim.
-    reason : str
-        Reason for the verdict, if the numbers alone do not show it.
-    """
-
-    figure: str
-    claim: ClaimTable
-    estimate: Estimate
-    verdict: Verdict
-    plain: Verdict
-    reason: str
+    figure: str  # number of the figure
+    claim: ClaimTable  # the claim
+    estimate: Estimate  # the measured value with its interval
+    verdict: Verdict  # the verdict
+    plain: Verdict  # the verdict as if nothing had been calibrated on the claim
+    reason: str  # reason for the verdict, if the numbers alone do not show it
 
     @property
     def fails(self) -> bool:
@@ -166,21 +150,11 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Reproduced:
-    """Result of reproducing a study: its folder, its report page and the judged claims.
+    """Result of reproducing a study: its folder, its report page and the judged claims."""
 
-    Attributes
-    ----------
-    folder : Path
-        Folder with all results.
-    page : Path
-        Path of the HTML page.
-    judgements : list of Judgement
-        Judged claims.
-    """
-
-    folder: Path
-    page: Path
-    judgements: Sequence[Judgement]
+    folder: Path  # folder with all results
+    page: Path  # path of the HTML page
+    judgements: Sequence[Judgement]  # judged claims
 
     @property
     def failed(self) -> list[Judgement]:

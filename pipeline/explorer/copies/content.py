@@ -38,25 +38,13 @@ Place = dict[str, int]
 
 @dataclass
 class Copied:
-    """Data of an exported page, and notes to its reader, as collected so far.
-
-    Attributes
-    ----------
-    view : dict
-        As `describe_view` gives it.
-    about : dict
-        Facts on the export for the page's script.
-    objects : dict
-        Data by name.
-    sentences : list of str
-        Notes on the export for its readers.
-    """
+    """Data of an exported page, and notes to its reader, as collected so far."""
 
     run: ExploredRun
-    view: dict[str, Any]
-    about: dict[str, Any]
-    objects: dict[str, bytes] = field(default_factory=dict)
-    sentences: list[str] = field(default_factory=list)
+    view: dict[str, Any]  # as `describe_view` gives it
+    about: dict[str, Any]  # facts on the export for the page's script
+    objects: dict[str, bytes] = field(default_factory=dict)  # data by name
+    sentences: list[str] = field(default_factory=list)  # notes on the export for its readers
 
     @property
     def x(self) -> str:
@@ -67,19 +55,8 @@ class Copied:
 def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
     """Collect the data that every export has: all except the points of the diagrams and the orbits.
 
-    Parameters
-    ----------
-    run
-        The run.
-    quantities
-        Those of the model that can be on the vertical axis, besides states and kept extremes.
-
-    Raises
-    ------
-    SpecError
-        If the model has no such quantity.
-    DamagedError
-        If what is read of the run is not what was written.
+    `quantities` are those of the model that can be on the vertical axis, besides states and kept extremes; raise
+    SpecError if the model lacks one.
     """
     view, left = _view(run, quantities)
     about: dict[str, Any] = {
@@ -209,26 +186,14 @@ def add_planes(copied: Copied, most_bytes: float) -> None:
 
 @dataclass(frozen=True)
 class Column:
-    """Points of a diagram for one vertical axis, and the number of points of each cell.
+    """Points of a diagram for one vertical axis, and the number of points of each cell."""
 
-    Attributes
-    ----------
-    count : ndarray of uint32, (n_cells,)
-    y : ndarray, (n,)
-    """
-
-    count: np.ndarray
-    y: np.ndarray
+    count: np.ndarray  # uint32 (n_cells,)
+    y: np.ndarray  # (n,)
 
 
 def column(run: ExploredRun, x: str, y: str) -> tuple[Column, dict[str, np.ndarray]]:
-    """Read the diagram points of one vertical axis, with the status and colour codes of the cells.
-
-    Raises
-    ------
-    DamagedError
-        If what is read of the run is not what was written.
-    """
+    """Read the diagram points of one vertical axis, with the status and colour codes of the cells."""
     parts = [points(run, x, y, at) for at in places(run, but=x)]
     cells = np.concatenate([part.cell for part in parts])
     order = np.argsort(cells, kind="stable")
@@ -270,40 +235,23 @@ def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None
 
 @dataclass(frozen=True)
 class Level:
-    """Level of detail of exported diagrams: precision of the numbers, and which section points are kept.
+    """Level of detail of exported diagrams: precision of the numbers, and which section points are kept."""
 
-    Attributes
-    ----------
-    dtype : str
-        Type of the values.
-    each : int
-        Step between kept section points of cells on no closed orbit; 0 keeps all points of all cells. With any
-        other number, cells on closed orbits keep one period.
-    """
-
-    dtype: str
+    dtype: str  # type of the values
+    # step between kept section points of cells on no closed orbit; 0 keeps all points of all cells. With any
+    # other number, cells on closed orbits keep one period.
     each: int
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Diagram points that fit the size limit, packed, with their level of detail.
+    """Diagram points that fit the size limit, packed, with their level of detail."""
 
-    Attributes
-    ----------
-    objects : dict
-        Data by name of the vertical axis.
-    kept, total : int
-        Points of the first vertical axis, here and in the run.
-    closed, others : int
-        Cells with points that are on closed orbits, and that are not.
-    """
-
-    objects: dict[str, bytes]
+    objects: dict[str, bytes]  # data by name of the vertical axis
     level: Level
-    kept: int
+    kept: int  # kept, total: points of the first vertical axis, here and in the run
     total: int
-    closed: int
+    closed: int  # closed, others: cells with points that are on closed orbits, and that are not
     others: int
 
     def sentences(self) -> list[str]:
@@ -336,16 +284,9 @@ def levels(most: int) -> Iterator[Level]:
 
 
 def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) -> Fitted | None:
-    """Pack the diagram points at the finest level of detail that fits a size limit; None if no level fits.
+    """Pack the diagram points at the finest level of detail that fits a size limit [bytes]; None if no level fits.
 
-    Parameters
-    ----------
-    columns
-        Columns by vertical axis, all for the same cells.
-    period
-        Period of each cell's closed orbit; 0 where there is none.
-    most_bytes
-        Size limit for all columns together [bytes].
+    `period` is that of each cell's closed orbit; 0 where there is none.
     """
     longest = max((int(c.count.max(initial=0)) for c in columns.values()), default=0)
     first = next(iter(columns.values()))

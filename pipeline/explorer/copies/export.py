@@ -42,20 +42,12 @@ RESERVE = 10_000
 
 @dataclass(frozen=True)
 class Exported:
-    """Result of an export: its path, its size, its number of orbits, and notes for the user.
-
-    Attributes
-    ----------
-    size : int
-        Size of everything written [bytes].
-    sentences : list of str
-        Notes that the export shows to its readers.
-    """
+    """Result of an export: its path, its size, its number of orbits, and notes for the user."""
 
     path: Path
-    size: int
+    size: int  # size of everything written [bytes]
     orbits: int
-    sentences: list[str] = field(default_factory=list)
+    sentences: list[str] = field(default_factory=list)  # notes that the export shows to its readers
 
 
 def export_page(
@@ -132,13 +124,7 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
 
 
 def check_place(out: Path, force: bool) -> None:
-    """Raise RefusedError if a file exists already or cannot be written, before anything is computed.
-
-    Raises
-    ------
-    RefusedError
-        Saying why.
-    """
+    """Raise RefusedError if a file exists already or cannot be written, before anything is computed."""
     if not out.parent.is_dir():
         raise RefusedError(f"{out.parent}: no such folder; make it first.")
     refuse_place(out)
@@ -249,13 +235,7 @@ def export_folder(
 
 
 def check_folder(out: Path, force: bool) -> None:
-    """Raise RefusedError if a folder exists already or cannot be written, before anything is computed.
-
-    Raises
-    ------
-    RefusedError
-        Saying why.
-    """
+    """Raise RefusedError if a folder exists already or cannot be written, before anything is computed."""
     if not out.parent.is_dir():
         raise RefusedError(f"{out.parent}: no such folder; make it first.")
     refuse_place(out.parent)

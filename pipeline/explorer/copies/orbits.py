@@ -34,55 +34,29 @@ SAMPLE = 6
 
 @dataclass(frozen=True)
 class Room:
-    """Limits of the exported orbits: their number, their bytes, and whether they are shortened.
-
-    Attributes
-    ----------
-    n_bytes : float
-        Before they are written as text.
-    brief : bool
-        Whether fewer digits and periods are kept, so that there are more of them.
-    """
+    """Limits of the exported orbits: their number, their bytes, and whether they are shortened."""
 
     orbits: int
-    n_bytes: float
-    brief: bool
+    n_bytes: float  # before they are written as text
+    brief: bool  # whether fewer digits and periods are kept, so that there are more of them
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Cells whose orbits are exported, and the exported orbit that is shown for each cell.
+    """Cells whose orbits are exported, and the exported orbit that is shown for each cell."""
 
-    Attributes
-    ----------
-    cells : ndarray of int64, (n,)
-        Cells whose orbits are integrated.
-    orbit : ndarray of uint32, (n_cells,)
-        Index into `cells`, or `NONE`.
-    how : ndarray of uint8, (n_cells,)
-    groups : int
-        Attractors at all parameter points; `cells` are fewer where there was no room.
-    """
-
-    cells: np.ndarray
-    orbit: np.ndarray
-    how: np.ndarray
-    groups: int
+    cells: np.ndarray  # int64 (n,); cells whose orbits are integrated
+    orbit: np.ndarray  # uint32 (n_cells,); index into `cells`, or `NONE`
+    how: np.ndarray  # uint8 (n_cells,)
+    groups: int  # attractors at all parameter points; `cells` are fewer where there was no room
 
 
 def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray, most: int) -> Chosen:
     """Choose the cells whose orbits are exported, and the exported orbit that is shown for each cell.
 
-    Parameters
-    ----------
-    run
-        The run.
-    layers
-        Codes by cell: ``colour_attractor``, or else ``colour_motion``; ``orbit_period`` and ``status``.
-    count
-        Number of each cell's points.
-    most
-        Orbits at most. Where there are more attractors, some values of the horizontal axis go without.
+    `layers` are codes by cell: ``colour_attractor``, or else ``colour_motion``; ``orbit_period`` and ``status``.
+    `count` is the number of each cell's points. Where there are more attractors than `most`, some values of the
+    horizontal axis go without.
     """
     labels = _labels(layers)
     point, axis = _parameter_points(run)
@@ -141,18 +115,9 @@ def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int)
 
 
 def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndarray, room: Room) -> int:
-    """Integrate the chosen orbits, and add them to an export. Return their number.
+    """Integrate the orbits that `choosing` chooses, at most as many as it is told, and add them to an export.
 
-    Parameters
-    ----------
-    copied
-        Export to which the orbits are added.
-    choosing
-        Function that chooses at most a given number of orbits.
-    count
-        Number of each cell's points; an orbit starts from the last.
-    room
-        Limits on number and size of the orbits.
+    An orbit starts from the last of the cell's points, whose number is `count`. Return the number of orbits.
     """
     if obstacle := copied.run.spec.motion.obstacle:
         missing = f"This copy has no orbits: {obstacle}."

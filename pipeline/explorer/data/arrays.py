@@ -29,19 +29,9 @@ def _padding(length: int) -> int:
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Pack arrays and attributes into one byte string.
+    """Pack arrays, of a type in `DTYPES`, and attributes that JSON can store into one byte string.
 
-    Parameters
-    ----------
-    arrays
-        Arrays by name, of a type in `DTYPES`.
-    attrs
-        Values that JSON can store. NaN and infinity are not allowed; None stands for a missing value.
-
-    Raises
-    ------
-    ValueError
-        If an array's type is none of `DTYPES`, or an attribute has no place in JSON.
+    NaN and infinity are no attributes; None stands for a missing value. Raise ValueError for what cannot be packed.
     """
     places: dict[str, Any] = {}
     parts: list[Any] = []
@@ -77,20 +67,7 @@ GZIP_LEVEL = 6
 
 
 def pack_zipped(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Pack arrays and attributes into gzip-compressed bytes.
-
-    Parameters
-    ----------
-    arrays
-        Arrays by name, of a type in `pipeline.explorer.data.arrays.DTYPES`.
-    attrs
-        Values that JSON can store.
-
-    Raises
-    ------
-    ValueError
-        As `pack_arrays`.
-    """
+    """Pack arrays and attributes as `pack_arrays` does, and compress them by gzip."""
     apart: dict[str, dict[str, Any]] = {}
     stored = {}
     for name, values in arrays.items():

@@ -53,22 +53,15 @@ class Category:
 
 @dataclass(frozen=True)
 class Scheme:
-    """A colour scheme for cells: a function that computes their codes, and the labels and colours of the codes.
-
-    Attributes
-    ----------
-    codes : callable
-        ``codes(block)``: code of each cell of a loaded part of the cube, an array that broadcasts to those
-        of ``status``; negative for none.
-    needs : tuple of str
-        Variables of the cube that `codes` reads besides ``status``.
-    """
+    """A colour scheme for cells: a function that computes their codes, and the labels and colours of the codes."""
 
     name: str
     title: str
     categories: tuple[Category, ...]
+    # ``codes(block)``: code of each cell of a loaded part of the cube, an array that broadcasts to those of
+    # ``status``; negative for none
     codes: Callable[[xr.Dataset], xr.DataArray]
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # variables of the cube that `codes` reads besides ``status``
 
     def describe(self) -> dict[str, Any]:
         """Return the colour scheme as a dictionary for the page."""

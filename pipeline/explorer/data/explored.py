@@ -34,24 +34,12 @@ MOST_LARGE = 2
 
 @dataclass(frozen=True)
 class Axis:
-    """Axis of a run that a diagram can have as its horizontal axis.
+    """Axis of a run that a diagram can have as its horizontal axis."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the cube's dim; in a run that sweeps nothing, name of the one value that it has.
-    parameter : str
-        Its name in a specification.
-    values : ndarray
-        In the order of the cube.
-    swept : bool
-        Whether it is a dim of the cube.
-    """
-
-    name: str
-    parameter: str
-    values: np.ndarray
-    swept: bool = True
+    name: str  # name of the cube's dim; in a run that sweeps nothing, name of the one value that it has
+    parameter: str  # its name in a specification
+    values: np.ndarray  # in the order of the cube
+    swept: bool = True  # whether it is a dim of the cube
 
 
 @dataclass(frozen=True)
@@ -59,14 +47,9 @@ class ExploredRun(Run):
     """A run opened for the explorer. It reads its result cube and its stored analyses only once.
 
     Reading never computes: what is not in the cube or in ``derived/`` is not there.
-
-    Attributes
-    ----------
-    curves : Run or None
-        Run whose bifurcation curves are shown; None for those of the run itself.
     """
 
-    curves: Run | None = None
+    curves: Run | None = None  # run whose bifurcation curves are shown; None for those of the run itself
 
     _opened: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     _lock: Any = field(default_factory=threading.RLock, compare=False, repr=False)
@@ -197,20 +180,7 @@ class ExploredRun(Run):
                 raise RequestError(unknown_name("axis", name, known or ["none"]))
 
     def place(self, at: Mapping[str, int], *, but: str = "") -> dict[str, int]:
-        """Check an index on every swept axis except `but`, and return these indices by axis name.
-
-        Parameters
-        ----------
-        at
-            Index by axis.
-        but
-            The axis that is left out.
-
-        Raises
-        ------
-        RequestError
-            If an axis is unknown or missing, or an index lies off it.
-        """
+        """Return the index on every swept axis except `but`; raise RequestError if one is unknown or missing."""
         wanted = {a.name: len(a.values) for a in self.axes if a.swept and a.name != but}
         shared = {a.name for a in self.axes if not a.swept or a.name == but}
         for name in at:
@@ -227,13 +197,7 @@ class ExploredRun(Run):
         return found
 
     def cell(self, number: int) -> dict[str, int]:
-        """Convert the flat number of a cell to its index on each dim of the result cube.
-
-        Raises
-        ------
-        RequestError
-            If there is no such cell.
-        """
+        """Convert the flat number of a cell to its index on each dim; raise RequestError if there is none."""
         if not 0 <= number < self.plan.n_cells:
             raise RequestError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
         index = np.unravel_index(number, self.plan.shape)

@@ -65,14 +65,8 @@ def series(
         Parameters of the model, with or without its Poincare section.
     clock_hz
         Drive frequency [Hz]; for a flow any frequency, which affects only the limit on steps.
-    state
-        At time 0, shape (n_states,).
-    times
-        Rising [s], shape (n,).
-    rtol, atol
-        Tolerances.
-    with_quantities
-        Whether the model's quantities are wanted.
+    state, times
+        At time 0, shape (n_states,); rising times [s], shape (n,).
 
     Returns
     -------
@@ -125,28 +119,14 @@ MOST_SEEDS = 200
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell (trajectory) of a run's result cube, with its parameters and its initial state.
-
-    Attributes
-    ----------
-    index : dict
-        Index on each of the cube's dims.
-    data : Dataset
-        The cell itself, loaded.
-    parameters : Parameters
-        With the swept ones.
-    clock_hz : float
-        Drive frequency; of a flow what stands for it [Hz].
-    start : ndarray, (n_states,)
-        The initial state; of a walk that with which it began.
-    """
+    """A cell (trajectory) of a run's result cube, with its parameters and its initial state."""
 
     number: int
-    index: Mapping[str, int]
-    data: xr.Dataset
-    parameters: Parameters
-    clock_hz: float
-    start: np.ndarray
+    index: Mapping[str, int]  # index on each of the cube's dims
+    data: xr.Dataset  # the cell itself, loaded
+    parameters: Parameters  # with the swept ones
+    clock_hz: float  # drive frequency; of a flow what stands for it [Hz]
+    start: np.ndarray  # (n_states,); the initial state; of a walk that with which it began
 
     @property
     def status(self) -> Status:
@@ -178,25 +158,11 @@ def cell_of(run: ExploredRun, number: int) -> Cell:
 
 
 def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
-    """Integrate the orbit through a point of the diagram; return arrays and attributes, packed for the page.
+    """Integrate the orbit through a kept section point of a cell; return it packed for the page.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    cell
-        Flat number of a cell of the cube.
-    point
-        Number of one of its kept sections.
-    linearised
-        Whether the multipliers of a closed orbit are computed where no analysis has them.
-
-    Raises
-    ------
-    RequestError
-        If there is no such section, or the run's motion has no orbits.
-    ArithmeticError
-        If the trajectory ends early.
+    `linearised` says whether the multipliers of a closed orbit are computed where no analysis has them. Raise
+    RequestError if there is no such point or the run's motion has no orbits, ArithmeticError if the trajectory ends
+    early.
     """
     explored = ExploredRun.of(run)
     if problem := run.spec.motion.refusal("an orbit"):
@@ -219,25 +185,10 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
 
 
 def facts(run: ExploredRun, cell: int, point: int | None = None) -> dict[str, Any]:
-    """Return what is known of a section point without integrating: its cell, state and parameters, and its attractor.
+    """Return what is known of a section point (by default the cell's last) without integrating, as JSON can say it.
 
-    Parameters
-    ----------
-    cell
-        Flat number of a cell of the cube.
-    point
-        Number of one of its kept sections; by default the last.
-
-    Returns
-    -------
-    dict
-        What JSON can say. ``state`` has the section point and ``start`` the initial state, by the names of the
-        states; ``attractor`` and what follows from it is None where no analysis has it.
-
-    Raises
-    ------
-    RequestError
-        If there is no such section.
+    ``state`` has the section point and ``start`` the initial state, by the names of the states; ``attractor`` and what
+    follows from it is None where no analysis has it. Raise RequestError if there is no such point.
     """
     found = cell_of(run, cell)
     kept = np.flatnonzero(np.isfinite(found.section).all(axis=1))

@@ -45,25 +45,8 @@ MOST_SECTION = 2000
 def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the curves of Lyapunov exponents and basin fractions along the horizontal axis of a diagram.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    x
-        Name of the horizontal axis.
-    at
-        Index on each other swept axis.
-
-    Returns
-    -------
-    dict
-        ``curves``: each with a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x``
-        rising, and ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
-
-    Raises
-    ------
-    RequestError
-        If an axis or an index is not there.
+    Each of ``curves`` has a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x`` rising, and
+    ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
     """
     explored = ExploredRun.of(run)
     axis, place = explored.axis(x), explored.place(at, but=x)
@@ -154,25 +137,8 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
 def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the branches of periodic orbits that are drawn over a diagram, and their bifurcations.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    x, y
-        Names of its axes; branches have section points, so there are none for an extreme.
-    at
-        Index on each other swept axis; branches that were followed at other values are left out.
-
-    Returns
-    -------
-    dict
-        ``branches`` with segments of one stability, cut where an angle wraps; ``points``; ``note``: why there
-        is nothing, if there is not.
-
-    Raises
-    ------
-    RequestError
-        If an axis or an index is not there.
+    ``branches`` have segments of one stability, cut where an angle wraps; ``note`` says why there is nothing. Branches
+    that were followed at other values than `at` are left out; extremes have none.
     """
     explored = ExploredRun.of(run)
     place, upwards = explored.place(at, but=x), vertical(explored, y)
@@ -257,24 +223,9 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 
 
 def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the attractors and other sets at a parameter point; the set with the largest basin fraction comes first.
+    """Return the attractors and other sets at a parameter point, the largest basin fraction first.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    at
-        Index on every swept axis.
-
-    Returns
-    -------
-    dict
-        ``attractors``, and ``note``: how to get them, where they are not known.
-
-    Raises
-    ------
-    RequestError
-        If an axis or an index is not there.
+    ``note`` says how to get them, where they are not known.
     """
     explored = ExploredRun.of(run)
     place = explored.place(at)
@@ -324,24 +275,9 @@ def _set(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> 
 def disturbances(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the critical shocks of the attractors at a parameter point, and the edge states between them.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    at
-        Index on every swept axis.
-
-    Returns
-    -------
-    dict
-        ``shocks``: for each attractor ``smallest`` (of the states that the analysis shocked, at any phase) and
-        ``shortest`` (of all states, at the section); ``edges``; ``notes``: how to get what is not stored for
-        this point. States are lists in the order of the model's.
-
-    Raises
-    ------
-    RequestError
-        If an axis or an index is not there.
+    ``shocks`` has for each attractor ``smallest`` (of the states that the analysis shocked, at any phase) and
+    ``shortest`` (of all states, at the section); ``notes`` say how to get what is not stored for this point. States are
+    lists in the order of the model's.
     """
     explored = ExploredRun.of(run)
     place = explored.place(at)

@@ -27,20 +27,10 @@ NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or n
 
 
 def parameter_plane(run: Run) -> dict[str, Any]:
-    """Return the bifurcation curves of a run, with the number of attractors over the plane if the run sweeps both
-    parameters.
+    """Return the bifurcation curves of a run, and over their plane the number of attractors if the run sweeps it.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-
-    Returns
-    -------
-    dict
-        ``axes``: names and labels across and upwards; ``curves`` and ``points`` of codimension two; ``map``: values
-        of both axes, the number of attractors at each point, and colours, or None; ``note``: why there are no
-        curves, or None.
+    ``axes`` are across and upwards, ``points`` those of codimension two; ``map`` has values of both axes, the number of
+    attractors at each point, and colours; ``note`` says why there are no curves.
     """
     explored = ExploredRun.of(run)
     found = explored.bifurcation_curves()
@@ -108,21 +98,9 @@ def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
 
 
 def curve_orbit(run: Run, curve: int, point: int) -> bytes:
-    """Integrate the orbit at a point of a bifurcation curve; return arrays and attributes, packed for the page.
+    """Integrate the orbit at a point of a bifurcation curve; return it packed for the page.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    curve, point
-        Number of the curve, and of its point.
-
-    Raises
-    ------
-    RequestError
-        If there is no such point.
-    ArithmeticError
-        If the trajectory ends early.
+    Raise RequestError if there is no such point, ArithmeticError if the trajectory ends early.
     """
     explored = ExploredRun.of(run)
     found = explored.bifurcation_curves()

@@ -23,53 +23,23 @@ _DIVERGED = -2
 
 @dataclass(frozen=True)
 class Plane:
-    """Plane of initial states: its two states, and the label of each initial state.
+    """Plane of initial states: its two states, and the label of each initial state."""
 
-    Attributes
-    ----------
-    states : tuple of str
-        Across and upwards.
-    u, v : ndarray
-        Their values, ascending; empty if the starts are no grid.
-    label : ndarray of int16, (v, u)
-    fixed : dict
-        Values of the other states, those that all starts share.
-    source : str or None
-        ``basins`` where labels are attractors, ``starts`` where they say what the cells themselves tell; None
-        where there is no grid.
-    starts : ndarray, (n, 2)
-        Starts that are no grid.
-    start_label : ndarray of int16, (n,)
-    """
-
-    states: tuple[str, str]
-    u: np.ndarray
+    states: tuple[str, str]  # across and upwards
+    u: np.ndarray  # u, v: their values, ascending; empty if the starts are no grid
     v: np.ndarray
-    label: np.ndarray
-    fixed: Mapping[str, float]
+    label: np.ndarray  # int16 (v, u)
+    fixed: Mapping[str, float]  # values of the other states, those that all starts share
     categories: list[Category]
+    # ``basins`` where labels are attractors, ``starts`` where they say what the cells themselves tell; None where
+    # there is no grid
     source: str | None
-    starts: np.ndarray
-    start_label: np.ndarray
+    starts: np.ndarray  # (n, 2); starts that are no grid
+    start_label: np.ndarray  # int16 (n,)
 
 
 def plane(run: Run, at: Mapping[str, int]) -> bytes:
-    """Return the labelled plane of initial states at a parameter point, packed for the page.
-
-    Parameters
-    ----------
-    run
-        An opened run.
-    at
-        Index on every swept axis.
-
-    Raises
-    ------
-    RequestError
-        If an axis or an index is not there.
-    DamagedError
-        If a chunk is not what was written.
-    """
+    """Return the labelled plane of initial states at a parameter point, packed for the page."""
     found = plane_of(ExploredRun.of(run), at)
     arrays = {
         "u": found.u,

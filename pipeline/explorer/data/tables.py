@@ -38,23 +38,10 @@ Asked = Mapping[str, Any]
 
 
 def table(run: Run, kind: str, asked: Asked, form: str = "csv") -> bytes:
-    """Return the numbers of what the page shows (diagram, orbit, plane, ...) as the bytes of a CSV or NetCDF file.
+    """Return the numbers of what the page shows as the bytes of a file, in one of `FORMATS`.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    kind
-        ``diagram``, ``curves``, ``branches``, ``orbit``, ``plane`` or ``attractors``.
-    asked
-        Arguments of the view: ``x``, ``y``, ``at``, ``cell``, ``point``, if the view takes them.
-    form
-        One of `FORMATS`.
-
-    Raises
-    ------
-    RequestError
-        If the kind, the format or what is asked for does not exist, or the rows are too many for CSV.
+    `kind` is one of `_TABLES`; `asked` has the arguments that it takes of ``x``, ``y``, ``at``, ``cell`` and ``point``.
+    Raise RequestError if one of these does not exist, or the rows are too many for CSV.
     """
     if kind not in _TABLES:
         raise RequestError(unknown_name("view", kind, list(_TABLES)))

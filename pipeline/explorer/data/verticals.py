@@ -41,14 +41,7 @@ def _letter(name: str) -> str:
 
 
 def plain(symbol: str, name: str) -> str:
-    r"""Convert a symbol from LaTeX to plain text, with Greek letters, accents and subscripts of Unicode.
-
-    Parameters
-    ----------
-    symbol
-        LaTeX without dollar signs; may be empty.
-    name
-        Name to use if there is no symbol.
+    r"""Convert a LaTeX symbol (or a name without one) to plain text with Greek letters, accents and subscripts.
 
     Examples
     --------
@@ -78,23 +71,14 @@ _WORDS = {"min": "least", "max": "largest", "mean": "mean"}
 
 @dataclass(frozen=True)
 class Vertical:
-    """A number that a diagram can show on its vertical axis.
-
-    Attributes
-    ----------
-    angle : bool
-        Whether full turns do not matter.
-    variable : str
-        Name of the cube's variable.
-    values : callable
-        ``values(part)`` returns the values in a part of the cube, on the dims of its cells and ``period_index``.
-    """
+    """A number that a diagram can show on its vertical axis."""
 
     name: str
     label: str
     unit: str
-    angle: bool
-    variable: str
+    angle: bool  # whether full turns do not matter
+    variable: str  # name of the cube's variable
+    # ``values(part)`` returns the values in a part of the cube, on the dims of its cells and ``period_index``
     values: Callable[[xr.Dataset], xr.DataArray]
 
     def describe(self) -> dict[str, Any]:

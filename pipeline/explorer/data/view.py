@@ -29,24 +29,10 @@ _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
 def describe_view(run: Run, live: bool) -> dict[str, Any]:
-    """Return a dictionary with all that the page needs to know about a run when it loads.
+    """Return all that the page needs to know about a run when it loads, as JSON can say it.
 
-    Parameters
-    ----------
-    run
-        An opened run; only coordinates, the cells' status and what is kept in ``derived/`` are read.
-    live
-        Whether the page can have trajectories integrated while one watches.
-
-    Returns
-    -------
-    dict
-        What JSON can say. Values of states and parameters are in the model's own units.
-
-    Raises
-    ------
-    DamagedError
-        If a chunk is not what was written.
+    Only coordinates, the cells' status and what is kept in ``derived/`` are read. `live` says whether the page can have
+    trajectories integrated while one watches. Values of states and parameters are in the model's own units.
     """
     explored = ExploredRun.of(run)
     return {

@@ -47,58 +47,26 @@ SAME_REST = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor.
+    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the entry in slices: the run's id of an attractor, or a larger number for any other entry.
-    attractor : int or None
-        The run's id.
-    kind : int
-        Of `vocabulary.KINDS`; absent for a class of cells that is no attractor.
-    period : int
-        Drive periods or returns; 0 if not closed.
-    motion : int
-        Code of the model's classifier.
-    status : int
-        Code of `Status`, of a class of cells that ended; 0 else.
-    points : ndarray, (n, state)
-        Section points; none of a class of cells.
-    seconds : float
-        Period of a limit cycle; NaN else.
-    stability : int
-        Of `vocabulary.STABILITIES`; 0 of a class of cells that ended.
-    """
-
-    number: int
-    attractor: int | None
-    kind: int
-    period: int
-    motion: int
-    status: int
-    points: np.ndarray
-    seconds: float = np.nan
-    stability: int = 0
+    number: int  # number of the entry in slices: the run's id of an attractor, or a larger number for any other entry
+    attractor: int | None  # the run's id
+    kind: int  # of `vocabulary.KINDS`; absent for a class of cells that is no attractor
+    period: int  # drive periods or returns; 0 if not closed
+    motion: int  # code of the model's classifier
+    status: int  # code of `Status`, of a class of cells that ended; 0 else
+    points: np.ndarray  # (n, state); section points; none of a class of cells
+    seconds: float = np.nan  # period of a limit cycle; NaN else
+    stability: int = 0  # of `vocabulary.STABILITIES`; 0 of a class of cells that ended
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """The attractors and cells that a run holds at one parameter point; None where it holds none.
+    """The attractors and cells that a run holds at one parameter point; None where it holds none."""
 
-    Attributes
-    ----------
-    attractors : Dataset or None
-        Attractors of all parameter points of the run.
-    cells : Dataset or None
-        The cube at the point; None where it has no such point.
-    index : tuple of int or None
-        Index of the point in the cube.
-    """
-
-    attractors: xr.Dataset | None = None
-    cells: xr.Dataset | None = None
-    index: tuple[int, ...] | None = None
+    attractors: xr.Dataset | None = None  # attractors of all parameter points of the run
+    cells: xr.Dataset | None = None  # the cube at the point; None where it has no such point
+    index: tuple[int, ...] | None = None  # index of the point in the cube
 
     def here(self) -> xr.Dataset | None:
         """Return the stored attractors of this parameter point; None if there are none."""
@@ -109,17 +77,7 @@ class Known:
 
 
 class Catalog:
-    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it.
-
-    Parameters
-    ----------
-    place
-        The point.
-    known
-        Stored attractors and cells of the run at the point.
-    closure_tolerance
-        Closure tolerance of the run.
-    """
+    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it."""
 
     def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:
         self.place, self.model = place, place.parameters.model
@@ -216,17 +174,10 @@ class Catalog:
         return near
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the catalog number of the attractor on which each cell ends. An unknown periodic orbit becomes a new
-        entry.
+        """Return the catalog number of the attractor on which each cell ends. An unknown orbit becomes a new entry.
 
-        Parameters
-        ----------
-        block
-            Cells at their end.
-        final
-            Whether every cell is to get one; else -1 stays for what is neither on an orbit nor at rest.
-        strictly
-            Whether cells count as closed within a small distance, however loosely the run's own do.
+        With `final` every cell gets one; else -1 stays for what is neither on an orbit nor at rest. With `strictly`
+        cells count as closed within a small distance, however loosely the run's own do.
         """
         numbers = np.full(len(block.status), -1, np.int64)
         if self.model.autonomous:

@@ -29,13 +29,7 @@ Emit = Callable[[Piece], None]
 
 
 class Job:
-    """A live job: a request of the page, with the functions that send its answers.
-
-    Parameters
-    ----------
-    request
-        Request that the job answers.
-    """
+    """A live job: a request of the page, with the functions that send its answers."""
 
     def __init__(self, request: Request) -> None:
         self.request, self.id = request, request.id
@@ -80,15 +74,7 @@ Work = Callable[[Job], None]
 
 
 class Desk:
-    """Queue of live jobs of one kind. One job runs at a time, in a thread that exists only while there are jobs.
-
-    Parameters
-    ----------
-    emit
-        Takes answers.
-    work
-        Does a job.
-    """
+    """Queue of live jobs of one kind. One job runs at a time, in a thread that exists only while there are jobs."""
 
     def __init__(self, emit: Emit, work: Work) -> None:
         self._emit, self._work = emit, work

@@ -36,15 +36,7 @@ from pipeline.store.run import Run
 
 
 class Legend:
-    """Names and colours for the entries of a catalog of attractors.
-
-    Parameters
-    ----------
-    catalog
-        The entries.
-    attractors
-        Attractors of the run; None if they are not known.
-    """
+    """Names and colours for the entries of a catalog, those of the run's attractors if they are known."""
 
     def __init__(self, catalog: Catalog, attractors: xr.Dataset | None) -> None:
         self._catalog, self._model = catalog, catalog.model
@@ -184,13 +176,7 @@ class Session(Protocol):
 
 
 class LiveRun:
-    """A run for live computation, with the state that all its sessions share.
-
-    Parameters
-    ----------
-    run
-        An opened run for which `live_problem` has nothing to say.
-    """
+    """A run for which `live_problem` has nothing to say, with the state that all its live sessions share."""
 
     def __init__(self, run: Run) -> None:
         problem = live_problem(run)
@@ -240,12 +226,9 @@ class LiveRun:
     # ---- parameter points --------------------------------------------------------------------
 
     def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
-        """Return the parameter point for given values; values that are not given are those of the run.
+        """Return the parameter point for given values; the other values are those of the run.
 
-        Raises
-        ------
-        RequestError, ParameterError
-            If a name is unknown, or a value out of bounds.
+        Raise RequestError or ParameterError if a name is unknown, or a value out of bounds.
         """
         parameters = self.spec.values.replace(**values)
         hertz = self._frequency(frequency)
@@ -293,13 +276,7 @@ class LiveRun:
         return tuple(found)
 
     def state(self, values: Mapping[str, float], place: Place) -> np.ndarray:
-        """Return an initial state from values by name; states that are not given are 0.
-
-        Raises
-        ------
-        RequestError
-            If the model has no such state.
-        """
+        """Return an initial state from values by name, 0 for other states; raise RequestError for an unknown name."""
         names = self.model.state_names
         unknown = [name for name in values if name not in names]
         if unknown:

@@ -60,51 +60,25 @@ HALVED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A periodic orbit that a page can refer to: its parameter point, its period and a section point.
-
-    Attributes
-    ----------
-    period : int
-        Drive periods or returns.
-    state : ndarray
-        A section point.
-    """
+    """A periodic orbit that a page can refer to: its parameter point, its period and a section point."""
 
     place: Place
-    period: int
-    state: np.ndarray
+    period: int  # drive periods or returns
+    state: np.ndarray  # a section point
 
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Result of following an orbit: the parameter value and the orbit that were reached, and why it went no further.
+    """Result of following an orbit: the parameter value and the orbit that were reached, and why it went no further."""
 
-    Attributes
-    ----------
-    value : float
-        Parameter value that was reached.
-    point : Point
-        The orbit at this value.
-    sentence : str
-        Why no farther; empty if it was followed to the value wanted.
-    lost : bool
-        Whether there is none beyond, rather than no time.
-    """
-
-    value: float
-    point: Point
-    sentence: str
-    lost: bool
+    value: float  # parameter value that was reached
+    point: Point  # the orbit at this value
+    sentence: str  # why no farther; empty if it was followed to the value wanted
+    lost: bool  # whether there is none beyond, rather than no time
 
 
 class Follower:
-    """Handles a session's requests to follow orbits, and remembers the orbits it has found.
-
-    Parameters
-    ----------
-    live
-        The run.
-    """
+    """Handles a session's requests to follow orbits, and remembers the orbits it has found."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._lock = live, threading.Lock()
@@ -197,21 +171,9 @@ def _value(place: Place, name: str) -> float:
 
 
 def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
-    """Return the periodic orbit of a cell: its parameter point, its period and one of its section points.
+    """Return the periodic orbit of a cell: its parameter point, its period and one of its stored section points.
 
-    Parameters
-    ----------
-    live
-        The run.
-    cell
-        Number of the cell in C order.
-    point
-        Number of one of its stored section points.
-
-    Raises
-    ------
-    RequestError
-        If there is no such cell, or it is on no closed orbit.
+    Raise RequestError if there is no such cell or point, or the cell is on no closed orbit.
     """
     status = live.cube["status"]
     if cell >= status.size:

@@ -47,13 +47,7 @@ _PACKAGES = Path(__file__).parents[3]
 
 
 def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
-    """Return the specification for a selected region, and notes on the parts of it that lie outside the run.
-
-    Raises
-    ------
-    SpecError, RequestError
-        If the region is none of this run's.
-    """
+    """Return the specification for a selected region, and notes on the parts of it that lie outside the run."""
     return zoom(run.spec, changes_of(run, region))
 
 
@@ -132,13 +126,7 @@ def region_name(run: Run, spec: Spec) -> str:
 
 
 class RegionRunner:
-    """Computes the runs of selected regions, one at a time for all users.
-
-    Parameters
-    ----------
-    live
-        The run.
-    """
+    """Computes the runs of selected regions, one at a time for all users."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._busy = live, live.region_lock

@@ -38,12 +38,7 @@ LOG = logging.getLogger(__name__)
 class LiveSession:
     """Live session of one page: its queues of jobs, and the function that sends answers.
 
-    Parameters
-    ----------
-    live
-        Run with the state that all sessions share.
-    emit
-        Function that sends an answer; called from threads of jobs, one call at a time for each kind of job.
+    `emit` is called from threads of jobs, one call at a time for each kind of job.
     """
 
     def __init__(self, live: LiveRun, emit: Callable[[Piece], None]) -> None:

@@ -88,17 +88,7 @@ def _too_long(steps: int) -> str:
 
 
 class _NoisyPath:
-    """Trajectory with noise that is integrated a few periods at a time, with the bits of a cell of a noisy run.
-
-    Attributes
-    ----------
-    states : list of str
-        States whose equations have noise.
-    steps : int
-        Steps per period.
-    done : int
-        Periods integrated so far.
-    """
+    """Trajectory with noise that is integrated a few periods at a time, with the bits of a cell of a noisy run."""
 
     def __init__(self, live: LiveRun, place: Place, state: np.ndarray, strength: float, seed: int) -> None:
         model, self.states = live.model, noisy_states(live.model)
