@@ -29,23 +29,8 @@ def draw_bands(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | 
     """Shade the bands about the section points of orbits, and draw the intervals of bifurcations as horizontal bars.
 
     A bar goes through the first section point of its bifurcation. Bifurcations at which no stable orbit begins or ends
-    have none, and neither have those that fewer than half of the draws have.
-
-    Parameters
-    ----------
-    ax
-        Axes with final limits.
-    bands
-        From the analysis ``bands``.
-    measure
-        Vertical axis: a state.
-    max_period
-        Longest period of the drawn orbits; by default all.
-
-    Returns
-    -------
-    list
-        Handles for the legend.
+    have none, and neither have those that fewer than half of the draws have. The limits of the axes are final. Return
+    handles for the legend.
     """
     edges: list[float] = []
     levels = bands["section_level"].sel(state=measure.name).values
@@ -111,19 +96,9 @@ LOOKS: dict[str, dict[str, Any]] = {
 
 
 def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Draw in a strip the share of cells that have no point in the diagram, and shade parameter values where no cell
-    has one.
+    """Draw in a strip below a diagram the share of cells without points, and shade values where no cell has one.
 
-    Parameters
-    ----------
-    ax, strip
-        Axes of the diagram, and of the strip below it.
-    x
-        Values of the parameter.
-    survey
-        Result of `pipeline.plots.points.survey`; it counts the cells along the parameter.
-    layers
-        Indices of the layers (directions) that the axes show.
+    The survey counts the cells along the parameter `x`; `layers` are the indices of the directions that the axes show.
     """
     edges = style.edges(x)
     cells = survey.cells[list(layers)].sum(0)

@@ -29,13 +29,7 @@ from pipeline.specification.problems import unknown_name
 
 
 def at_points(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
-    """Select values of a result cube's swept parameters and initial states; the selected dims become scalars.
-
-    Raises
-    ------
-    ValueError
-        If an axis is unknown or does not have the value.
-    """
+    """Select values of swept parameters and initial states; the dims become scalars. ValueError if one is not there."""
     _, starts = split_dims(ds["status"])
     given = dict(at or {})
     for name in [n for n in given if n in starts and n in ds.coords]:
@@ -215,10 +209,7 @@ def frame_of(options: FigureOptions) -> Frame:
 def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
     """Return the axis values at which a figure is drawn, and notes where they differ from the options.
 
-    Raises
-    ------
-    ValueError
-        If an axis is unknown, or lacks the value and ``nearest`` is not set. Raised before any computation.
+    Raise ValueError, before any computation, if an axis is unknown, or lacks the value and ``nearest`` is not set.
     """
     given: Mapping[str, float] = options.at
     cube = run.cube()

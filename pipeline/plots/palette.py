@@ -151,13 +151,8 @@ class Cast:
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     """Choose colours and names for the attractors (and other sets) of a run.
 
-    Parameters
-    ----------
-    attractors
-        Result of `pipeline.analysis.attractors.attractors.match` for the whole run, so that a colour does not
-        change with what is selected of it.
-    part
-        Part of the dataset that the names describe; by default all of it.
+    `attractors` are those of the whole run, so that a colour does not change with what is selected of it; `part` is
+    what the names describe, by default all.
     """
     sets = _sets(attractors)
     attracts = [one["stability"].values == ATTRACTS for one in sets]
@@ -279,16 +274,7 @@ def new_panel(
 ) -> tuple[style.DataFigure, Axes]:
     """Make a figure with one panel, and a legend beside it (or below it in a narrow figure).
 
-    Parameters
-    ----------
-    data
-        Data to draw.
-    entries
-        Lines of the legend.
-    frame
-        Width of the figure.
-    height
-        Minimum height [in] at full width; the figure grows with the legend.
+    `height` is the least one [in] at full width; the figure grows with the legend.
     """
     look = style.sizes()
     room = frame.width_in * (1.0 if frame.compact else 0.33) - 0.35
@@ -341,14 +327,8 @@ def percent(share: float) -> str:
 def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> None:
     """Write the letter of each attractor into the widest part of its area in an image, if the letter fits there.
 
-    Parameters
-    ----------
-    ax
-        Axes that the codes fill, at their final place.
-    codes
-        Ids on a raster of equal cells, rows from below; some 400 each way are enough.
-    attractors
-        Ids to be written.
+    The axes are at their final place. `codes` are ids on a raster of equal cells, rows from below; some 400 each way
+    are enough.
     """
     box = ax.get_window_extent()
     sampling = np.array([box.height / codes.shape[0], box.width / codes.shape[1]]) / ax.figure.dpi

@@ -52,16 +52,9 @@ class Panel:
 
 
 def draw_points(panels: Sequence[Panel], view: View, diameter: float) -> xr.Dataset:
-    """Draw the points of a `View` into axes whose positions and limits are final.
+    """Draw the points of a `View` into panels of equal size, whose positions and limits are final.
 
-    Parameters
-    ----------
-    panels
-        Panels of equal size and limits.
-    view
-        The points.
-    diameter
-        Diameter of the marker of a single layer [pt].
+    `diameter` is that of the marker of a single layer [pt].
 
     Returns
     -------
@@ -209,18 +202,8 @@ def paint(
 ) -> None:
     """Paint points into an image. Each pixel has the colour of the class of motion that has most points there.
 
-    Parameters
-    ----------
-    picture
-        RGB from 0 to 1, shape (row, column, 3); changed in place.
-    spread
-        Counts by code of motion.
-    look
-        Marker style of the layer.
-    colours
-        Colours by code.
-    reference
-        Count of points at which a pixel is fully dark.
+    The image is RGB from 0 to 1, shape (row, column, 3), and changed in place. `spread` are counts by code of motion; a
+    pixel with `reference` points is fully dark.
     """
     if not spread:
         return

@@ -147,17 +147,9 @@ def _joined(known: Range, values: np.ndarray) -> Range:
 
 
 def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Range | None = None) -> Survey:
-    """Read a result cube once to find the ranges of its points, the classes of motion that occur, and the cells without
-    points.
+    """Find the ranges of the points to draw, the classes of motion that occur, and the cells without points.
 
-    Parameters
-    ----------
-    view
-        Points to draw.
-    along
-        Dim along which absent cells are counted; by default all in one.
-    xlim, ylim
-        Ranges of the axes.
+    Absent cells are counted along the dim `along`, by default all in one.
     """
     size = view.ds.sizes[along] if along else 1
     shape = (len(view.layers), size)

@@ -33,21 +33,7 @@ class Motion:
 
 
 def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:
-    """Draw a phase portrait: the motion as a line, and its section points as dots.
-
-    Parameters
-    ----------
-    ax
-        The panel.
-    ds
-        Dataset of the run, from which the model is read.
-    pair
-        States to the right and upwards.
-    motion
-        Motion to draw.
-    degrees
-        Degrees for angles and their rates.
-    """
+    """Draw a phase portrait (`pair` to the right and upwards): the motion as a line, and its section points as dots."""
     states = {s.name: s for s in model_of(ds).states}
     measures = [labels.state_measure(ds, n, degrees and states[n].unit.startswith("rad")) for n in pair]
     lines = [np.asarray(motion.orbit[name], dtype=np.float64) for name in pair]
@@ -99,22 +85,7 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
 def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
     """Draw the path of the traced point of the model's drawing, and the near points that do not move.
 
-    Parameters
-    ----------
-    ax
-        The panel.
-    drawing
-        Mechanical drawing of the model.
-    parameters
-        Parameter values of the model.
-    motion
-        Motion to draw.
-
-    Returns
-    -------
-    list of str
-        Names of the fixed points that are near enough to be shown. `equalise` the axes once they have
-        their place.
+    Return the names of those points. `equalise` the axes once they have their place.
     """
     states = np.stack([motion.orbit[name] for name in motion.orbit], axis=-1)
     place = drawing.points(states, parameters)[drawing.trace]

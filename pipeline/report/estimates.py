@@ -73,19 +73,9 @@ class Verdict(Enum):
 
 
 def judged(low: float, high: float, least: float, most: float) -> Verdict:
-    """Judge a claim by comparing the confidence interval of a measured number with the claimed range.
+    """Judge a claim: met if the confidence interval lies inside the claimed range, not met if outside, else undecided.
 
-    Parameters
-    ----------
-    low, high
-        Confidence interval of the measured number; NaN if nothing was measured.
-    least, most
-        Claimed range; infinite on a side without a bound.
-
-    Returns
-    -------
-    Verdict
-        Met if the interval lies inside the claimed range, not met if it lies outside, otherwise undecided.
+    A claimed range is infinite on a side without a bound; the interval is NaN if nothing was measured.
     """
     if not low <= high:  # NaN too
         return Verdict.UNDECIDED

@@ -39,20 +39,7 @@ if TYPE_CHECKING:
 
 
 def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
-    """Return the options of each valid stored result of an analysis.
-
-    Parameters
-    ----------
-    run
-        An opened run.
-    name
-        Name of the analysis.
-
-    Returns
-    -------
-    list of dict
-        Options that differ from their defaults, those with the fewest first.
-    """
+    """Return the options, as far as they differ from the defaults, of each valid stored result; the fewest first."""
     found, wanted = [], current(run, name)
     for place in products_in(run.info.files.below(DERIVED)):
         try:
@@ -102,15 +89,7 @@ SHOWN = {
 
 
 class Shown:
-    """A run that a report shows, with its result cube.
-
-    Parameters
-    ----------
-    run
-        The run.
-    computed
-        Analyses that may be computed; other analyses are shown only if they are stored.
-    """
+    """A run that a report shows, with its result cube; analyses not in `computed` are shown only if they are stored."""
 
     def __init__(self, run: AnalysedRun, computed: tuple[str, ...]) -> None:
         self.run, self.computed = run, computed
@@ -131,22 +110,7 @@ class Shown:
 
 
 def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tuple[str, ...] = CHEAP) -> Part:
-    """Make the section of a report about one run.
-
-    Parameters
-    ----------
-    source
-        Run directory, or an opened run.
-    echo
-        Function that prints a line about each computation.
-    computed
-        Analyses that are computed if they are not stored.
-
-    Raises
-    ------
-    RefusedError, DamagedError, UnreadableError
-        See `pipeline.store.run.Run.open`.
-    """
+    """Make the section of a report about one run; analyses in `computed` are computed if they are not stored."""
     shown = Shown(AnalysedRun.of(source, echo), computed)
     title = shown.run.info.title or shown.run.name.rpartition("/")[2]
     parts = [

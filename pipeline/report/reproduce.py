@@ -86,17 +86,7 @@ def _command_of_picture(results: Results, table: PictureTable) -> str:
 
 
 def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz: float) -> DataFigure:
-    """Draw quantities of a model over one drive period, with all states at 0.
-
-    Parameters
-    ----------
-    parameters
-        Parameters of the model.
-    names
-        Names of the model's quantities.
-    frequency_hz
-        Drive frequency [Hz].
-    """
+    """Draw quantities of a model over one drive period, with all states at 0."""
     from magpend_core import evaluate
     from pipeline.plots import style
     from pipeline.plots.labels import with_unit

@@ -147,17 +147,7 @@ class StudyTable(Table):
 
 
 class Study:
-    """A study: its name, the path of its TOML file and the content of this file.
-
-    Parameters
-    ----------
-    name
-        Name of the study.
-    path
-        Path of the study's file.
-    table
-        Content of the file.
-    """
+    """A study: its name, the path of its TOML file and the content of this file."""
 
     def __init__(self, name: str, path: Path, table: StudyTable) -> None:
         self.name, self.path, self.table = name, path, table
@@ -173,13 +163,7 @@ def shipped_studies() -> dict[str, Path]:
 
 
 def load_study(name: str | Path) -> Study:
-    """Read a study, given by its TOML file or by the name of a study that ships with the package.
-
-    Raises
-    ------
-    SpecError
-        If keys, names or measures are wrong; the message lists all problems.
-    """
+    """Read a study, given by its file or the name of one that ships; raise SpecError with all its problems."""
     path, shipped = Path(name), shipped_studies()
     if not path.suffix and str(name) in shipped:
         path = shipped[str(name)]
@@ -232,23 +216,10 @@ Echo = Callable[[str], None]
 
 
 class Results:
-    """Results of a study in a folder; each is computed when it is first needed.
+    """Results of a study in a folder; each is computed when it is first needed, in small sizes if `smoke`.
 
     Runs lie in ``runs/`` and are completed, not repeated. Recordings and fits take seconds and are computed
     again, with the same numbers.
-
-    Parameters
-    ----------
-    study
-        Study to compute.
-    folder
-        Folder of the results, which is made if necessary.
-    smoke
-        Whether to use the small sizes of the specifications.
-    workers
-        See `pipeline.runs.run.run`.
-    echo
-        Function that prints a line.
     """
 
     def __init__(self, study: Study, folder: Path, *, smoke: bool, workers: int | None, echo: Echo) -> None:
@@ -261,10 +232,7 @@ class Results:
     def prepare(self, names: set[str]) -> None:
         """Check the inputs of the results that are needed, then compute the runs among them.
 
-        Raises
-        ------
-        SpecError
-            If specifications, rigs or headers are wrong; before anything is computed, with all problems.
+        Raise SpecError with all problems of specifications, rigs and headers, before anything is computed.
         """
         self._check(names)
         for name in self.study.table.runs:
