@@ -1,6 +1,6 @@
 """Show a run on an interactive web page, served on this machine, in a notebook, or exported as files.
 
-`answers` lists what a page can request and `live` computes while the user watches; `server` and `notebook` carry
+`answers` lists what a page can request and `live` computes while the user watches; `server` and `connection` carry
 requests and answers, and `copies` exports pages that hold the answers. `data` reads the run. `page/` has the page's
 sources, `static/` the files built from them.
 """

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from pipeline.explorer.live.session import LiveSession
 
 
+LOG = logging.getLogger(__name__)
+
 _REDIRECT = """<!doctype html>
 <html lang="en">
 <head>
@@ -81,8 +83,6 @@ def browser() -> Iterator[Callable[[str], None]]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
-
-LOG = logging.getLogger(__name__)
 
 MOST_CONNECTIONS = 8
 """Pages that may watch at once."""

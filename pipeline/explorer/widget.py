@@ -16,9 +16,9 @@ import traitlets
 
 from pipeline.explorer import RequestError
 from pipeline.explorer.answers import Answering
+from pipeline.explorer.connection import LEAST_HEIGHT, Connection, GoneError
 from pipeline.explorer.data.orbits import facts
 from pipeline.explorer.data.tables import orbit_dataset
-from pipeline.explorer.notebook import LEAST_HEIGHT, Connection, GoneError
 from pipeline.store.run import Run
 
 if TYPE_CHECKING:

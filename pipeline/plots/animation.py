@@ -93,28 +93,10 @@ class Animation:
 def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800) -> Animation:
     """Lay out a film that shows one or more motions side by side.
 
-    Parameters
-    ----------
-    ds
-        Result of `pipeline.runs.instants.filmed`, with the attribute ``fps``.
-    degrees
-        Degrees for angles and their rates.
-    portrait
-        State whose phase portrait is shown. By default a single motion shows all portraits;
-        several motions show the model's first.
-    size
-        Width of a frame [pixels]; must be even for video encoders.
-
-    Returns
-    -------
-    Animation
-        Motions that repeat within the film show their whole path from the start. Other paths grow as the film
-        runs. Dots are section points.
-
-    Raises
-    ------
-    ValueError
-        If there is no portrait of that state, or degrees are asked for of a model without angles.
+    `ds` is from `pipeline.runs.instants.filmed`, with the attribute ``fps``; `size` is the width of a frame [pixels],
+    even for video encoders. By default a single motion shows all portraits, and several the model's first. Motions that
+    repeat within the film show their whole path from the start; other paths grow as the film runs. Dots are section
+    points. Raise ValueError if there is no portrait of that state, or degrees are asked for of a model without angles.
     """
     model = model_of(ds)
     pairs = portraits_of(model, portrait, ds.sizes["motion"], degrees)

@@ -293,20 +293,9 @@ def plot_edge(
     degrees: bool = False,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the section points of edge states, alone or on a figure of basins.
+    """Draw the section points of edge states, alone or on a figure of basins over the states `axes`.
 
-    Parameters
-    ----------
-    ds
-        Result of the analysis ``edge``.
-    basins
-        A figure of basins over the states `axes`, which is drawn on.
-    axes
-        Names of the two states; by default the first two. Points are projected on their plane.
-    degrees
-        Degrees instead of radians.
-    frame
-        Width of the figure and ranges of its axes.
+    By default these are the first two states; points are projected on their plane.
     """
     names = axes or tuple(str(name) for name in ds["state"].values[:2])
     measures = [labels.state_measure(ds, name, degrees) for name in names]

@@ -31,28 +31,12 @@ def plot_rates(
 ) -> style.DataFigure:
     """Draw rates of escape with their intervals over the one swept parameter that is left.
 
-    Parameters
-    ----------
-    ds
-        Result of the analysis ``escapes``.
-    at
-        Values of the axes that are not drawn.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        With a logarithmic axis of rates. Over the strength σ of a noise the other axis is 1/σ², on which
-        Kramers' law is a line; an open marker is the upper end of the interval where no cell left.
-
-    Raises
-    ------
-    ValueError
-        If not exactly one swept parameter is left.
+    The axis of rates is logarithmic. Over the strength σ of a noise the other axis is 1/σ², on which Kramers' law is a
+    line; an open marker is the upper end of the interval where no cell left. Raise ValueError if not exactly one swept
+    parameter is left.
     """
-    part = _at(ds, at)
-    dims = [str(d) for d in part["rate"].dims if d != "set"]
+    part = _at(ds, "rate", at)
+    dims = _axes(part, "rate")
     if len(dims) != 1:
         raise ValueError(
             f"rates are drawn over one axis, and {len(dims)} are left ({', '.join(dims) or 'none'}); choose values "
@@ -98,20 +82,12 @@ def _draw_points(ax: Axes, x: np.ndarray, one: xr.Dataset, colour: str, marker: 
 def plot_paths(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw mean and spread of the sections before cells leave, a panel for each state.
+    """Draw mean and spread of the sections before cells leave, at one parameter point, a panel for each state.
 
-    Parameters
-    ----------
-    ds, at, frame
-        See `plot_rates`; all axes must have a value.
-
-    Returns
-    -------
-    DataFigure
-        Lines are means, bands one standard deviation on either side; the set in which cells begin has a colour.
+    Lines are means, bands one standard deviation on either side; the set in which cells begin has a colour.
     """
-    part = _at(ds, at)
-    dims = [str(d) for d in part["rate"].dims if d != "set"]
+    part = _at(ds, "rate", at)
+    dims = _axes(part, "rate")
     if dims:
         raise ValueError(f"paths are drawn at one parameter point; choose a value of {dims[0]} with at")
     states = [str(s) for s in part["state"].values]
@@ -137,9 +113,13 @@ def plot_paths(
     return fig
 
 
-def _at(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
-    """Select values of axes; axes of one value are selected, too."""
-    dims = [str(d) for d in ds["rate"].dims if d != "set"]
+def _axes(ds: xr.Dataset, name: str) -> list[str]:
+    return [str(d) for d in ds[name].dims if d != "set"]
+
+
+def _at(ds: xr.Dataset, of: str, at: Mapping[str, float] | None) -> xr.Dataset:
+    """Select values of the axes of a variable; axes of one value are selected, too."""
+    dims = _axes(ds, of)
     for name, value in (at or {}).items():
         if name not in dims:
             raise ValueError(unknown_name("axis", name, dims))
@@ -163,35 +143,13 @@ _GAMMA = 0.5
 def plot_density(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the density of a state at the sections.
+    """Draw the density of a state at the sections; raise ValueError if more than one axis is left.
 
-    Parameters
-    ----------
-    ds
-        Result of the analysis ``density``.
-    at
-        Values of the axes that are not drawn.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Over an axis: the density by colour with its peaks as dots, and the number of peaks in a panel below.
-        At one point: the histogram, the smoothed density as a line, its peaks as dots.
-
-    Raises
-    ------
-    ValueError
-        If more than one axis is left.
+    Over an axis: the density by colour with its peaks as dots, and the number of peaks in a panel below. At one point:
+    the histogram, the smoothed density as a line, its peaks as dots.
     """
-    dims = [str(d) for d in ds["n_peaks"].dims]
-    for name, value in (at or {}).items():
-        if name not in dims:
-            raise ValueError(unknown_name("axis", name, dims))
-        ds = ds.isel({name: place(ds[name], value)})
-    part = ds.isel({d: 0 for d in dims if d in ds.dims and ds.sizes[d] == 1})
-    left = [str(d) for d in part["n_peaks"].dims]
+    part = _at(ds, "n_peaks", at)
+    left = _axes(part, "n_peaks")
     if len(left) > 1:
         raise ValueError(f"a density is drawn over one axis, and {', '.join(left)} are left; choose values with at")
     return _over(part, left[0], frame) if left else _at_one_point(part, frame)

@@ -42,27 +42,10 @@ def plot_rotation(
 ) -> style.DataFigure:
     """Draw the rotation numbers of a run's cells over one swept parameter, or in the plane of two.
 
-    Parameters
-    ----------
-    ds
-        Cube.
-    at
-        Values of swept parameters that are not drawn.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Over one parameter every cell has a dot, blue where it is locked to the drive (closed), and steps p/q with
-        denominators up to `NAMED` have their names. Over two parameters the colour is the median over the cells
-        of a point; points at which all cells are locked have white dots. Its `data` hold ``rotation`` and
-        ``locked``, the share of the cells that are.
-
-    Raises
-    ------
-    ValueError
-        If there are no rotation numbers, or more than two swept parameters are left.
+    Over one parameter every cell has a dot, blue where it is locked to the drive (closed), and steps p/q with
+    denominators up to `NAMED` have their names. Over two the colour is the median over the cells of a point; points at
+    which all cells are locked have white dots. The figure's `data` hold ``rotation`` and ``locked``, the share of the
+    cells that are. Raise ValueError if there are no rotation numbers, or more than two swept parameters are left.
     """
     if "rotation" not in ds:
         raise ValueError("the cube has no rotation numbers; run it with [products] rotation = {} in its specification")
@@ -186,20 +169,7 @@ def plot_tongues(
 ) -> style.DataFigure:
     """Draw the edges of Arnold tongues in the plane of two parameters, each with its name p/q.
 
-    Parameters
-    ----------
-    ds
-        Result of the analysis ``tongues``.
-    cube
-        Cube with rotation numbers over both parameters, drawn as a map below; None if there is none.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Edges are black over a map; else their colour tells the denominator. Its `data` are the curves, with the
-        map's numbers.
+    Edges are black over the map of a cube's rotation numbers, if it is given; else their colour tells the denominator.
     """
     first, second = str(ds.attrs["first_parameter"]), str(ds.attrs["second_parameter"])
     stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])

@@ -125,13 +125,17 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
 
 def check_place(out: Path, force: bool) -> None:
     """Raise RefusedError if a file exists already or cannot be written, before anything is computed."""
-    if not out.parent.is_dir():
-        raise RefusedError(f"{out.parent}: no such folder; make it first.")
-    refuse_place(out)
-    if problem := unwritable(out.parent):
-        raise RefusedError(f"{problem}; give another place.")
     if out.is_dir():
         raise RefusedError(f"{out}: is a folder; give a file.")
+    refuse_place(out)
+    _check_new(out, force)
+
+
+def _check_new(out: Path, force: bool) -> None:
+    if not out.parent.is_dir():
+        raise RefusedError(f"{out.parent}: no such folder; make it first.")
+    if problem := unwritable(out.parent):
+        raise RefusedError(f"{problem}; give another place.")
     if (out.exists() or out.is_symlink()) and not force:
         raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
 
@@ -236,17 +240,10 @@ def export_folder(
 
 def check_folder(out: Path, force: bool) -> None:
     """Raise RefusedError if a folder exists already or cannot be written, before anything is computed."""
-    if not out.parent.is_dir():
-        raise RefusedError(f"{out.parent}: no such folder; make it first.")
     refuse_place(out.parent)
-    if problem := unwritable(out.parent):
-        raise RefusedError(f"{problem}; give another place.")
-    if not (out.exists() or out.is_symlink()):
-        return
-    if not force:
-        raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
+    _check_new(out, force)
     own = {INDEX, LIST, DATA, LICENCES, CUBE}
-    if out.is_symlink() or not out.is_dir() or {p.name for p in out.iterdir()} - own:
+    if out.is_symlink() or (out.exists() and (not out.is_dir() or {p.name for p in out.iterdir()} - own)):
         raise RefusedError(f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it.")
 
 

@@ -12,13 +12,13 @@ import pytest
 
 from pipeline.explorer import server as sockets
 from pipeline.explorer.answers import ANSWERS, Answering
+from pipeline.explorer.connection import MOST_PAGES, Connection
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import orbit
 from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live.messages import MOST_BYTES
-from pipeline.explorer.notebook import MOST_PAGES, Connection
 from pipeline.store.run import Run
 from tests.pipeline.explorer.conftest import PATIENCE_S
 
