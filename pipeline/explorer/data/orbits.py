@@ -15,7 +15,7 @@ from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import share_interval
-from pipeline.analysis.ragged import dense, isel
+from pipeline.analysis.ragged import dense, dims_of, isel
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
@@ -302,14 +302,10 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     """
     nothing: dict[str, Any] = dict.fromkeys((*_TOLD, "multipliers", "seconds"))
     nothing["period"] = 0
-    found = run.kept("attractors")
-    if found is None:
+    here = attractor_of(run.kept("attractors"), cell.index)
+    if here is None:
         return nothing
-    number = int(found["attractor_id"].isel(cell.index))
-    if number < 0:
-        return nothing
-    here = dense(isel(found, _parameter_index(run, cell))).isel(attractor=number)
-    told = {**nothing, "attractor": number, "share": finite(here["share"]), **shown(here)}
+    told = {**nothing, "attractor": int(here["attractor"]), "share": finite(here["share"]), **shown(here)}
     if BRANCH not in run.start_dims:  # branches of a continuation are no sample of initial states
         low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))
         told |= {"low": finite(low[0]), "high": finite(high[0])}
@@ -320,6 +316,14 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     if np.isfinite(multipliers).all() and period == (cell.period or period):
         told |= {"multipliers": multipliers, "seconds": finite(here["period_s"])}
     return told
+
+
+def attractor_of(attractors: xr.Dataset | None, index: Mapping[str, int]) -> xr.Dataset | None:
+    """Return the stored attractor on which the cell at an index ends; None if there is none."""
+    number = -1 if attractors is None else int(attractors["attractor_id"].isel(index))
+    if attractors is None or number < 0:
+        return None
+    return dense(isel(attractors, {d: index[d] for d in dims_of(attractors)})).isel(attractor=number)
 
 
 def _parameter_index(run: ExploredRun, cell: Cell) -> dict[str, int]:

@@ -24,7 +24,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.lockstep import run_alone
 from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
 from pipeline.explorer import RequestError
-from pipeline.explorer.data.orbits import fixed_points, orbit_series
+from pipeline.explorer.data.orbits import attractor_of, fixed_points, orbit_series
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import CellPoint, FollowRequest
 from pipeline.explorer.live.settling import Place, system_at
@@ -200,14 +200,8 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
 
 def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
     """Return the period of the stored attractor on which a cell ends; 0 if that is no periodic orbit."""
-    attractors = live.attractors
-    if attractors is None:
-        return 0
-    here = attractors.isel({d: i for d, i in at.items() if d in attractors["attractor_id"].dims})
-    number = int(here["attractor_id"].values)
-    if number < 0 or int(here["kind"].isel(attractor=number).values) != PERIODIC_ORBIT:
-        return 0
-    return int(here["orbit_period"].isel(attractor=number).values)
+    here = attractor_of(live.attractors, at)
+    return 0 if here is None or int(here["kind"]) != PERIODIC_ORBIT else int(here["orbit_period"])
 
 
 def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
