@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Any
 
 from tornado import httpserver, web
 from tornado.ioloop import IOLoop
-from tornado.web import RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from pipeline.explorer import html
@@ -93,28 +92,21 @@ MOST_PER_SECOND, MOST_AT_ONCE = 40.0, 80
 MOST_UNSENT = 64 * 2**20
 """Bytes that may wait to be sent to a page that does not take them; then it is left."""
 
-Authorised = Callable[[RequestHandler], bool]
-Route = tuple[str, type[WebSocketHandler], dict[str, Any]]
-
-
-def socket_routes(live: LiveRun, authorised: Authorised) -> list[Route]:
-    """Return the tornado routes of the websocket for live computation; `authorised` says who may connect."""
-    return [("/ws", LiveSocket, {"live": live, "authorised": authorised, "others": set()})]
-
 
 class LiveSocket(WebSocketHandler):
     """Websocket connection of one page that computes live."""
 
-    def initialize(self, live: LiveRun, authorised: Authorised, others: set[LiveSocket]) -> None:
-        """Store the run, the function that checks requests, and the set of open connections."""
-        self._live, self._authorised, self._others = live, authorised, others
+    def initialize(self, service: Service, live: LiveRun, others: set[LiveSocket]) -> None:
+        """Store the service, its run, and the set of open connections."""
+        self._service, self._live, self._others = service, live, others
         self._session: LiveSession | None = None
         self._rate = Rate(MOST_PER_SECOND, MOST_AT_ONCE)
         self._waiting = 0
 
     async def prepare(self) -> None:
         """Refuse a connection without a valid token, or if too many are open."""
-        if not self._authorised(self):
+        guard, headers = self._service.guard, self.request.headers
+        if guard.foreign(headers) or not guard.authorised(headers, self.get_query_argument("token", "")):
             self.set_status(403)
             await self.finish({"error": "this address has no valid token, or another page asks."})
         elif len(self._others) >= MOST_CONNECTIONS:
@@ -318,21 +310,18 @@ class ApiHandler(Handler):
 
     async def get(self) -> None:
         """Answer a GET request, whose arguments are in its address."""
-        if self.answer.method != "GET":
-            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
-            return
-        await self._reply(b"")
+        await self._reply("GET")
 
     async def post(self) -> None:
         """Answer a POST request, whose arguments are in its body."""
-        if self.answer.method != "POST":
-            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
-            return
-        await self._reply(self.request.body)
+        await self._reply("POST", self.request.body)
 
-    async def _reply(self, body: bytes) -> None:
+    async def _reply(self, method: str, body: bytes = b"") -> None:
         from pipeline.explorer.answers import Query, RefusedRequestError
 
+        if self.answer.method != method:
+            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
+            return
         query = Query({k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body)
         try:
             reply = await asyncio.wrap_future(self.service.answering.ask(self.answer.name, query))
@@ -360,12 +349,12 @@ def application(service: Service) -> web.Application:
     """Make the web application that answers the requests for a run."""
     from pipeline.explorer.answers import ANSWERS
 
-    shared = {"service": service}
+    shared, live = {"service": service}, service.answering.live
     routes: list[Any] = [
         (r"/", PageHandler, shared),
         (r"/static/([A-Za-z.]+)", StaticHandler, shared),
         *((rf"/api/{name}", ApiHandler, {**shared, "answer": a}) for name, a in ANSWERS.items()),
-        *_live_routes(service),
+        *([] if live is None else [("/ws", LiveSocket, {**shared, "live": live, "others": set()})]),
     ]
     return web.Application(
         routes,
@@ -375,19 +364,6 @@ def application(service: Service) -> web.Application:
         compress_response=False,
         log_function=lambda handler: None,
     )
-
-
-def _live_routes(service: Service) -> list[Any]:
-    live = service.answering.live
-    if live is None:
-        return []
-
-    def authorised(handler: web.RequestHandler) -> bool:
-        headers, guard = handler.request.headers, service.guard
-        token = handler.get_query_argument("token", "")
-        return guard.foreign(headers) is None and guard.authorised(headers, token)
-
-    return socket_routes(live, authorised)
 
 
 def listening(port: int) -> socket.socket:

@@ -50,6 +50,10 @@ class Category:
     label: str
     colour: str
 
+    def describe(self) -> dict[str, Any]:
+        """Return the code as a dictionary for the page."""
+        return {"id": self.number, "label": self.label, "colour": self.colour}
+
 
 @dataclass(frozen=True)
 class Scheme:
@@ -65,11 +69,7 @@ class Scheme:
 
     def describe(self) -> dict[str, Any]:
         """Return the colour scheme as a dictionary for the page."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "categories": [{"id": c.number, "label": c.label, "colour": c.colour} for c in self.categories],
-        }
+        return {"name": self.name, "title": self.title, "categories": [c.describe() for c in self.categories]}
 
 
 def schemes(run: ExploredRun) -> list[Scheme]:

@@ -66,22 +66,16 @@ class ExploredRun(Run):
         """Return the run's result cube as a lazy dataset; each chunk is verified when it is read."""
         if chunks is not None or check is not None:
             return super().cube(chunks, check=check)
-        with self._lock:
-            if "cube" not in self._opened:
-                opened = super().cube()
-                # once: each use of a coordinate would read it again
-                self._opened["cube"] = opened.assign_coords({n: c.load() for n, c in opened.coords.items()})
-            found: xr.Dataset = self._opened["cube"]
-            return found
+        return self.remembered("cube", self._loaded_cube)
+
+    def _loaded_cube(self) -> xr.Dataset:
+        opened = super().cube()
+        # each use of a coordinate would read it again
+        return opened.assign_coords({n: c.load() for n, c in opened.coords.items()})
 
     def kept(self, name: str) -> xr.Dataset | None:
         """Return the stored result of an analysis; None if it has not been computed."""
-        with self._lock:
-            key = f"derived {name}"
-            if key not in self._opened:
-                self._opened[key] = stored(self, name)
-            found: xr.Dataset | None = self._opened[key]
-            return found
+        return self.remembered(f"derived {name}", lambda: stored(self, name))
 
     def kept_each(self, name: str) -> list[xr.Dataset]:
         """Return all stored results of an analysis, such as one for each pair of attractors; see `stored_each`."""

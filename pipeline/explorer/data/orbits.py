@@ -264,7 +264,7 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
         "motion": names.words[code] if names.told and code > 0 else None,
         **{key: told[key] for key in _TOLD},
         "stable": _is_stable(told["stability"], multipliers),
-        "multipliers": None if multipliers is None else [[float(m.real), float(m.imag)] for m in multipliers],
+        "multipliers": None if multipliers is None else parts_of(multipliers),
         "note": "its multipliers are not ready yet: choose it again in a moment" if awaited else None,
         "exponents": exponents,
         "exponents_from": source,
@@ -306,9 +306,7 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     if here is None:
         return nothing
     told = {**nothing, "attractor": int(here["attractor"]), "share": finite(here["share"]), **shown(here)}
-    if BRANCH not in run.start_dims:  # branches of a continuation are no sample of initial states
-        low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))
-        told |= {"low": finite(low[0]), "high": finite(high[0])}
+    told |= share_bounds(run, here)
     multipliers = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
     period = int(here["orbit_period"])
     told["period"] = period
@@ -316,6 +314,19 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     if np.isfinite(multipliers).all() and period == (cell.period or period):
         told |= {"multipliers": multipliers, "seconds": finite(here["period_s"])}
     return told
+
+
+def share_bounds(run: ExploredRun, one: xr.Dataset) -> dict[str, float | None]:
+    """Return the interval of an attractor's share; branches of a continuation are no sample and have none."""
+    if BRANCH in run.start_dims:
+        return {"low": None, "high": None}
+    low, high = share_interval(np.array([int(one["n_cells"])]), np.array([float(one["share"])]))
+    return {"low": finite(low[0]), "high": finite(high[0])}
+
+
+def parts_of(numbers: np.ndarray) -> list[list[float | None]]:
+    """Return the real and the imaginary part of each complex number."""
+    return [[finite(number.real), finite(number.imag)] for number in numbers]
 
 
 def attractor_of(attractors: xr.Dataset | None, index: Mapping[str, int]) -> xr.Dataset | None:

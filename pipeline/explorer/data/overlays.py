@@ -20,7 +20,7 @@ from pipeline.analysis.resilience.table import end_of
 from pipeline.analysis.tabular import sets_of
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.explorer.data.orbits import finite, shown
+from pipeline.explorer.data.orbits import finite, parts_of, share_bounds, shown
 from pipeline.explorer.data.verticals import vertical
 from pipeline.explorer.data.view import can_have
 from pipeline.layout.attractor_letters import letter
@@ -246,11 +246,6 @@ def _set(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> 
     points = points[np.isfinite(points).all(axis=1)][:MOST_SECTION]
     multipliers = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
     closed = int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(multipliers).all()
-    count = int(one["n_cells"])
-    interval: tuple[float | None, float | None] = (None, None)
-    if BRANCH not in run.start_dims:
-        low, high = share_interval(np.array([count]), np.array([float(one["share"])]))
-        interval = (finite(low[0]), finite(high[0]))
     exponent = finite(one["lyapunov_max"])
     return {
         "id": number,
@@ -262,11 +257,10 @@ def _set(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> 
         "periods": periods_of(run.model),
         "motion": classifier.words[side] if classifier is not None and side > 0 else None,
         "share": finite(one["share"]),
-        "low": interval[0],
-        "high": interval[1],
-        "n_starts": count,
+        **share_bounds(run, one),
+        "n_starts": int(one["n_cells"]),
         "colour": rgb(cast.colours[number]),
-        "multipliers": [[float(m.real), float(m.imag)] for m in multipliers] if closed else None,
+        "multipliers": parts_of(multipliers) if closed else None,
         "exponents": None if exponent is None else [exponent],
         "section": points.tolist(),
     }

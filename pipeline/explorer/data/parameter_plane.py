@@ -16,7 +16,7 @@ from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.explorer.data.orbits import TOLERANCE, finite, fixed_points, orbit_series
+from pipeline.explorer.data.orbits import TOLERANCE, fixed_points, orbit_series, parts_of
 from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
 from pipeline.plots.branches import NAMES, POINT_NAMES
@@ -146,7 +146,7 @@ def _attrs(
         "status_meaning": f"an orbit on a curve of bifurcations: {kind}",
         "kind": f"{kind}, period {period}",
         "stable": None,
-        "multipliers": [[finite(m.real), finite(m.imag)] for m in multipliers],
+        "multipliers": parts_of(multipliers),
         "note": None,
         "exponents_from": None,
         "seeds": [],

@@ -99,35 +99,17 @@ def _model(run: ExploredRun) -> dict[str, Any]:
         "section": _section(model),
         "period": period_of(model),
         "forced": not model.autonomous,
-        "states": [_state(s) for s in model.states],
-        "quantities": [
-            {
-                "name": q.name,
-                "label": plain(q.symbol, q.name),
-                "meaning": q.meaning,
-                "unit": q.unit,
-                "angle": False,
-                "scale": 1.0,
-                "rate": None,
-            }
-            for q in model.quantities
-        ],
+        "states": [_named(s, s.on_circle, s.scale, s.rate or None) for s in model.states],
+        "quantities": [_named(q, False, 1.0, None) for q in model.quantities],
         "parameters": [_parameter(run, p) for p in model.parameters],
         "portraits": [list(pair) for pair in model.portraits],
         "drawing": _drawing(run),
     }
 
 
-def _state(state: Any) -> dict[str, Any]:
-    return {
-        "name": state.name,
-        "label": plain(state.symbol, state.name),
-        "meaning": state.meaning,
-        "unit": state.unit,
-        "angle": state.on_circle,
-        "scale": state.scale,
-        "rate": state.rate or None,
-    }
+def _named(one: Any, angle: bool, scale: float, rate: str | None) -> dict[str, Any]:
+    named = {"name": one.name, "label": plain(one.symbol, one.name), "meaning": one.meaning, "unit": one.unit}
+    return {**named, "angle": angle, "scale": scale, "rate": rate}
 
 
 def _section(model: Model) -> str:

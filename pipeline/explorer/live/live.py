@@ -21,6 +21,7 @@ from magpend_core.status import Status
 from pipeline.analysis.ragged import dims_of, isel
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.colours import rgb
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.catalog import Catalog, Entry, Known
 from pipeline.explorer.live.jobs import PATIENCE_S
@@ -182,7 +183,7 @@ class LiveRun:
         problem = live_problem(run)
         if problem is not None:
             raise RequestError(problem)
-        self.run, self.model, self.spec = run, run.model, run.spec
+        self.run, self.model, self.spec = ExploredRun.of(run), run.model, run.spec
         self.integration = run.spec.integration
         self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
         self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
@@ -190,7 +191,6 @@ class LiveRun:
         self._lock = threading.Lock()
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None
-        self._cube: xr.Dataset | None = None
         self._sessions: set[Session] = set()
         self._warming = Warming(self)
 
@@ -327,10 +327,7 @@ class LiveRun:
     @property
     def cube(self) -> xr.Dataset:
         """Result cube of the run, opened once."""
-        with self._lock:
-            if self._cube is None:
-                self._cube = self.run.cube()
-            return self._cube
+        return self.run.cube()
 
     def legend(self, catalog: Catalog) -> Legend:
         """Return the names and colours of the attractors of a catalog."""

@@ -24,7 +24,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.lockstep import run_alone
 from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
 from pipeline.explorer import RequestError
-from pipeline.explorer.data.orbits import attractor_of, fixed_points, orbit_series
+from pipeline.explorer.data.orbits import attractor_of, fixed_points, orbit_series, parts_of
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import CellPoint, FollowRequest
 from pipeline.explorer.live.settling import Place, system_at
@@ -298,7 +298,7 @@ def described(
         "attractor": None,
         "share": None,
         "stable": bool(np.abs(multipliers).max() < 1.0),
-        "multipliers": [[float(m.real), float(m.imag)] for m in multipliers],
+        "multipliers": parts_of(multipliers),
         "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, is_flow)],
         "seeds": [],
         "at": None,
