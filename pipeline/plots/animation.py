@@ -205,9 +205,7 @@ class _Plan:
         return 2 * round(whole * SCREEN_DPI / 2) / SCREEN_DPI
 
     def boxes(self, k: int) -> list[Box]:
-        """Return the rectangles of the panels of motion `k`: the model's drawing if it has one, then phase
-        portraits.
-        """
+        """Return the rectangles of the panels of motion `k`: the model's drawing if it has one, then portraits."""
         return [self._box(*inches) for inches in (self._single() if self.n == 1 else self._column(k))]
 
     def _single(self) -> list[Box]:

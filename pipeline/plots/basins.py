@@ -144,9 +144,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Return the colour code of each cell (an attractor id, or a negative code), and the number of cells of each
-    code.
-    """
+    """Return the code of each cell (an attractor id, or a negative code), and the number of cells of each code."""
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
@@ -161,9 +159,7 @@ def _codes(
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
-    """Return the RGB colour of each code, shape (codes, 3). Attractor ids come first; negative codes count from the
-    end.
-    """
+    """Return RGB by code, shape (codes, 3): attractor ids first; negative codes count from the end."""
     greys = list(reversed(palette.GREYS.values()))
     colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
     return np.array([to_rgb(c) for c in colours], dtype=np.float32)

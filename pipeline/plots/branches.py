@@ -140,9 +140,7 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """Yield the lines of a branch to draw: one for each section point and each range of equal stability, cut where an
-    angle wraps.
-    """
+    """Yield the lines of a branch, one for each section point and range of equal stability, cut where angles wrap."""
     n = int(ds["n_points"][branch])
     period = max(int(ds["orbit_period"][branch]), 1)
     x = ds["parameter"].values[branch, :n]
@@ -211,8 +209,7 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
-    """Write labels of bifurcations where they cover neither lines nor other labels, each with a thin line to its
-    bifurcation.
+    """Label bifurcations where labels cover neither lines nor one another, each with a thin line to its place.
 
     Short periods come first. A label without room nearby is left out; its marker remains.
     """

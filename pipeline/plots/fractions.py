@@ -101,9 +101,7 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
 
 
 def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
-    """Return the basin fraction of each attractor, and the share of cells without an attractor, at each parameter
-    value.
-    """
+    """Return the basin fractions, and the share of cells without an attractor, at each parameter value."""
     n = part.sizes[parameter]
     ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
     kinds, others = list(palette.GREYS), palette.other_cells(part)
@@ -154,9 +152,7 @@ class _Band:
 
 
 def _bands(data: xr.Dataset, cast: palette.Cast) -> list[_Band]:
-    """Return the bands from the bottom up: attractors by falling basin fraction, then minor ones, then cells without an
-    attractor.
-    """
+    """Return the bands from below: attractors by falling fraction, minor ones, cells without an attractor."""
     share = data["fraction"].values
     n = len(cast.names)
     total = share[:, :n].sum(axis=0)
@@ -348,9 +344,7 @@ def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[fl
 
 
 def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the chosen points of an attractor as arrays: parameter value, drawn value, index of the parameter
-    value.
-    """
+    """Return the chosen points of an attractor: parameter values, drawn values, indices of the parameter values."""
     values = one["value"].transpose(parameter, "point").values
     row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
     return one[parameter].values[row].astype(np.float64), values[row, column], row

@@ -1,6 +1,4 @@
-"""Draw all attractors of one parameter point, with their phase portraits and the path of a point of the model's
-drawing.
-"""
+"""Draw all attractors of one parameter point: phase portraits, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 

@@ -184,9 +184,7 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Spread the count of each pixel over the disc of a marker, for every direction of continuation and class of
-    motion.
-    """
+    """Spread the count of each pixel over the disc of a marker, for every direction and class of motion."""
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -221,9 +219,7 @@ def paint(
 
 
 def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarray:
-    """Return opacities that grow with the logarithm of the counts, from `faintest` for one point to 1 for `reference`
-    points.
-    """
+    """Return opacities that grow with the logarithm of counts, from `faintest` for 1 to 1 for `reference`."""
     if reference <= 1.0:
         return np.ones(counts.size, dtype=np.float32)
     depth = np.log(counts.astype(np.float32)) / np.float32(math.log(reference))

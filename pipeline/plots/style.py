@@ -402,9 +402,7 @@ def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]
 
 
 def edges(x: np.ndarray) -> np.ndarray:
-    """Return the edges of the columns that are centred on given parameter values; there is one more edge than
-    values.
-    """
+    """Return the edges of the columns that are centred on parameter values, one more than there are values."""
     if x.size == 1:
         width = 0.05 * abs(float(x[0])) or 0.5
         return np.array([x[0] - width, x[0] + width])

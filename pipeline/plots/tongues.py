@@ -72,9 +72,7 @@ def plot_rotation(
 
 
 def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
-    """Return the rotation numbers to draw, and which cells (over two parameters: which share of them) are
-    phase-locked.
-    """
+    """Return the rotation numbers to draw, and which cells (over two parameters: which share) are locked."""
     locked = (part["orbit_period"] > 0).where(part["rotation"].notnull())
     data = xr.Dataset({"rotation": part["rotation"], "locked": locked}).load()
     if len(swept) == 2:
@@ -132,9 +130,7 @@ def _steps(x: np.ndarray, rotation: np.ndarray, axis: xr.DataArray) -> dict[Frac
 
 
 def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]) -> None:
-    """Draw the rotation numbers as colours in the plane of two parameters, with white dots where all cells are
-    locked.
-    """
+    """Draw rotation numbers as colours in the plane of two parameters, with white dots where all cells are locked."""
     grid, locked = data["rotation"].values, data["locked"].values
     x, y = (data[d].values.astype(np.float64) for d in swept)
     known = grid[np.isfinite(grid)]

@@ -299,9 +299,7 @@ def _asked(options: Options) -> str:
 
 
 def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Measure the interval about an axis value in which every cell has a given orbit period; return also its indices
-    and cells.
-    """
+    """Measure the interval about a value in which every cell has a given orbit period; return its cells, too."""
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
     values, n = here[axis].values, here.sizes["cell"]
@@ -422,8 +420,7 @@ def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Esti
 
 
 def largest_exponent(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the largest Lyapunov exponent [1/s] at one axis value, averaged over cells that are not on a periodic
-    orbit.
+    """Return the largest Lyapunov exponent [1/s] at one axis value, averaged over cells on no periodic orbit.
 
     Options: ``at``. The interval is that of the mean over cells (Student's t). The cells are on one set, so
     their exponents differ only because of finite time.
@@ -446,8 +443,7 @@ def largest_exponent(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of the common axis values of two runs at which both runs have the same most frequent orbit
-    period.
+    """Return the fraction of common axis values at which two runs have the same most frequent orbit period.
 
     Options: ``low``, ``high``. Periods above 16 count as one outcome, and so do cells that are not closed.
     """

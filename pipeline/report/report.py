@@ -102,9 +102,7 @@ class Shown:
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options with which a report shows an analysis: those of each stored result, or else the
-        defaults.
-        """
+        """Return the options with which an analysis is shown: those of each stored result, or else the defaults."""
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])
 

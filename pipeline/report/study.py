@@ -105,9 +105,7 @@ class ClaimTable(Table):
 
 
 class FigureTable(Table):
-    """Table ``[[figures]]`` of a study's file: figures of the paper, with the pictures and claims that reproduce
-    them.
-    """
+    """Table ``[[figures]]`` of a study's file: figures of the paper, with pictures and claims."""
 
     number: str = Field(description="Number of the figure, or several numbers; a name without spaces may replace it.")
     title: str = Field(description="Title of the figure.")

@@ -89,9 +89,7 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
 
 
 def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], int]:
-    """Return the description of a run with only the given quantities of the model, and the number of vertical axes left
-    out.
-    """
+    """Return the description of a run with only the given quantities, and the number of axes left out."""
     known = [q.name for q in run.model.quantities]
     if problems := [unknown_name("--quantity", name, known) for name in quantities if name not in known]:
         raise SpecError(problems)
@@ -110,9 +108,7 @@ def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Return the key of a point on the axes, such as ``frequency=3&amplitude=0``; the page's script makes the same
-    keys.
-    """
+    """Return the key of a point on the axes, such as ``frequency=3&amplitude=0``, as the page's script does."""
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]
     return "&".join([*([f"x={x}"] if x else []), *parts])
 

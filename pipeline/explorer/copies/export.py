@@ -280,9 +280,7 @@ def _write_folder(run: ExploredRun, folder: Path, quantities: Sequence[str], mos
 
 
 def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
-    """Return a quantity of the model at the section points of the diagram, in the shape of the result cube; NaN
-    elsewhere.
-    """
+    """Return a quantity of the model at the drawn section points, in the shape of the cube; NaN elsewhere."""
     values = np.full((run.plan.n_cells, run.n_keep), np.nan)
     values[np.arange(run.n_keep) < column.count[:, None]] = column.y
     quantity = run.model.quantity(name)

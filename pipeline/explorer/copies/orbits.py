@@ -99,9 +99,7 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the exported orbit that is shown for each group of cells: its own, or the nearest one, if possible of the
-    same attractor.
-    """
+    """Return the orbit shown for each group of cells: its own, or the nearest, if possible of the same attractor."""
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
     number[taken], means[taken] = np.arange(len(taken)), same

@@ -140,8 +140,7 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Return a colour code for each cell: its attractor, or a grey category such as an unstable set. Return also the
-    grey categories that occur.
+    """Return a code for each cell (its attractor, or a grey such as an unstable set), and the greys that occur.
 
     Cells that diverged, failed or are pending have none.
     """

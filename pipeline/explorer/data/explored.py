@@ -82,9 +82,7 @@ class ExploredRun(Run):
         return self.remembered(f"each {name}", lambda: list(stored_each(self, name)))
 
     def bifurcation_curves(self) -> xr.Dataset | None:
-        """Return the stored bifurcation curves of this run, or of the other run named for them; None if there are
-        none.
-        """
+        """Return the stored bifurcation curves of this run, or of the run named for them; None if there are none."""
         return self.kept("curves") if self.curves is None else ExploredRun.of(self.curves).kept("curves")
 
     def refreshed(self) -> ExploredRun:
@@ -138,9 +136,7 @@ class ExploredRun(Run):
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Axes that a diagram can have as its horizontal axis: the swept parameters or, if there are none, one fixed
-        parameter.
-        """
+        """Axes that a diagram can have: the swept parameters or, if there are none, one fixed parameter."""
         swept = tuple(Axis(a.dim, a.parameter, a.values) for a in parameter_axes(self.spec))
         if swept:
             return swept

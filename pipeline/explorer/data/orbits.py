@@ -29,8 +29,7 @@ SAMPLES = 128
 
 
 def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarray) -> np.ndarray | None:
-    """Return the positions of the moving points of the model's drawing, shape (n, n_points, 2); None if it has no
-    drawing.
+    """Return the moving points of the model's drawing, shape (n, n_points, 2); None if it has no drawing.
 
     They are in the order in which `Drawing.points` names them.
     """
@@ -215,9 +214,7 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
 
 
 def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
-    """Return the time at which each period after a section point ends [s]; without a drive, a period is a return to the
-    section.
-    """
+    """Return the time at which each period (without a drive, return) after a section point ends [s]."""
     if run.model.crossing is None:
         return np.asarray(np.arange(1, n_periods + 1) / cell.clock_hz)
     from magpend_core.sections import run_branches

@@ -59,9 +59,7 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Yield the curves of the Lyapunov exponents: the mean over initial conditions, and a band from minimum to
-    maximum.
-    """
+    """Yield the curves of the Lyapunov exponents: the mean over initial conditions, and the range as a band."""
     cube = run.cube()
     if "lyapunov" not in cube:
         return

@@ -73,9 +73,7 @@ def _special(found: xr.Dataset, k: int) -> dict[str, Any]:
 
 
 def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
-    """Return the number of attractors at each point of the plane of two parameters; None unless the run sweeps just
-    these two.
-    """
+    """Return the number of attractors over the plane of two parameters; None unless the run sweeps just these."""
     attractors = run.kept("attractors")
     if attractors is None:
         return None

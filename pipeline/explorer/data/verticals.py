@@ -58,9 +58,7 @@ def plain(symbol: str, name: str) -> str:
 
 
 def _lowered(found: re.Match[str]) -> str:
-    """Convert a subscript to Unicode's subscript characters, or to ``_TEXT`` if one of its characters has no such
-    form.
-    """
+    """Convert a subscript to Unicode's subscript characters, or to ``_TEXT`` if one character has no such form."""
     text = (found[1] if found[1] is not None else found[2]).replace(" ", "")
     small = text.translate(_SUBSCRIPTS)
     return small if all(a != b for a, b in zip(text, small, strict=True)) else f"_{text}"

@@ -122,9 +122,7 @@ class Catalog:
                     self._sets.append((entry, cloud))
 
     def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
-        """Return the section points of the run's cells on a non-periodic set, in a search tree; None if it has no
-        cells.
-        """
+        """Return the section points of the run's cells on a non-periodic set; None if it has no cells."""
         block = self._point(cells).whole()
         ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
         own = np.flatnonzero((ids == number) & block.is_bounded)
@@ -151,9 +149,7 @@ class Catalog:
     # ---- where trajectories are ----------------------------------------------------------------
 
     def on_orbits(self, block: Block) -> np.ndarray:
-        """Return the catalog number of the periodic orbit that each cell has reached or surely will reach; -1 for
-        none.
-        """
+        """Return the catalog number of the periodic orbit that each cell has reached or surely will reach; else -1."""
         with self._lock:
             orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
         if not orbits:
@@ -162,9 +158,7 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return the undecided cells that nearly return to earlier section points, so that they are worth integrating
-        further.
-        """
+        """Return the undecided cells that nearly return to earlier section points: they are worth integrating on."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -192,9 +186,7 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Decide which cells of a flow end at equilibria or on limit cycles, and write their catalog numbers into
-        `numbers`.
-        """
+        """Write into `numbers` which cells of a flow end at equilibria or on limit cycles."""
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
@@ -238,9 +230,7 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Decide which cells are on the run's non-periodic attractors, and write their catalog numbers into
-        `numbers`.
-        """
+        """Write into `numbers` which cells are on the run's non-periodic attractors."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -292,9 +282,7 @@ class Catalog:
         return [*alike, None][number_of_cycle(cycle, states, near, point, self._geometry)]
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the catalog entry for cells without an attractor that share status, period and motion with a given
-        cell.
-        """
+        """Return the entry for cells without an attractor that share status, period and motion with a given cell."""
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
         period = int(block.orbit_period[row]) if alive else 0
