@@ -33,7 +33,7 @@ from pipeline.analysis.attractors.finding.spirals import Recurrence
 from pipeline.analysis.ragged import N_IDS, dense, dims_of, isel
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import SAME_SECONDS, STRICT
-from pipeline.explorer.data.series import orbit_series
+from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.settling import Place
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
 from pipeline.products.attractors import IdentifyOptions
@@ -47,58 +47,26 @@ SAME_REST = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor.
+    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the entry in slices: the run's id of an attractor, or a larger number for any other entry.
-    attractor : int or None
-        The run's id.
-    kind : int
-        Of `vocabulary.KINDS`; absent for a class of cells that is no attractor.
-    period : int
-        Drive periods or returns; 0 if not closed.
-    motion : int
-        Code of the model's classifier.
-    status : int
-        Code of `Status`, of a class of cells that ended; 0 else.
-    points : ndarray, (n, state)
-        Section points; none of a class of cells.
-    seconds : float
-        Period of a limit cycle; NaN else.
-    stability : int
-        Of `vocabulary.STABILITIES`; 0 of a class of cells that ended.
-    """
-
-    number: int
-    attractor: int | None
-    kind: int
-    period: int
-    motion: int
-    status: int
-    points: np.ndarray
-    seconds: float = np.nan
-    stability: int = 0
+    number: int  # number of the entry in slices: the run's id of an attractor, or a larger number for any other entry
+    attractor: int | None  # the run's id
+    kind: int  # of `vocabulary.KINDS`; absent for a class of cells that is no attractor
+    period: int  # drive periods or returns; 0 if not closed
+    motion: int  # code of the model's classifier
+    status: int  # code of `Status`, of a class of cells that ended; 0 else
+    points: np.ndarray  # (n, state); section points; none of a class of cells
+    seconds: float = np.nan  # period of a limit cycle; NaN else
+    stability: int = 0  # of `vocabulary.STABILITIES`; 0 of a class of cells that ended
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """The attractors and cells that a run holds at one parameter point; None where it holds none.
+    """The attractors and cells that a run holds at one parameter point; None where it holds none."""
 
-    Attributes
-    ----------
-    attractors : Dataset or None
-        Attractors of all parameter points of the run.
-    cells : Dataset or None
-        The cube at the point; None where it has no such point.
-    index : tuple of int or None
-        Index of the point in the cube.
-    """
-
-    attractors: xr.Dataset | None = None
-    cells: xr.Dataset | None = None
-    index: tuple[int, ...] | None = None
+    attractors: xr.Dataset | None = None  # attractors of all parameter points of the run
+    cells: xr.Dataset | None = None  # the cube at the point; None where it has no such point
+    index: tuple[int, ...] | None = None  # index of the point in the cube
 
     def here(self) -> xr.Dataset | None:
         """Return the stored attractors of this parameter point; None if there are none."""
@@ -109,17 +77,7 @@ class Known:
 
 
 class Catalog:
-    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it.
-
-    Parameters
-    ----------
-    place
-        The point.
-    known
-        Stored attractors and cells of the run at the point.
-    closure_tolerance
-        Closure tolerance of the run.
-    """
+    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it."""
 
     def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:
         self.place, self.model = place, place.parameters.model
@@ -164,9 +122,7 @@ class Catalog:
                     self._sets.append((entry, cloud))
 
     def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
-        """Return the section points of the run's cells on a non-periodic set, in a search tree; None if it has no
-        cells.
-        """
+        """Return the section points of the run's cells on a non-periodic set; None if it has no cells."""
         block = self._point(cells).whole()
         ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
         own = np.flatnonzero((ids == number) & block.is_bounded)
@@ -193,9 +149,7 @@ class Catalog:
     # ---- where trajectories are ----------------------------------------------------------------
 
     def on_orbits(self, block: Block) -> np.ndarray:
-        """Return the catalog number of the periodic orbit that each cell has reached or surely will reach; -1 for
-        none.
-        """
+        """Return the catalog number of the periodic orbit that each cell has reached or surely will reach; else -1."""
         with self._lock:
             orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
         if not orbits:
@@ -204,9 +158,7 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return the undecided cells that nearly return to earlier section points, so that they are worth integrating
-        further.
-        """
+        """Return the undecided cells that nearly return to earlier section points: they are worth integrating on."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -216,17 +168,10 @@ class Catalog:
         return near
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the catalog number of the attractor on which each cell ends. An unknown periodic orbit becomes a new
-        entry.
+        """Return the catalog number of the attractor on which each cell ends. An unknown orbit becomes a new entry.
 
-        Parameters
-        ----------
-        block
-            Cells at their end.
-        final
-            Whether every cell is to get one; else -1 stays for what is neither on an orbit nor at rest.
-        strictly
-            Whether cells count as closed within a small distance, however loosely the run's own do.
+        With `final` every cell gets one; else -1 stays for what is neither on an orbit nor at rest. With `strictly`
+        cells count as closed within a small distance, however loosely the run's own do.
         """
         numbers = np.full(len(block.status), -1, np.int64)
         if self.model.autonomous:
@@ -241,9 +186,7 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Decide which cells of a flow end at equilibria or on limit cycles, and write their catalog numbers into
-        `numbers`.
-        """
+        """Write into `numbers` which cells of a flow end at equilibria or on limit cycles."""
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
@@ -287,9 +230,7 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Decide which cells are on the run's non-periodic attractors, and write their catalog numbers into
-        `numbers`.
-        """
+        """Write into `numbers` which cells are on the run's non-periodic attractors."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -341,9 +282,7 @@ class Catalog:
         return [*alike, None][number_of_cycle(cycle, states, near, point, self._geometry)]
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the catalog entry for cells without an attractor that share status, period and motion with a given
-        cell.
-        """
+        """Return the entry for cells without an attractor that share status, period and motion with a given cell."""
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
         period = int(block.orbit_period[row]) if alive else 0

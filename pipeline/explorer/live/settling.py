@@ -16,7 +16,7 @@ from magpend_core.models.model import Model, Parameters
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.tolerances import EXTEND_CLOSURE, EXTEND_RTOL
-from pipeline.explorer.live.messages import RequestError
+from pipeline.explorer import RequestError
 from pipeline.specification.tables import Integration
 
 MOST_STEPS = 200_000

@@ -14,9 +14,9 @@ from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
-from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.live import Legend, LiveRun
 from pipeline.explorer.live.messages import MOST_BYTES, Region
+from pipeline.explorer.live.orbit_following import _period_of_attractor
 from pipeline.explorer.live.regions import zoom_toml, zoomed
 from pipeline.explorer.live.settling import settle_cells
 from pipeline.layout.vocabulary import (
@@ -48,6 +48,15 @@ initial_conditions.x = { start = -0.9375, stop = 0.9375, num = 16 }
 initial_conditions.v = { start = -0.5, stop = 1.0, num = 7 }
 integration = { rtol = 1e-7, atol = 1e-7, n_transient = %d, n_keep = 12, stop_when_closed = %s }
 """
+
+
+def test_follow__period_of_a_cell_is_that_of_its_attractor(little):
+    live = LiveRun(RunDirectory.open(little))
+    periods = live.cube["orbit_period"].values
+    found = [_period_of_attractor(live, {"x_0": i}) for i in range(periods.size)]
+    live.close()
+    assert np.all((periods == 0) | (periods % np.array(found) == 0))
+    assert min(found) > 0
 
 
 @pytest.fixture(scope="module")

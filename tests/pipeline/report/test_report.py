@@ -13,7 +13,7 @@ import pytest
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS
-from pipeline.report.stored import stored_options
+from pipeline.report.report import stored_options
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
 from pipeline.store.run import RunDirectory

@@ -1,4 +1,4 @@
-"""Open a run and show it in a cell of a notebook."""
+"""Open a run and show it in a cell of a notebook, whose kernel answers the page."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.explorer.connection import LEAST_HEIGHT
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.explorer.notebook import LEAST_HEIGHT
 from pipeline.specification.problems import SpecError, import_extra
 from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
-    from pipeline.explorer.notebook.widget import Explorer
+    from pipeline.explorer.widget import Explorer
 
 
 def explorer(
@@ -46,7 +46,7 @@ def explorer(
     if height < LEAST_HEIGHT:
         raise SpecError(f"height = {height}: must be {LEAST_HEIGHT} pixels or more.")
     import_extra("anywidget", "notebook", "explorer")
-    from pipeline.explorer.notebook.widget import Explorer
+    from pipeline.explorer.widget import Explorer
 
     found = ExploredRun.of(run)
     return Explorer(found if curves is None else replace(found, curves=RunDirectory.open(curves)), height=height)

@@ -1,28 +1,110 @@
-"""Integrate the orbit through a clicked point of the diagram."""
+"""Integrate orbits for the page: through a clicked point of the diagram, or from an initial state."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Parameters
+from magpend_core import evaluate, trajectory
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.sectioned import of_flow
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import share_interval
-from pipeline.analysis.ragged import dense, isel
+from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
-from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
-from pipeline.plots.motions import motion_codes, motions_of
+from pipeline.plots.palette import motion_codes, motions_of
 from pipeline.store.run import RunDirectory
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+SAMPLES = 128
+"""Instants per drive period or return."""
+
+
+def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarray) -> np.ndarray | None:
+    """Return the moving points of the model's drawing, shape (n, n_points, 2); None if it has no drawing.
+
+    They are in the order in which `Drawing.points` names them.
+    """
+    if model.drawing is None:
+        return None
+    places = model.drawing.points(states, parameters)
+    return np.stack([np.broadcast_to(p, (len(states), 2)) for p in places.values()], axis=1).astype(float)
+
+
+def fixed_points(model: Model, parameters: Mapping[str, float]) -> dict[str, list[float]]:
+    """Return the positions of those points of the model's drawing that do not move, by name."""
+    if model.drawing is None:
+        return {}
+    return {name: [float(x) for x in place] for name, place in model.drawing.fixed(parameters).items()}
+
+
+def series(
+    parameters: Parameters,
+    clock_hz: float,
+    state: np.ndarray,
+    times: np.ndarray,
+    *,
+    rtol: float,
+    atol: float,
+    with_quantities: bool = True,
+) -> dict[str, np.ndarray]:
+    """Integrate from a section point; return the states over time, the quantities and the drawing's points.
+
+    Parameters
+    ----------
+    parameters
+        Parameters of the model, with or without its Poincare section.
+    clock_hz
+        Drive frequency [Hz]; for a flow any frequency, which affects only the limit on steps.
+    state, times
+        At time 0, shape (n_states,); rising times [s], shape (n,).
+
+    Returns
+    -------
+    dict
+        ``time`` (n,), ``states`` (n, n_states) with angles that run on, ``quantities`` (n, n_quantities), and
+        ``drawing`` (n, n_points, 2) if the model has one.
+
+    Raises
+    ------
+    ArithmeticError
+        If the trajectory ends before the last time.
+    """
+    own = of_flow(parameters)
+    states = trajectory(own, clock_hz, state, times, rtol=rtol, atol=atol)
+    found = {"time": np.asarray(times, np.float64), "states": states}
+    if with_quantities:
+        names = [q.name for q in own.model.quantities]
+        found["quantities"] = evaluate(names, times, states, own, clock_hz)
+    drawing = drawn_points(own.model, own, states)
+    if drawing is not None:
+        found["drawing"] = drawing
+    return found
+
+
+def orbit_series(
+    parameters: Parameters,
+    clock_hz: float,
+    state: np.ndarray,
+    n_periods: int,
+    seconds: float,
+    *,
+    rtol: float = 1e-9,
+    atol: float = 1e-9,
+) -> dict[str, np.ndarray]:
+    """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
+    n = max(1, min(n_periods * SAMPLES, 65_536))
+    times = seconds * np.arange(n + 1) / n
+    return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)
+
 
 TOLERANCE = 1e-9
 """Relative and absolute, of what is integrated here; the run's own where that is smaller."""
@@ -36,28 +118,14 @@ MOST_SEEDS = 200
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell (trajectory) of a run's result cube, with its parameters and its initial state.
-
-    Attributes
-    ----------
-    index : dict
-        Index on each of the cube's dims.
-    data : Dataset
-        The cell itself, loaded.
-    parameters : Parameters
-        With the swept ones.
-    clock_hz : float
-        Drive frequency; of a flow what stands for it [Hz].
-    start : ndarray, (n_states,)
-        The initial state; of a walk that with which it began.
-    """
+    """A cell (trajectory) of a run's result cube, with its parameters and its initial state."""
 
     number: int
-    index: Mapping[str, int]
-    data: xr.Dataset
-    parameters: Parameters
-    clock_hz: float
-    start: np.ndarray
+    index: Mapping[str, int]  # index on each of the cube's dims
+    data: xr.Dataset  # the cell itself, loaded
+    parameters: Parameters  # with the swept ones
+    clock_hz: float  # drive frequency; of a flow what stands for it [Hz]
+    start: np.ndarray  # (n_states,); the initial state; of a walk that with which it began
 
     @property
     def status(self) -> Status:
@@ -77,7 +145,7 @@ class Cell:
 
 
 def cell_of(run: ExploredRun, number: int) -> Cell:
-    """Read a cell of the run by its number; raise ExplorerError if there is no such cell."""
+    """Read a cell of the run by its number; raise RequestError if there is no such cell."""
     index = run.cell(number)
     cube = run.cube()
     names = [n for n in ("section", "turns", "status", "orbit_period", "lyapunov") if n in cube]
@@ -89,34 +157,20 @@ def cell_of(run: ExploredRun, number: int) -> Cell:
 
 
 def orbit(run: RunDirectory, cell: int, point: int, *, linearised: bool = True) -> bytes:
-    """Integrate the orbit through a point of the diagram; return arrays and attributes, packed for the page.
+    """Integrate the orbit through a kept section point of a cell; return it packed for the page.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    cell
-        Flat number of a cell of the cube.
-    point
-        Number of one of its kept sections.
-    linearised
-        Whether the multipliers of a closed orbit are computed where no analysis has them.
-
-    Raises
-    ------
-    ExplorerError
-        If there is no such section, or the run's motion has no orbits.
-    ArithmeticError
-        If the trajectory ends early.
+    `linearised` says whether the multipliers of a closed orbit are computed where no analysis has them. Raise
+    RequestError if there is no such point or the run's motion has no orbits, ArithmeticError if the trajectory ends
+    early.
     """
     explored = ExploredRun.of(run)
     if problem := run.spec.motion.refusal("an orbit"):
-        raise ExplorerError(f"{run.name}: {problem}")
+        raise RequestError(f"{run.name}: {problem}")
     found = cell_of(explored, cell)
     section = found.section
     kept = np.isfinite(section).all(axis=1)
     if not 0 <= point < len(section) or not kept[point]:
-        raise ExplorerError(_no_point(found, point, int(kept.sum())))
+        raise RequestError(_no_point(found, point, int(kept.sum())))
     attractor = _attractor(explored, found)
     period = found.period or attractor["period"]
     n_periods = period or N_PERIODS
@@ -130,31 +184,16 @@ def orbit(run: RunDirectory, cell: int, point: int, *, linearised: bool = True) 
 
 
 def facts(run: ExploredRun, cell: int, point: int | None = None) -> dict[str, Any]:
-    """Return what is known of a section point without integrating: its cell, state and parameters, and its attractor.
+    """Return what is known of a section point (by default the cell's last) without integrating, as JSON can say it.
 
-    Parameters
-    ----------
-    cell
-        Flat number of a cell of the cube.
-    point
-        Number of one of its kept sections; by default the last.
-
-    Returns
-    -------
-    dict
-        What JSON can say. ``state`` has the section point and ``start`` the initial state, by the names of the
-        states; ``attractor`` and what follows from it is None where no analysis has it.
-
-    Raises
-    ------
-    ExplorerError
-        If there is no such section.
+    ``state`` has the section point and ``start`` the initial state, by the names of the states; ``attractor`` and what
+    follows from it is None where no analysis has it. Raise RequestError if there is no such point.
     """
     found = cell_of(run, cell)
     kept = np.flatnonzero(np.isfinite(found.section).all(axis=1))
     chosen = point if point is not None else int(kept[-1]) if len(kept) else 0
     if chosen not in kept:
-        raise ExplorerError(_no_point(found, chosen, len(kept)))
+        raise RequestError(_no_point(found, chosen, len(kept)))
     attractor = _attractor(run, found)
     said = _attrs(run, found, attractor, False)
     for name in ("fixed", "quantities", "seeds", "note"):  # for drawings of the orbit
@@ -175,9 +214,7 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
 
 
 def _seconds(run: RunDirectory, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
-    """Return the time at which each period after a section point ends [s]; without a drive, a period is a return to the
-    section.
-    """
+    """Return the time at which each period (without a drive, return) after a section point ends [s]."""
     if run.model.crossing is None:
         return np.asarray(np.arange(1, n_periods + 1) / cell.clock_hz)
     from magpend_core.sections import run_branches
@@ -198,7 +235,7 @@ def _seconds(run: RunDirectory, cell: Cell, state: np.ndarray, n_periods: int) -
     times = np.cumsum(np.asarray(result.return_time)[0, 0])
     reached = times[np.isfinite(times)]
     if not len(reached):
-        raise ExplorerError("the trajectory does not come back to the section from here.")
+        raise RequestError("the trajectory does not come back to the section from here.")
     return np.asarray(reached)
 
 
@@ -224,7 +261,7 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
         "motion": names.words[code] if names.told and code > 0 else None,
         **{key: told[key] for key in _TOLD},
         "stable": _is_stable(told["stability"], multipliers),
-        "multipliers": None if multipliers is None else [[float(m.real), float(m.imag)] for m in multipliers],
+        "multipliers": None if multipliers is None else parts_of(multipliers),
         "note": "its multipliers are not ready yet: choose it again in a moment" if awaited else None,
         "exponents": exponents,
         "exponents_from": source,
@@ -262,17 +299,11 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     """
     nothing: dict[str, Any] = dict.fromkeys((*_TOLD, "multipliers", "seconds"))
     nothing["period"] = 0
-    found = run.kept("attractors")
-    if found is None:
+    here = attractor_of(run.kept("attractors"), cell.index)
+    if here is None:
         return nothing
-    number = int(found["attractor_id"].isel(cell.index))
-    if number < 0:
-        return nothing
-    here = dense(isel(found, _parameter_index(run, cell))).isel(attractor=number)
-    told = {**nothing, "attractor": number, "share": finite(here["share"]), **shown(here)}
-    if BRANCH not in run.start_dims:  # branches of a continuation are no sample of initial states
-        low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))
-        told |= {"low": finite(low[0]), "high": finite(high[0])}
+    told = {**nothing, "attractor": int(here["attractor"]), "share": finite(here["share"]), **shown(here)}
+    told |= share_bounds(run, here)
     multipliers = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
     period = int(here["orbit_period"])
     told["period"] = period
@@ -280,6 +311,27 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     if np.isfinite(multipliers).all() and period == (cell.period or period):
         told |= {"multipliers": multipliers, "seconds": finite(here["period_s"])}
     return told
+
+
+def share_bounds(run: ExploredRun, one: xr.Dataset) -> dict[str, float | None]:
+    """Return the interval of an attractor's share; branches of a continuation are no sample and have none."""
+    if BRANCH in run.start_dims:
+        return {"low": None, "high": None}
+    low, high = share_interval(np.array([int(one["n_cells"])]), np.array([float(one["share"])]))
+    return {"low": finite(low[0]), "high": finite(high[0])}
+
+
+def parts_of(numbers: np.ndarray) -> list[list[float | None]]:
+    """Return the real and the imaginary part of each complex number."""
+    return [[finite(number.real), finite(number.imag)] for number in numbers]
+
+
+def attractor_of(attractors: xr.Dataset | None, index: Mapping[str, int]) -> xr.Dataset | None:
+    """Return the stored attractor on which the cell at an index ends; None if there is none."""
+    number = -1 if attractors is None else int(attractors["attractor_id"].isel(index))
+    if attractors is None or number < 0:
+        return None
+    return dense(isel(attractors, {d: index[d] for d in dims_of(attractors)})).isel(attractor=number)
 
 
 def _parameter_index(run: ExploredRun, cell: Cell) -> dict[str, int]:

@@ -1,8 +1,7 @@
-"""Serve the interactive page of a run on this machine only.
+"""Serve the interactive page of a run on this machine only: page, data and a websocket for live computation.
 
-What takes long to import is imported once the address is known, while a browser starts.
-
-`answering` reads in a few threads, so that the page stays at hand. `security` says who is answered.
+What takes long to import is imported once the address is known, while a browser starts. `security` says who is
+answered.
 """
 
 from __future__ import annotations
@@ -11,22 +10,161 @@ import asyncio
 import contextlib
 import errno
 import json
+import logging
+import os
+import shutil
 import socket
-from collections.abc import Callable
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from html import escape
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tornado import httpserver, web
+from tornado.ioloop import IOLoop
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from pipeline.explorer.serving import page_html
-from pipeline.explorer.serving.security import Guard, Rate, headers_of, new_token
+from pipeline.explorer import html
+from pipeline.explorer.live.messages import MOST_BYTES, number_in
+from pipeline.explorer.security import Guard, Rate, headers_of, new_token
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
-    from pipeline.explorer.serving.answers import Answer
+    from pipeline.explorer.answers import Answer
+    from pipeline.explorer.live.jobs import Piece
+    from pipeline.explorer.live.live import LiveRun
+    from pipeline.explorer.live.session import LiveSession
+
+
+LOG = logging.getLogger(__name__)
+
+_REDIRECT = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="refresh" content="0; url={address}">
+<meta name="referrer" content="no-referrer">
+<title>magpend</title>
+</head>
+<body><a href="{address}">magpend explore</a></body>
+</html>
+"""
+
+
+def redirect_file(folder: Path, address: str) -> Path:
+    """Write a file that redirects a browser to an address, and that only this user can read."""
+    path = folder / "open.html"
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        file.write(_REDIRECT.format(address=escape(address)))
+    return path
+
+
+@contextlib.contextmanager
+def browser() -> Iterator[Callable[[str], None]]:
+    """Yield a function that opens an address in the user's browser without waiting for it.
+
+    The redirect file exists as long as the block runs.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="magpend-explore-"))
+
+    def open_address(address: str) -> None:
+        path = redirect_file(folder, address)
+        threading.Thread(target=webbrowser.open, args=(path.as_uri(),), daemon=True, name="browser").start()
+
+    try:
+        yield open_address
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+MOST_CONNECTIONS = 8
+"""Pages that may watch at once."""
+
+MOST_PER_SECOND, MOST_AT_ONCE = 40.0, 80
+"""Messages that a page may send, lastingly and in a burst."""
+
+MOST_UNSENT = 64 * 2**20
+"""Bytes that may wait to be sent to a page that does not take them; then it is left."""
+
+
+class LiveSocket(WebSocketHandler):
+    """Websocket connection of one page that computes live."""
+
+    def initialize(self, service: Service, live: LiveRun, others: set[LiveSocket]) -> None:
+        """Store the service, its run, and the set of open connections."""
+        self._service, self._live, self._others = service, live, others
+        self._session: LiveSession | None = None
+        self._rate = Rate(MOST_PER_SECOND, MOST_AT_ONCE)
+        self._waiting = 0
+
+    async def prepare(self) -> None:
+        """Refuse a connection without a valid token, or if too many are open."""
+        guard, headers = self._service.guard, self.request.headers
+        if guard.foreign(headers) or not guard.authorised(headers, self.get_query_argument("token", "")):
+            self.set_status(403)
+            await self.finish({"error": "this address has no valid token, or another page asks."})
+        elif len(self._others) >= MOST_CONNECTIONS:
+            self.set_status(503)
+            await self.finish({"error": f"{MOST_CONNECTIONS} pages watch already; close one."})
+
+    def open(self, *args: str, **kwargs: str) -> None:
+        """Start a live session for the new connection."""
+        from pipeline.explorer.live.session import LiveSession
+
+        self._others.add(self)
+        self.set_nodelay(True)
+        loop = IOLoop.current()
+
+        def emit(answer: Piece) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.add_callback(self._send, answer)
+
+        self._session = LiveSession(self._live, emit)
+
+    def on_message(self, message: str | bytes) -> None:
+        """Handle a message of the page, or answer that messages come too fast."""
+        if not self._rate.allows():
+            told = "too many messages; send fewer."
+            self._send({"id": number_in(message), "kind": "error", "error": told})
+        elif self._session is not None:
+            self._session.receive(message)
+
+    def _send(self, answer: Piece) -> None:
+        if self.ws_connection is None:
+            return
+        is_binary = isinstance(answer, bytes)
+        data = answer if isinstance(answer, bytes) else json.dumps(answer, allow_nan=False)
+        self._waiting += len(data)
+        if self._waiting > MOST_UNSENT:
+            LOG.warning("a page takes nothing any more; it is left")
+            self.close(1008, "too slow")
+            return
+        with contextlib.suppress(WebSocketClosedError):
+            sent = asyncio.ensure_future(self.write_message(data, binary=is_binary))
+            sent.add_done_callback(lambda done: self._sent(done, len(data)))
+
+    def _sent(self, done: asyncio.Future[None], n_bytes: int) -> None:
+        self._waiting -= n_bytes
+        if not done.cancelled():
+            done.exception()  # a page that has gone is nobody's mistake
+
+    def on_close(self) -> None:
+        """Cancel all jobs of the connection."""
+        self._others.discard(self)
+        if self._session is not None:
+            self._session.close()
+
+    @property
+    def max_message_size(self) -> int:
+        """Length of the longest message that is accepted [bytes]."""
+        return MOST_BYTES
+
 
 HOST = "127.0.0.1"
 
@@ -66,18 +204,10 @@ def static_files() -> dict[str, tuple[bytes, str]]:
 
 
 class Service:
-    """State that all request handlers share: the run that answers, the check of requests, and rate limits.
-
-    Parameters
-    ----------
-    run
-        Run to show.
-    guard
-        Check of a request's origin and token.
-    """
+    """State that all request handlers share: the run that answers, the check of requests, and rate limits."""
 
     def __init__(self, run: RunDirectory, guard: Guard) -> None:
-        from pipeline.explorer.serving.answering import Answering
+        from pipeline.explorer.answers import Answering
 
         self.answering = Answering(run)
         self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
@@ -143,7 +273,7 @@ class PageHandler(Handler):
         """Answer a request with an error status and a sentence, as an HTML page."""
         self.set_status(status)
         self.set_header("Content-Type", "text/html; charset=utf-8")
-        self.finish(page_html.note(sentence))
+        self.finish(html.note_html(sentence))
 
     async def get(self) -> None:
         """Send the HTML page of the run."""
@@ -151,7 +281,7 @@ class PageHandler(Handler):
             self.refuse(500, "the page's script is not installed: install magpend again")
             return
         self.set_header("Content-Type", "text/html; charset=utf-8")
-        self.finish(page_html.page(self.service.answering.run.info.title, self.service.guard.token))
+        self.finish(html.served_html(self.service.answering.run.info.title, self.service.guard.token))
 
 
 class StaticHandler(Handler):
@@ -180,22 +310,18 @@ class ApiHandler(Handler):
 
     async def get(self) -> None:
         """Answer a GET request, whose arguments are in its address."""
-        if self.answer.method != "GET":
-            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
-            return
-        await self._reply(b"")
+        await self._reply("GET")
 
     async def post(self) -> None:
         """Answer a POST request, whose arguments are in its body."""
-        if self.answer.method != "POST":
+        await self._reply("POST", self.request.body)
+
+    async def _reply(self, method: str, body: bytes = b"") -> None:
+        from pipeline.explorer.answers import Query, RefusedRequestError
+
+        if self.answer.method != method:
             self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
             return
-        await self._reply(self.request.body)
-
-    async def _reply(self, body: bytes) -> None:
-        from pipeline.explorer.serving.answering import RefusedRequestError
-        from pipeline.explorer.serving.answers import Query
-
         query = Query({k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body)
         try:
             reply = await asyncio.wrap_future(self.service.answering.ask(self.answer.name, query))
@@ -221,14 +347,14 @@ class NothingHandler(Handler):
 
 def application(service: Service) -> web.Application:
     """Make the web application that answers the requests for a run."""
-    from pipeline.explorer.serving.answers import ANSWERS
+    from pipeline.explorer.answers import ANSWERS
 
-    shared = {"service": service}
+    shared, live = {"service": service}, service.answering.live
     routes: list[Any] = [
         (r"/", PageHandler, shared),
         (r"/static/([A-Za-z.]+)", StaticHandler, shared),
         *((rf"/api/{name}", ApiHandler, {**shared, "answer": a}) for name, a in ANSWERS.items()),
-        *_live_routes(service),
+        *([] if live is None else [("/ws", LiveSocket, {**shared, "live": live, "others": set()})]),
     ]
     return web.Application(
         routes,
@@ -240,29 +366,8 @@ def application(service: Service) -> web.Application:
     )
 
 
-def _live_routes(service: Service) -> list[Any]:
-    live = service.answering.live
-    if live is None:
-        return []
-
-    from pipeline.explorer.serving.socket import socket_routes
-
-    def authorised(handler: web.RequestHandler) -> bool:
-        headers, guard = handler.request.headers, service.guard
-        token = handler.get_query_argument("token", "")
-        return guard.foreign(headers) is None and guard.authorised(headers, token)
-
-    return socket_routes(live, authorised)
-
-
 def listening(port: int) -> socket.socket:
-    """Open a socket that listens on this machine only, at the given or a free port.
-
-    Raises
-    ------
-    SpecError
-        If the port is taken or not ours to take.
-    """
+    """Open a socket that listens on this machine only, at the given or a free port; raise SpecError if it is taken."""
     if not 0 <= port <= 65535:
         raise SpecError(f"--port {port}: must be 0 to 65535; 0 takes a free one.")
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)

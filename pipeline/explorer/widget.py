@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 import anywidget
 import traitlets
 
-from pipeline.explorer.data.clicked_orbit import facts
-from pipeline.explorer.data.explored import ExplorerError
+from pipeline.explorer import RequestError
+from pipeline.explorer.answers import Answering
+from pipeline.explorer.connection import LEAST_HEIGHT, Connection, GoneError
+from pipeline.explorer.data.orbits import facts
 from pipeline.explorer.data.tables import orbit_dataset
-from pipeline.explorer.notebook import LEAST_HEIGHT
-from pipeline.explorer.notebook.connection import Connection, GoneError
-from pipeline.explorer.serving.answering import Answering
 from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
+
 
 _POINT = re.compile(r"(?:^|&)point=(\d{1,15}),(\d{1,15})(?=&|$)")
 
@@ -81,7 +81,7 @@ class Explorer(anywidget.AnyWidget):
         try:
             # as JSON has it, so that Python and the page have equal values
             return dict(json.loads(json.dumps(facts(self._answering.run, cell, point))))
-        except ExplorerError as error:
+        except RequestError as error:
             raise traitlets.TraitError(f"selected: {error}") from None
 
     @traitlets.observe("selected")

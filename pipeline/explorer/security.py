@@ -31,13 +31,7 @@ def new_token() -> str:
 
 @dataclass(frozen=True)
 class Guard:
-    """Checks where a request comes from, and whether it has the secret token.
-
-    Attributes
-    ----------
-    token : str
-    port : int
-    """
+    """Checks where a request comes from, and whether it has the secret token."""
 
     token: str = field(repr=False)
     port: int
@@ -95,13 +89,7 @@ def headers_of(port: int) -> dict[str, str]:
 
 
 class Rate:
-    """Limit on the rate of requests: a mean rate per second, and a larger number for a short time.
-
-    Parameters
-    ----------
-    per_second, burst
-        Mean rate [1/s], and number of requests allowed at once.
-    """
+    """Limit on the rate of requests: a mean rate [1/s], and a larger number at once."""
 
     def __init__(self, per_second: float, burst: int) -> None:
         self._per_second, self._burst = per_second, float(burst)

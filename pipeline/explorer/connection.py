@@ -3,7 +3,7 @@
 A page is one output that shows the widget; a notebook can show it several times. Messages of pages are objects with
 ``page``, a name that the page has chosen, and one of
 
-    {"page", "id", "ask": NAME, "words": {...}, "body": TEXT}   a request for data, see `serving.answers`
+    {"page", "id", "ask": NAME, "words": {...}, "body": TEXT}   a request for data, see `answers`
     {"page", "live": TEXT}                                      a message of `live.messages`
     {"page", "open": true}, {"page", "close": true}             the page begins or ends to compute live
 
@@ -23,12 +23,15 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from pipeline.explorer.live.jobs import Answer
+from pipeline.explorer.answers import ANSWERS, Answering, Query, RefusedRequestError, Reply
+from pipeline.explorer.live.jobs import Piece
 from pipeline.explorer.live.session import LiveSession
-from pipeline.explorer.serving.answering import Answering, RefusedRequestError
-from pipeline.explorer.serving.answers import ANSWERS, Query, Reply
 
 LOG = logging.getLogger(__name__)
+
+LEAST_HEIGHT = 320
+"""Lowest widget in which the diagram has its axes [CSS px]."""
+
 
 MOST_PAGES = 8
 """Pages of a widget that may compute live at once; a further one ends the session of the oldest."""
@@ -43,13 +46,8 @@ class GoneError(Exception):
 class Connection:
     """Messages between the pages of a widget and the run that answers them.
 
-    Parameters
-    ----------
-    answering
-        Run that answers.
-    send
-        ``send(content, buffers)`` sends a message to all pages; called from several threads, one call at a time.
-        If it raises GoneError, all jobs are cancelled.
+    ``send(content, buffers)`` sends a message to all pages; it is called from several threads, one call at a time. If
+    it raises GoneError, all jobs are cancelled.
     """
 
     def __init__(self, answering: Answering, send: Send) -> None:
@@ -108,7 +106,7 @@ class Connection:
         if live is None:
             return None
 
-        def emit(answer: Answer) -> None:
+        def emit(answer: Piece) -> None:
             if isinstance(answer, bytes):
                 self._send({"page": page, "live": True}, [answer])
             else:
