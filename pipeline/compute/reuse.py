@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Sections, Status
-from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.inputs import WALKED, Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
@@ -223,7 +222,7 @@ class Pool:
                 part |= _products(spec, _points(inputs.take(rows), slice(0, n)), part, source.missing)
                 if n < n_points:
                     tail = _points(inputs.take(rows), slice(n, n_points))
-                    more = integrate(spec, going_on(tail, {k: part[k][:, -1] for k in WALKED if k in part}))
+                    more = integrate(spec, tail.continuing({k: part[k][:, -1] for k in WALKED if k in part}))
                     part = {name: np.concatenate([part[name], more[name]], axis=1) for name in more}
                 _put(values, rows, part, n_branches)
                 tally.append(int(n) * len(rows))

@@ -18,7 +18,6 @@ import numpy as np
 from magpend_core import Status
 from magpend_core.engine.threads import using_threads
 from magpend_core.models import import_model
-from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
@@ -26,7 +25,7 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.first_versions import numbered
 from pipeline.layout.identity import differences, identity_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.inputs import WALKED, Inputs
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.commits import write_task
@@ -78,7 +77,7 @@ def compute(
     """
     inputs = cells.inputs(block)
     if before is not None:
-        inputs = going_on(inputs, before)
+        inputs = inputs.continuing(before)
     if spec.refine is None:
         values = integrate(spec, inputs)
     else:

@@ -22,7 +22,7 @@ from pipeline.explorer.live.catalog import Catalog, Known
 from pipeline.explorer.live.jobs import PATIENCE_S
 from pipeline.explorer.live.legend import Legend
 from pipeline.explorer.live.messages import RequestError
-from pipeline.explorer.live.settling import Flight, Place
+from pipeline.explorer.live.settling import LiveFlight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import axis_name
@@ -306,9 +306,8 @@ class Warming:
     def _sections(self) -> None:
         live = self._live
         place, start = live.first_start()
-        flight = Flight(place, live.integration, start[None], lambda: None)
-        section, _ = flight.advance(np.array([0]), 1)
-        flight.closed(section, live.integration)
+        flight = LiveFlight(place, live.integration, start[None], lambda: None)
+        flight.advance(1)
         if live.model.autonomous:  # where it rests is told at its end
             newton_steps(live.model.system, start[None], place.parameters.pack())
 
