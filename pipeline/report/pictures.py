@@ -50,7 +50,7 @@ def _recording(results: Results, table: PictureTable) -> DataFigure:
 
 
 def _series(results: Results, table: PictureTable) -> DataFigure:
-    from pipeline.rig.measured.overlays import plot_series
+    from pipeline.rig.measured.figures import plot_series
 
     return plot_series(results.series(table.of, int(table.options.get("periods", 10))))
 

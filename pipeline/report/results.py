@@ -10,14 +10,14 @@ from pipeline.layout.writing import write_atomically
 from pipeline.report.study import Study
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
-from pipeline.runs.workflows import find_spec
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from pipeline.rig.simulation import Rig
+    from pipeline.rig.virtual import Rig
 
 Echo = Callable[[str], None]
 
@@ -66,7 +66,7 @@ class Results:
         """Read all needed specifications and headers; raise a SpecError that lists all problems."""
         table, problems = self.study.table, []
         checks: list[tuple[str, Callable[[str], Any]]] = [
-            *((name, lambda name: load_spec(self.spec(name), smoke=self.smoke)) for name in table.runs),
+            *((name, lambda name: Spec.read(self.spec(name), smoke=self.smoke)) for name in table.runs),
             *((name, self.rig) for name in table.recordings),
             *((name, self._measurement) for name in table.torques),
         ]
@@ -105,7 +105,7 @@ class Results:
 
     def rig(self, name: str) -> Rig:
         """Return the simulated test rig that makes a recording of the study."""
-        from pipeline.rig.simulation import load_rig
+        from pipeline.rig.virtual import load_rig
 
         return load_rig(self.study.file(self.study.table.recordings[name].rig))
 
@@ -114,7 +114,7 @@ class Results:
         if name not in self._recordings:
             from pipeline.rig.recordings import read_recording
             from pipeline.rig.recordings.writing import write_raw
-            from pipeline.rig.simulation import simulated
+            from pipeline.rig.virtual import simulated
 
             self._echo(f"{name}: recording of a virtual rig")
             raw, mapping = simulated(self.rig(name), is_csv=True)

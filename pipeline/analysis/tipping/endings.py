@@ -15,12 +15,11 @@ from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
-from pipeline.motion.inputs import Inputs
-from pipeline.motion.steady import Steady
+from pipeline.motion.steady import Inputs, Steady
 from pipeline.products.tipping import TippingOptions
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 
@@ -109,7 +108,7 @@ class Group:
 
 
 def endings(
-    run: Run, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
+    run: OpenRun, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
 ) -> Iterator[Group]:
     """Integrate cells on at their final parameters, and find the attractors on which they end.
 
@@ -141,7 +140,7 @@ def endings(
         yield Group(final, cells, ids, going, settled, outcome)
 
 
-def _going_on(run: Run, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
+def _going_on(run: OpenRun, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
     """Return a cube of trajectories that go on from given states at constant parameters, as of a sweep."""
     model, n = final.parameters.model, len(states)
     length = {"n_transient": options.settle, "n_keep": options.keep}

@@ -10,8 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.compute.closing import TOLERANCE, closing_of
-from pipeline.compute.simulate import simulate
+from pipeline.compute.simulate import TOLERANCE, closing_of, simulate
 
 PLANE = SimpleNamespace(is_angle=(True, False), scales=(1.0, 10.0))
 ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))

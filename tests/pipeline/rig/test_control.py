@@ -10,8 +10,8 @@ import pytest
 from magpend_core.models import load_model
 from pipeline.layout.vocabulary import parameters_of
 from pipeline.rig.control import Controlled, load_control, orbits_csv, trace
-from pipeline.rig.measured_branch.comparison import amplitudes, compare
-from pipeline.rig.measured_branch.reading import read_branch
+from pipeline.rig.measured.branch import compare, read_branch
+from pipeline.rig.measured.branch_computed import amplitudes
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError

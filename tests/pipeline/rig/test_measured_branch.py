@@ -7,12 +7,11 @@ import pytest
 
 from magpend_core.models import load_model
 from pipeline.layout.vocabulary import parameters_of
-from pipeline.rig.measured_branch.comparison import amplitudes, branch_table, compare, rms_of
-from pipeline.rig.measured_branch.cycles import CyclesError, cycles_of
-from pipeline.rig.measured_branch.figure import plot_branch
-from pipeline.rig.measured_branch.reading import read_branch
+from pipeline.rig.measured.branch import CyclesError, branch_table, compare, cycles_of, read_branch, rms_of
+from pipeline.rig.measured.branch_computed import amplitudes
+from pipeline.rig.measured.branch_figure import plot_branch
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from pipeline.specification.problems import SpecError
 
 LINEAR = """

@@ -10,8 +10,7 @@ import pytest
 from magpend_core import load_preset, trajectory
 from magpend_core.models.preset_writing import write_preset
 from pipeline.rig.recordings import findings_of, parse_mapping, read_recording, write_raw
-from pipeline.rig.simulation import load_rig, parse_rig, simulated
-from pipeline.rig.virtual import TOLERANCE, DriveSensor, Sensor, Step, readings, record
+from pipeline.rig.virtual import TOLERANCE, DriveSensor, Sensor, Step, load_rig, parse_rig, readings, record, simulated
 from pipeline.specification.problems import SpecError
 
 TIMES = np.arange(3000) / 500.0

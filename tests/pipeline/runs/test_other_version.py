@@ -9,9 +9,9 @@ import pytest
 from pipeline.cli.exits import Exit
 from pipeline.layout.identity import digest_of
 from pipeline.runs.run import run
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key
 from pipeline.store.files import entry_of
+from pipeline.store.stored_json import seal, unseal
 
 pytestmark = pytest.mark.slow
 

@@ -18,8 +18,8 @@ from magpend_core.models import imported
 from pipeline import open_run
 from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.runfile import read_run
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import finished, quietly
 
 

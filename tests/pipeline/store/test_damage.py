@@ -21,11 +21,11 @@ from pipeline.compute import task
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
-from pipeline.store import commits, packing, records
-from pipeline.store.checksums import seal, unseal
+from pipeline.store import commits, records
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.products import write_product
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import duffing, finished, quietly, silent
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
@@ -44,7 +44,7 @@ def values_of(directory):
 def sound(tmp_path_factory):
     """A finished run of two packs, a record of its own and the copy of that, with a product beside it."""
     folder, patch = tmp_path_factory.mktemp("damage"), pytest.MonkeyPatch()
-    for module in (records, commits, packing):
+    for module in (records, commits):
         patch.setattr(module, "BLOCK", 2)
     directory = finished(folder, SPEC)
     names = sorted(f.name for f in (directory / "commits").iterdir())
@@ -422,7 +422,7 @@ def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(wh
     """The record's digest, and the checksum in the chunk, for readers that know no records."""
     directory = whole()
 
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     chunk = next(path for path in chunks(directory) if path.parent.name == name)
     content = chunk.read_bytes()
     for i in range(20):

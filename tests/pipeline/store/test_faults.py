@@ -21,12 +21,12 @@ import pytest
 
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import load_spec
-from pipeline.store import commits, packing, records
-from pipeline.store.checksums import fits, unseal
+from pipeline.specification.spec import Spec
+from pipeline.store import commits, records
 from pipeline.store.errors import StoreError
+from pipeline.store.stored_json import fits, unseal
+from tests.core.models.text.test_domains import faults
 from tests.pipeline.factories import duffing, quietly
-from tests.pipeline.store import faults
 from tests.pipeline.store.faults import CHANGES, MKDIR, OPEN, READ, RENAME, SYNC, WRITE, Disk, Steps
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
@@ -50,7 +50,7 @@ def go(folder):
 def finished(tmp_path_factory):
     """An uninterrupted run: its files, its numbers, and all that it did."""
     folder, patch = tmp_path_factory.mktemp("faults"), pytest.MonkeyPatch()
-    for module in (records, commits, packing):  # two records make a pack, so that packing is a step too
+    for module in (records, commits):  # two records make a pack, so that packing is a step too
         patch.setattr(module, "BLOCK", 2)
     (folder / "spec.toml").write_text(SPEC)
     go(folder)  # compiled, and imported
@@ -319,7 +319,7 @@ def test_power_cut__order_of_syncs_and_renames(finished):
         for file in vouched:
             assert kept.get(file) == file.read_bytes(), (target.name, file)
     # each on its own, then in a pack
-    assert n_records == 2 * make_plan(load_spec(finished.folder / "spec.toml")).n_tasks
+    assert n_records == 2 * make_plan(Spec.read(finished.folder / "spec.toml")).n_tasks
     assert disk.after_a_cut(top, lambda path: False).keys() >= {top / key for key in finished.files}
 
 

@@ -13,9 +13,9 @@ from zarr.storage import LocalStore
 
 from pipeline import open_run
 from pipeline.store import products
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits
 from pipeline.store.errors import DamagedError
+from pipeline.store.stored_json import seal, unseal
 
 
 def flipped(content: bytes, byte: int = -40) -> bytes:

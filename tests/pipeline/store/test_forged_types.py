@@ -14,10 +14,10 @@ from pipeline.layout.identity import digest_of
 from pipeline.runs.status import describe_state, state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import products
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.records import BLOCK, Pack, Records, pack_key, pack_text, read_pack, read_record
+from pipeline.store.stored_json import seal, unseal
 
 FORGED = [7, "12", None, True, [1, "a"], {"a\0b": 1}, float("nan"), -(10**400)]
 

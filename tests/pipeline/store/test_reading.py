@@ -12,7 +12,7 @@ from magpend_core import Status
 from magpend_core.models import load_model
 from pipeline import open_run
 from pipeline.layout.schema import base_variables
-from pipeline.store import parallel_reads
+from pipeline.store import reading
 from pipeline.store.view import CommittedStore
 
 VARIABLES = base_variables(load_model())
@@ -72,6 +72,6 @@ def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
 
 def test_quick__builds_on_what_zarr_makes_public():
     """No module of `zarr.core`: what is there may change with any version."""
-    tree = ast.parse(Path(parallel_reads.__file__).read_text("utf-8"))
+    tree = ast.parse(Path(reading.__file__).read_text("utf-8"))
     modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert not {name for name in modules if name and name.startswith("zarr.core")}

@@ -7,13 +7,12 @@ import json
 import pytest
 
 from pipeline import open_run
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.verify import verify_run
-from pipeline.store.commits import read_commits, scan
-from pipeline.store.declared import METADATA
+from pipeline.store.arrays import METADATA
+from pipeline.store.commits import read_commits, scan, withdraw
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
-from pipeline.store.packing import withdraw
 from pipeline.store.record_copy import copied_records, write_copy
 from pipeline.store.runfile import write_run
 from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton

@@ -12,8 +12,7 @@ from scipy.optimize import least_squares
 
 from magpend_core.models import load_model
 from magpend_core.sampling import Drive
-from pipeline.rig.identify.first_guesses import fit_starts
-from pipeline.rig.identify.local import fit_local
+from pipeline.rig.identify.local import fit_local, fit_starts
 from pipeline.rig.identify.objective import _steps, evaluate
 from pipeline.rig.identify.problem import Free, Piece, Problem
 from pipeline.rig.identify.search import cut, refine, search, slowest_period, sobol

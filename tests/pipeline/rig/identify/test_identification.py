@@ -13,9 +13,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
-from pipeline.rig.identify import check as checking
 from pipeline.rig.identify import directory as d
 from pipeline.rig.identify import identification
+from pipeline.rig.identify import validation as checking
 from pipeline.specification.problems import SpecError
 
 TRUTH = {"damping": 0.15, "linear": 1.1, "cubic": 0.4}
@@ -315,7 +315,7 @@ def test_compare__goes_by_held_out_pieces(bench, without_cubic, main):
 
 
 def test_compare__refuses_other_data(bench, tmp_path):
-    from pipeline.rig.identify.comparison import compare
+    from pipeline.rig.identify.validation import compare
 
     folder, _, _ = bench
     shutil.copytree(folder / "out", tmp_path / "other")
@@ -351,7 +351,7 @@ def test_check__long_pieces_of_other_numbers_and_lengths(bench, tmp_path):
 
 
 def test_judgement__without_a_spread_has_no_correlation():
-    from pipeline.rig.identify.judging import Judgement
+    from pipeline.rig.identify.judgement import Judgement
     from pipeline.rig.identify.problem import Piece
 
     measured = np.column_stack([np.ones(5), np.arange(5.0), np.full(5, np.nan)])

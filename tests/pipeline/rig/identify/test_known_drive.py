@@ -8,8 +8,8 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
-from pipeline.rig.identify import check as checking
 from pipeline.rig.identify import identification
+from pipeline.rig.identify import validation as checking
 from pipeline.rig.identify.build import drive_problems
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.specification.problems import SpecError

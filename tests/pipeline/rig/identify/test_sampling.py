@@ -11,10 +11,8 @@ import xarray as xr
 
 from pipeline.rig.identify.directory import read_result
 from pipeline.rig.identify.identification import identify
-from pipeline.rig.identify.log_posterior import LogPosterior, log_posterior
-from pipeline.rig.identify.posterior import Sampling, kept_draws, posterior_table, sample_draws
-from pipeline.rig.identify.posterior_files import write_posterior
-from pipeline.rig.identify.sampling import _first, judged, sample_posterior, split_rhat
+from pipeline.rig.identify.mcmc import LogPosterior, _first, judged, log_posterior, sample_posterior, split_rhat
+from pipeline.rig.identify.posterior import Sampling, kept_draws, posterior_table, sample_draws, write_posterior
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from tests.pipeline.bautin import MODEL, SECTION, TRUTH, radius, write_orbits, write_toml

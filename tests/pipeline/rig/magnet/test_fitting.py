@@ -9,9 +9,17 @@ import pytest
 from scipy.optimize import curve_fit
 
 from magpend_core.models.pendulum import magnet_torque as laws
-from pipeline.rig.magnet.fitting import fit_curve, fit_curves, fit_dipoles, fit_jointly, fit_laws, fit_measurement
+from pipeline.rig.magnet.fitting import (
+    errors_by_cluster,
+    fit_curve,
+    fit_curves,
+    fit_dipoles,
+    fit_jointly,
+    fit_laws,
+    fit_measurement,
+    solve,
+)
 from pipeline.rig.magnet.measurement import Curve
-from pipeline.rig.magnet.solving import errors_by_cluster, solve
 
 from .conftest import TRUE
 
@@ -196,7 +204,7 @@ def test_fit_jointly__says_what_readings_do_not_determine(measured):
 
 
 def test_fit_jointly__what_does_not_converge_is_no_result(measured, monkeypatch):
-    monkeypatch.setattr("pipeline.rig.magnet.solving.MAX_EVALUATIONS", 3)
+    monkeypatch.setattr("pipeline.rig.magnet.fitting.MAX_EVALUATIONS", 3)
     with pytest.raises(ArithmeticError, match="joint fit: the fit did not converge"):
         fit_jointly(measured, near(TRUE))
 

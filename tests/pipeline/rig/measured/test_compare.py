@@ -8,10 +8,10 @@ import xarray as xr
 
 from pipeline.analysis.ragged import dense
 from pipeline.products.measured import SweepOptions
-from pipeline.rig.measured.compare import compare, compare_with
+from pipeline.rig.measured.comparison import compare, compare_with
 from pipeline.rig.measured.computed import Computed
+from pipeline.rig.measured.diagram import measure
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
-from pipeline.rig.measured.measuring import measure
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 

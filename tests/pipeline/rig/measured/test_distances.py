@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import wasserstein_distance
 
 from pipeline.analysis.sets import Geometry
-from pipeline.rig.measured.distances import Candidate, Cloud, cloud_of, distance_to, floor_of, wasserstein
+from pipeline.rig.measured.comparison import Cloud, cloud_of, distance_to, floor_of, wasserstein
+from pipeline.rig.measured.computed import Candidate
 
 LINE = Geometry((False,), (2.0,))
 CIRCLE = Geometry((True, False), (1.0, 10.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.rig.measured.regimes import find_period
+from pipeline.rig.measured.diagram import find_period
 
 
 def noisy(points, sigma, seed=0):

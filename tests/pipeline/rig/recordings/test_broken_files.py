@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import parse_mapping, recording_of
-from pipeline.rig.recordings.formats import read_raw
+from pipeline.rig.recordings.reading import read_raw
 from pipeline.rig.recordings.writing import write_raw
 from pipeline.specification.problems import SpecError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of
-from pipeline.rig.recordings.findings import runs
+from pipeline.rig.recordings.channels import runs
 
 
 def kinds(ds):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of, window
-from pipeline.rig.recordings.formats import read_raw
+from pipeline.rig.recordings.channels import Channel
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.recordings.raw import Channel
+from pipeline.rig.recordings.reading import read_raw
 from pipeline.specification.problems import SpecError
 
 

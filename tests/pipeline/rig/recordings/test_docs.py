@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.simulation import parse_rig, simulated
+from pipeline.rig.virtual import parse_rig, simulated
 
 PAGE = (Path(__file__).parents[4] / "docs" / "rig.md").read_text("utf-8")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, mapping_for, parse_mapping, read_recording, window, write_recording
-from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.mapping import CsvMap
+from pipeline.rig.recordings.reading import read_raw
 from pipeline.specification.problems import SpecError
 
 from .lvm_files import lvm_segment, written_lvm
