@@ -25,7 +25,7 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.catalog import Catalog, Entry, Known
 from pipeline.explorer.live.jobs import PATIENCE_S
-from pipeline.explorer.live.settling import Flight, Place
+from pipeline.explorer.live.settling import LiveFlight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES, axis_name
@@ -391,9 +391,8 @@ class Warming:
     def _sections(self) -> None:
         live = self._live
         place, start = live.first_start()
-        flight = Flight(place, live.integration, start[None], lambda: None)
-        section, _ = flight.advance(np.array([0]), 1)
-        flight.closed(section, live.integration)
+        flight = LiveFlight(place, live.integration, start[None], lambda: None)
+        flight.advance(1)
         if live.model.autonomous:  # where it rests is told at its end
             newton_steps(live.model.system, start[None], place.parameters.pack())
 

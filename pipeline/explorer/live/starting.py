@@ -21,7 +21,7 @@ from pipeline.explorer import RequestError
 from pipeline.explorer.data.orbits import SAMPLES, fixed_points, series
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import StartRequest
-from pipeline.explorer.live.settling import Flight, Place, conclude, run_start, system_at
+from pipeline.explorer.live.settling import LiveFlight, Place, conclude, run_start, system_at
 from pipeline.layout.vocabulary import ABSENT
 from pipeline.specification.noise import STEPS
 
@@ -161,7 +161,7 @@ def start(live: LiveRun, job: Job) -> None:
     path = _Path(live, job, place, state)
     path.show(FIRST_PERIODS)
     sections = _Sections(job)
-    flight = Flight(place, live.integration, state[None], job.check)
+    flight = LiveFlight(place, live.integration, state[None], job.check)
     if not live.model.autonomous:
         path.show(PERIODS - FIRST_PERIODS)
     block = run_start(flight, live.integration, sections.take, request.periods)

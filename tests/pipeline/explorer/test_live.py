@@ -10,6 +10,8 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
+from pipeline.analysis.attractors.destinations import destinations_at
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
@@ -28,6 +30,7 @@ from pipeline.layout.vocabulary import (
     NOT_SETTLED,
     PERIODIC_ORBIT,
     UNSTABLE,
+    split_dims,
 )
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
@@ -446,3 +449,25 @@ def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
     ):
         assert word in watcher.ask(**wrong)["error"]
     assert watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})["kind"] == "done"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["whole", "closing", "flow"])
+def test_settle_cells__ends_where_the_analysis_follows(directories, name):
+    """The live page and the analyses name the same attractor for the same initial states."""
+    opened = RunDirectory.open(directories[name])
+    live, cube, attractors = LiveRun(opened), opened.cube(), derive(directories[name], "attractors")
+    rng, n_named = np.random.default_rng(3), 0
+    for points in slabs(cube, Dynamics.of(cube), BUDGET):
+        for index, there in destinations_at(cube, attractors, points):
+            (axis,) = split_dims(cube["status"])[0]
+            place = live.place({axis: float(cube[axis][index[0]])}, None)
+            catalog = live.catalog(place)
+            starts = rng.uniform(-0.9, 0.9, (64, 2))
+            numbers = settle_cells(place, live.integration, catalog, starts, lambda: None)
+            labels = there.follow(starts).label
+            ends = [catalog.entry(number) for number in numbers.tolist()]
+            named = [i for i, end in enumerate(ends) if end.attractor is not None and end.stability == ATTRACTS]
+            assert [ends[i].attractor for i in named] == labels[named].tolist()
+            n_named += len(named)
+    assert n_named > 64

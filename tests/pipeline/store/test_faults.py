@@ -25,8 +25,8 @@ from pipeline.specification.spec import Spec
 from pipeline.store import commits, records
 from pipeline.store.errors import StoreError
 from pipeline.store.stored_json import fits, unseal
-from tests.core.models.text.test_domains import faults
 from tests.pipeline.factories import duffing, quietly
+from tests.pipeline.store import faults
 from tests.pipeline.store.faults import CHANGES, MKDIR, OPEN, READ, RENAME, SYNC, WRITE, Disk, Steps
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
