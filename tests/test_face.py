@@ -15,12 +15,11 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib import pyplot as plt
-from matplotlib.legend import Legend
 
 import magpend
 from magpend._plots import Plots
 from pipeline.cli import reference
-from pipeline.plots import pixels, style
+from pipeline.plots import pixels
 from pipeline.plots.style import TARGET, Target
 from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
@@ -345,15 +344,6 @@ def test_plot__counts_points_on_pixels_as_fine_as_in_files(run, monkeypatch):
     monkeypatch.setitem(plt.rcParams, "figure.dpi", 72.0)
     (shown,), (kept,) = run.plot.bifurcation().images, magpend.figure(run, "bifurcation").axes[0].images
     np.testing.assert_allclose(shown.get_array().shape, kept.get_array().shape, rtol=0.02)  # texts differ by pixels
-
-
-def test_legend_inside__keeps_the_first():
-    ax = style.new_figure(3.0, xr.Dataset()).add_subplot()
-    line = ax.plot([0, 1], [0, 1], label="a")
-    style.legend_inside(ax, [*line, *ax.plot([1], [1], label="b")])
-    style.legend_inside(ax, line)
-    legends = [artist for artist in ax.get_children() if isinstance(artist, Legend)]
-    assert sorted(len(legend.get_texts()) for legend in legends) == [1, 2]
 
 
 # ---- Datasets -----------------------------------------------------------------------------------
