@@ -10,54 +10,30 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import magpend
-from tests.pipeline.factories import quietly
+from tests.pipeline.factories import duffing, finished, quietly
 
 FREQUENCY = 1.0 / (2.0 * math.pi)
-TWO_WELLS = f"""
-kind = "sweep"
-title = "two wells"
-model = "duffing"
-[parameters]
-preset = "twin-well-periodic"
-[axes]
-frequency_hz = {{ values = [{FREQUENCY!r}] }}
-[initial_conditions]
-kind = "grid"
-x = {{ start = -2.2, stop = 2.2, num = 12 }}
-v = {{ start = -2.2, stop = 2.2, num = 12 }}
-[integration]
-rtol = 1e-8
-atol = 1e-8
-n_transient = 200
-n_keep = 16
-[products]
-lyapunov = {{ n_transient = 100, n_periods = 200, n_blocks = 4 }}
-[execution]
-trajectories_per_task = 24
-"""
+TWO_WELLS = duffing(
+    f"frequency_hz = {{ values = [{FREQUENCY!r}] }}",
+    'kind = "grid"\nx = { start = -2.2, stop = 2.2, num = 12 }\nv = { start = -2.2, stop = 2.2, num = 12 }',
+    n_transient=200,
+    n_keep=16,
+    tolerance=1e-8,
+    more='[parameters]\npreset = "twin-well-periodic"\n'
+    "[products]\nlyapunov = { n_transient = 100, n_periods = 200, n_blocks = 4 }",
+)
+RESONANCE = duffing(
+    "frequency_hz = { start = 0.16, stop = 0.30, num = 15 }",
+    'kind = "list"\npoints = [[0.0, 0.0]]',
+    kind="continuation",
+    n_transient=60,
+    n_keep=12,
+    tolerance=1e-8,
+    more='[parameters]\npreset = "hardening"\n[continuation]\ndirection = "both"',
+)
 # x'' = .2 cos t + x - x^3 - .15 x': DynamicalSystemsBase.jl, issue 139, and recomputed
 WELLS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
 MULTIPLIER = complex(-0.226806, 0.581567)
-
-RESONANCE = """
-kind = "continuation"
-title = "bent resonance"
-model = "duffing"
-[parameters]
-preset = "hardening"
-[axes]
-frequency_hz = { start = 0.16, stop = 0.30, num = 15 }
-[continuation]
-direction = "both"
-[initial_conditions]
-kind = "list"
-points = [[0.0, 0.0]]
-[integration]
-rtol = 1e-8
-atol = 1e-8
-n_transient = 60
-n_keep = 12
-"""
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +41,6 @@ def folder(tmp_path_factory):
     """A folder with the finished run ``wells``."""
     path = tmp_path_factory.mktemp("promises")
     (path / "wells.toml").write_text(TWO_WELLS)
-    (path / "resonance.toml").write_text(RESONANCE)
     quietly(path / "wells.toml", path / "wells")
     return path
 
@@ -101,9 +76,8 @@ def hardening(t, y, f):
     return v, force - 0.1 * v - x - 0.5 * x**3, c, d, -k * a - 0.1 * c, -k * b - 0.1 * d
 
 
-def test_branches__have_the_orbits_and_folds_of_another_integrator(folder):
-    quietly(folder / "resonance.toml", folder / "resonance")
-    found = magpend.branches(folder / "resonance", max_period=1)
+def test_branches__have_the_orbits_and_folds_of_another_integrator(tmp_path):
+    found = magpend.branches(finished(tmp_path, RESONANCE), max_period=1)
     folds = found.isel(bifurcation=found.of_branch == 0)
     assert folds.sizes["bifurcation"] == 2
     for f, state in zip(folds.value.values, folds.bifurcation_section.values[:, 0], strict=True):

@@ -15,7 +15,8 @@ from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live import noisy_starting
 from pipeline.explorer.serving.answers import ANSWERS, Query
 from pipeline.store.run import Run
-from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
+from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH
+from tests.pipeline.factories import finished
 
 DAMPING, AMPLITUDES = 0.15, (0.1, 0.2)
 

@@ -34,9 +34,8 @@ from pipeline.runs.derive import derive
 from pipeline.runs.status import state
 from pipeline.specification.parsing import load_spec
 from pipeline.store.run import Run
-from tests.pipeline.explorer.small_runs import FLOW, finished
-
-HZ = 0.15915494309189535
+from tests.pipeline.explorer.small_runs import FLOW, HZ
+from tests.pipeline.factories import finished
 
 DRIVEN = """
 kind = "sweep"

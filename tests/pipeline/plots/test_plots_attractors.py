@@ -91,6 +91,7 @@ def test_plot_basins__cells_outcomes_and_shares(grid):
     ):
         assert (one == other) == (first == second)
     assert image.get_extent() == pytest.approx(np.rad2deg([-1.0, 1.0, -1.0, 1.0]))
+    assert image.origin == "lower"
 
 
 def test_plot_basins__selection_and_refusals(grid):
