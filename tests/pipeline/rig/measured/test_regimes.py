@@ -36,12 +36,9 @@ def test_find_period__cycles_among_noise(period, seed):
 
 N = np.arange(60)
 CYCLE = np.tile([[0.0, 1.0], [0.3, 0.2], [0.9, 0.4]], (20, 1))
+ON_PAPER = {2.9: 1, 3.2: 2, 3.5: 4, 3.83: 3, 3.74: 5, 3.9: 0, 3.6: 0}
 KNOWN = {
-    # the logistic map as on paper
-    **{
-        f"r = {r}": (logistic(r, 64), p)
-        for r, p in ((2.9, 1), (3.2, 2), (3.5, 4), (3.83, 3), (3.74, 5), (3.9, 0), (3.6, 0))
-    },
+    **{f"logistic map, r = {r}": (logistic(r, 64), period) for r, period in ON_PAPER.items()},
     "a turn per period is no motion of its own": (2 * np.pi * N + 0.1, 1),
     "a missing section does not shift the others": (np.where((N == 17)[:, None], np.nan, CYCLE), 3),
 }
