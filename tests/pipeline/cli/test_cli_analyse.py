@@ -38,12 +38,9 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
     lines = out.splitlines()
     assert "attractors at 2 parameter points" in out
     at = lines.index("frequency 2.2 Hz:")
-    assert lines[at + 1].split()[:5] == ["id", "kind", "stability", "period", "side"]
     left, right = (next(line for line in lines[at:] if f" {side} " in line) for side in ("left", "right"))
     assert re.search(r"periodic orbit +attracts +1 +left +0\.000 0\.000 +0\.9[67]\d\d ", left)
-    assert re.search(r"0\.\d{4} \(0\.\d{4} to 0\.\d{4}\)", right)
-    assert left.endswith("multipliers")
-    assert lines[at + 1].endswith("shown by")
+    assert re.search(r"0\.\d{4} \(0\.\d{4} to 0\.\d{4}\) .*multipliers$", right)
     assert lines[-1] == "all 32 cells end on attractors"
     ds = dense(derive(spirals, "attractors"), points=True)
     assert f"stored: {ds.encoding['source']}" in err
@@ -139,36 +136,22 @@ def test_analyse__refused_before_computing(main, made, arguments, message):
     assert not (made.info.directory / "derived").exists()
 
 
-def test_analyse__run_without_attractors(main, write_spec, tmp_path):
+def test_analyse__run_without_attractors(main, sweep_text, copied):
     """Every cell diverged at once: tables and figures say so, none fails."""
-    write_spec("""
-kind = "sweep"
-[axes]
-frequency_hz = { values = [2.6, 2.8] }
-[initial_conditions]
-kind = "grid"
-psi1_deg = { start = -10, stop = 10, num = 3 }
-psi2_deg = { start = -10, stop = 10, num = 2 }
-psi1_dot = 1e9
-[integration]
-n_transient = 8
-n_keep = 16
-""")
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    code, out, err = main("analyse", "attractors", "run", "--csv", "a.csv")
-    assert code == 0, err
-    assert "0 attractors at 2 parameter points" in out
-    assert "0 of 12 cells end on attractors; 12 diverged" in out
-    code, out, err = main("analyse", "basins", "run")
-    assert code == 0, err
-    assert re.search(r"diverged +6 +1\.0000 \(0\.6097 to 1\.0000\)", out)
-    code, out, err = main("analyse", "settling", "run")
-    assert code == 0, err
-    assert "sets that do not close: none" in out
-    for figure in ("fractions", "attractors"):
-        code, _, err = main("plot", figure, "run")
+    text = sweep_text.replace("psi1_dot = 0.1", "psi1_dot = 1e9").replace("q = { values = [1.5, 1.6] }", "")
+    copied(text.replace("n_transient = 2\nn_keep = 3", "n_transient = 8\nn_keep = 16").replace("num = 5", "num = 2"))
+    for name, words in (
+        ("attractors", "0 of 24 cells end on attractors; 24 diverged"),
+        ("basins", r"diverged +12 +1\.0000 \(0\.7575 to 1\.0000\)"),
+        ("settling", "sets that do not close: none"),
+    ):
+        code, out, err = main("analyse", name, "run")
         assert code == 0, err
-    assert main("plot", "basins", "run", "--at", "frequency=2.6")[0] == 0
-    code, _, err = main("plot", "gallery", "run", "--at", "frequency=2.6")
+        assert re.search(words, out), out
+    at = ("--at", "frequency=2.0")
+    for figure in (("fractions",), ("attractors",), ("basins", *at)):
+        code, _, err = main("plot", figure[0], "run", *figure[1:])
+        assert code == 0, err
+    code, _, err = main("plot", "gallery", "run", *at)
     assert code == Exit.REFUSED
     assert "there is no attractor" in err

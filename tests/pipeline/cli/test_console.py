@@ -122,26 +122,16 @@ def test_reporting__says_when_it_compiles():
 
 
 @pytest.mark.slow
-def test_head__ends_with_0(magpend, made, environment):
+def test_head__ends_with_0(made, environment):
     """Whoever reads no further is no error."""
     command = f"{sys.executable} -m pipeline.cli.main status {made.info.directory} | head -c 1"
-    found = subprocess.run(
-        ["bash", "-c", f"{command}; echo rc ${{PIPESTATUS[0]}}"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command += "; echo rc ${PIPESTATUS[0]}"
+    found = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=True)
     assert found.stdout.endswith("rc 0\n")
     assert "Error" not in found.stderr  # on a busy machine progress is shown
     code = "import sys; from pipeline.cli import console\nfor i in range(100000): console.result('line')"
-    found = subprocess.run(
-        ["bash", "-c", f'{sys.executable} -c "{code}" 2>&1 | head -1'],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = f'{sys.executable} -c "{code}" 2>&1 | head -1'
+    found = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=True)
     assert "EnoughError" in found.stdout or found.stdout == "line\n"
 
 
@@ -190,12 +180,3 @@ def test_models__lists_states_parameters_and_presets(main):
     assert code == Exit.REFUSED
     assert "duffing" in err
     assert "twin-well" in main("presets", "--model", "duffing")[1]
-
-
-def test_status__for_programs(main, made):
-    made.commit(0)
-    code, out, _ = main("status", made.info.directory, "--json")
-    assert code == 0
-    (found,) = json.loads(out)
-    assert found["complete"] is False
-    assert found["committed_cells"] == made.plan.cells_in(0)

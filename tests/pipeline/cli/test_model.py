@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 
 import pytest
 
@@ -13,28 +12,15 @@ from pipeline.specification.parsing import load_spec
 
 
 @pytest.mark.slow
-def test_new__runs_as_it_is(main, tmp_path):
+def test_new__runs_as_it_is_and_overwrites_nothing(main, tmp_path):
     code, out, _ = main("model", "new", "mine.toml")
     assert (code, out) == (0, "specification: mine.toml\n")
+    assert main("model", "new")[1] == (tmp_path / "mine.toml").read_text()
+    for file in ("mine.toml", "mine.txt", "nowhere/mine.toml"):
+        assert main("model", "new", file)[0] == 2
     code, _, said = main("run", "mine.toml", "--smoke", "--workers", 0)
     assert code == 0, said
     assert (tmp_path / "runs" / "mine-smoke" / "run.json").is_file()
-
-
-def test_new__overwrites_nothing(main, tmp_path):
-    (tmp_path / "mine.toml").write_text("kept")
-    code, _, said = main("model", "new", "mine.toml")
-    assert code == 2
-    assert "exists already" in said
-    assert (tmp_path / "mine.toml").read_text() == "kept"
-    assert main("model", "new", "mine.txt")[0] == 2
-    assert main("model", "new", "nowhere/mine.toml")[0] == 2
-
-
-def test_new__without_a_file_writes_to_the_output(main):
-    code, out, _ = main("model", "new")
-    assert code == 0
-    assert tomllib.loads(out)["model"]["name"] == "oscillator"
 
 
 def test_template__every_line_that_is_offered_can_be_taken(tmp_path):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
+from tests.pipeline.factories import contents, duffing
+
 pytestmark = pytest.mark.slow
 
-SPEC = """
-kind = "sweep"
-model = "duffing"
-parameters = { frequency_hz = 0.2 }
-axes = { amplitude = { start = 0.2, stop = 0.3, num = 3 } }
-initial_conditions = { kind = "list", points = [[0.1, 0.0], [1.0, 0.2]] }
-integration = { n_transient = 30, n_keep = 8 }
-"""
+SPEC = duffing(
+    "amplitude = { start = 0.2, stop = 0.3, num = 3 }",
+    n_transient=30,
+    n_keep=8,
+    more="[parameters]\nfrequency_hz = 0.2",
+)
 
 ANALYSE = ("analyse", "attractors", "run", "--no-polish", "--no-extend", "--csv")
 PLOT = ("plot", "bifurcation", "run", "--out")
@@ -42,13 +42,9 @@ def whole(copied):
     return copied(SPEC)
 
 
-def everything(folder):
-    return {f.relative_to(folder): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands__write_into_no_run_directory_and_follow_no_link(whole, main, tmp_path, name):
-    before = everything(whole)
+    before = contents(whole)
     for below in (".", "cube.zarr", "commits"):
         code, _, said = main(*COMMANDS[name], whole / below / name)
         assert code == 2, said
@@ -60,7 +56,7 @@ def test_commands__write_into_no_run_directory_and_follow_no_link(whole, main, t
     assert code == 2, said
     assert "link that leads nowhere" in said
     assert not (tmp_path / "nowhere").exists()
-    assert everything(whole) == before
+    assert contents(whole) == before
 
 
 @pytest.mark.parametrize("name", [n for n in COMMANDS if n not in ("film.gif", "copy.html", "new.toml")])

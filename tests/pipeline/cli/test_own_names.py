@@ -5,33 +5,19 @@ from __future__ import annotations
 import pytest
 
 from pipeline.cli.exits import Exit
+from tests.pipeline.factories import duffing, quietly
 
 pytestmark = pytest.mark.slow
 
-SPEC = """
-kind = "sweep"
-title = "{title}"
-model = "duffing"
-[axes]
-frequency_hz = {{ start = {start}, stop = 0.25, num = 3 }}
-[initial_conditions]
-kind = "list"
-points = [[0.5, 0.0]]
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 2
-n_keep = 3
-"""
-
 
 @pytest.fixture
-def two(main, write_spec):
+def two(tmp_path):
     """Two runs of one name in two folders."""
-    for folder, start in (("a", 0.15), ("b", 0.16)):
-        path = write_spec(SPEC.format(start=start, title="Öl"), f"{folder}.toml")
-        code, _, err = main("run", path, "--out", f"{folder}-runs/first", "--workers", "0")
-        assert code == 0, err
+    for folder, start in (("a-runs", 0.15), ("b-runs", 0.16)):
+        text = duffing(f"frequency_hz = {{ start = {start}, stop = 0.25, num = 3 }}").replace('"small"', '"Öl"')
+        (tmp_path / folder).mkdir()
+        (tmp_path / f"{folder}/spec.toml").write_text(text, "utf-8")
+        quietly(tmp_path / f"{folder}/spec.toml", tmp_path / f"{folder}/first")
     return "a-runs/first", "b-runs/first"
 
 

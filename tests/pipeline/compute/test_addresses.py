@@ -16,6 +16,7 @@ from pipeline.compute import addresses, clients
 from pipeline.compute.addresses import Address, SchedulerError, ask, read_address
 from pipeline.compute.clients import Where
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import LOOPBACK
 
 SECONDS = 60.0
 """Within which each is refused: 5 s of silence, and a machine that is busy."""
@@ -55,20 +56,6 @@ def closed_port():
         yield taken.getsockname()[1]
 
 
-@pytest.fixture
-def cluster():
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=1,
-        processes=False,
-        host="127.0.0.1",
-        protocol="tcp",
-        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-    ) as found:
-        yield found
-
-
 def refusal(address):
     """What is said, and that it is said soon."""
     started = time.monotonic()
@@ -80,50 +67,49 @@ def refusal(address):
     return text
 
 
-def test_ask__no_such_host():
-    assert "there is no host 'nosuch.invalid'" in refusal("tcp://nosuch.invalid:8786")
-
-
-def test_ask__unreachable_host():
-    """An address that networks keep free for examples: whatever the way there does, it is refused in time."""
-    assert "tcp://192.0.2.1:8786: " in refusal("tcp://192.0.2.1:8786")
-
-
-def test_ask__wrong_port():
-    with closed_port() as port:
-        assert f"tcp://127.0.0.1:{port}: nothing listens there" in refusal(f"127.0.0.1:{port}")
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("tcp://nosuch.invalid:8786", "there is no host 'nosuch.invalid'"),
+        # an address that networks keep free for examples: whatever the way there does, it is refused in time
+        ("tcp://192.0.2.1:8786", "tcp://192.0.2.1:8786: "),
+        *((a, f"{a!r} is no address of a scheduler; give tcp://HOST:PORT") for a in ("tcp://", "host", "tcp:/host:1")),
+        *((a, "is no address") for a in ("tcp://host:port", "tcp://host:0", "tcp://host:70000", "tcp://a:1:2")),
+        *((a, f"{a!r}: must begin with tcp:// or tls://.") for a in ("http://host:8787", "inproc://1:2")),
+    ],
+)
+def test_ask__nobody_can_be_asked(address, words):
+    assert words in refusal(address)
 
 
 @pytest.mark.slow
-def test_ask__web_server(monkeypatch):
+@pytest.mark.parametrize(
+    ("scheme", "there", "words"),
+    [
+        ("", closed_port, "nothing listens there"),
+        ("tcp://", web_server, "is another kind of server"),
+        ("tcp://", mute_server, "or a scheduler that hangs"),
+        ("tls://", mute_server, "TLS needs the scheduler's authority"),
+    ],
+)
+def test_ask__something_else_is_there(monkeypatch, scheme, there, words):
     assert addresses.ANSWER_S <= 5
     monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
-    with web_server() as port:
-        assert "is another kind of server" in refusal(f"tcp://127.0.0.1:{port}")
+    with there() as port:
+        assert words in refusal(f"{scheme}127.0.0.1:{port}")
 
 
 @pytest.mark.slow
-def test_ask__mute(monkeypatch):
-    monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
-    with mute_server() as port:
-        assert "or a scheduler that hangs" in refusal(f"tcp://127.0.0.1:{port}")
+def test_ask__a_scheduler_and_what_is_beside_it(monkeypatch):
+    from distributed import LocalCluster
 
-
-@pytest.mark.slow
-def test_ask__a_scheduler_and_what_is_beside_it(cluster, monkeypatch):
-    ask(read_address(cluster.scheduler_address, "--scheduler"))
-    monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
-    (worker,) = cluster.workers.values()
-    assert "is the address of a worker" in refusal(worker.address)
-    dashboard = f"tcp://127.0.0.1:{cluster.scheduler.http_server.port}"
-    assert "is another kind of server" in refusal(dashboard)
-
-
-def test_ask__tls_without_keys():
-    with mute_server() as port:
-        text = refusal(f"tls://127.0.0.1:{port}")
-    assert "TLS needs the scheduler's authority" in text
-    assert "DASK_DISTRIBUTED__COMM__TLS__CA_FILE" in text
+    with LocalCluster(n_workers=1, processes=False, protocol="tcp", **LOOPBACK) as cluster:
+        ask(read_address(cluster.scheduler_address, "--scheduler"))
+        monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
+        (worker,) = cluster.workers.values()
+        assert "is the address of a worker" in refusal(worker.address)
+        dashboard = f"tcp://127.0.0.1:{cluster.scheduler.http_server.port}"
+        assert "is another kind of server" in refusal(dashboard)
 
 
 def test_ask__plain_where_tls_is_spoken(tmp_path, monkeypatch):
@@ -131,49 +117,17 @@ def test_ask__plain_where_tls_is_spoken(tmp_path, monkeypatch):
     from distributed import LocalCluster, Security
 
     security = Security.temporary()
-    with LocalCluster(
-        n_workers=0,
-        processes=False,
-        host="127.0.0.1",
-        protocol="tls",
-        security=security,
-        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-        silence_logs=60,
-    ) as cluster:
+    options = {"n_workers": 0, "processes": False, "protocol": "tls", "security": security, "silence_logs": 60}
+    with LocalCluster(**options, **LOOPBACK) as cluster:
         settings = {}
         for name, key in (("CA_FILE", "ca_file"), ("CLIENT__CERT", "cert"), ("CLIENT__KEY", "key")):
             file = tmp_path / key
             file.write_text(security.get_tls_config_for_role("client")[key])
-            variable = f"DASK_DISTRIBUTED__COMM__TLS__{name}"
             settings[f"distributed.comm.tls.{name.lower().replace('__', '.')}"] = str(file)
-            monkeypatch.setenv(variable, str(file))
+            monkeypatch.setenv(f"DASK_DISTRIBUTED__COMM__TLS__{name}", str(file))
         with dask.config.set(settings):
             ask(read_address(cluster.scheduler_address, "--scheduler"))
             assert "for tls://" in refusal(cluster.scheduler_address.replace("tls", "tcp"))
-
-
-@pytest.mark.parametrize(
-    "address",
-    [
-        "tcp://",
-        "tcp://host",
-        "host",
-        "tcp://host:port",
-        "tcp://host:0",
-        "tcp://host:70000",
-        "tcp://a:1:2",
-        "tcp://ho st:1",
-        "slurmm",
-        "tcp:/host:1",
-    ],
-)
-def test_read_address__malformed(address):
-    assert f"{address!r} is no address of a scheduler; give tcp://HOST:PORT" in refusal(address)
-
-
-@pytest.mark.parametrize("address", ["http://host:8787", "https://host:1", "ssh://host:22", "inproc://1:2"])
-def test_read_address__wrong_scheme(address):
-    assert f"{address!r}: must begin with tcp:// or tls://." in refusal(address)
 
 
 def test_read_address__forms():
@@ -187,12 +141,11 @@ def test_read_address__forms():
     [
         (None, "cannot be read (No such file or directory)"),
         ("", "is no scheduler file"),
-        ("[1]", "is no scheduler file"),
         ("{}", "is no scheduler file"),
+        ("\udcff", "is no scheduler file"),
         ('{"address": 3}', "its 'address' must be a text"),
         ('{"address": "other.json"}', "its 'address' must be a text"),
         ('{"address": "tcp://host"}', "is no address of a scheduler"),
-        ("\udcff", "is no scheduler file"),
     ],
 )
 def test_read_address__bad_file(tmp_path, content, words):
@@ -226,50 +179,42 @@ def test_where__default_and_environment(monkeypatch):
         Where().resolved()
 
 
-def test_where__jobs_need_a_file(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("place", "has_file", "dashboard", "words"),
+    [
+        ("slurm", False, False, "set MAGPEND_CLUSTER"),
+        ("pbs", True, False, "describes jobs of slurm"),
+        ("threads", True, False, "and --scheduler threads asks for none"),
+        (None, True, False, "slurm: there is no command 'sbatch' here"),
+        ("slurm", True, True, r"needs bokeh.*pip install '\.\[dashboard\]'"),
+        ("threads", False, True, "--dashboard: shows a dask scheduler, and there is none"),
+    ],
+)
+def test_where__what_does_not_go_together(tmp_path, monkeypatch, place, has_file, dashboard, words):
+    path = tmp_path / "cluster.toml"
+    path.write_text(CLUSTER)
     monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
-    with pytest.raises(SpecError, match="set MAGPEND_CLUSTER"):
-        Where("slurm").resolved()
-    path = tmp_path / "cluster.toml"
-    path.write_text(CLUSTER)
-    with pytest.raises(SpecError, match="describes jobs of slurm"):
-        Where("pbs", path).resolved()
-    with pytest.raises(SpecError, match="and --scheduler threads asks for none"):
-        Where("threads", path).resolved()
-
-
-def test_where__no_batch_system_here(tmp_path, monkeypatch):
-    path = tmp_path / "cluster.toml"
-    path.write_text(CLUSTER)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(SpecError, match="slurm: there is no command 'sbatch' here"):
-        Where(None, path).resolved()
-    monkeypatch.setenv("MAGPEND_CLUSTER", str(path))
-    with pytest.raises(SpecError, match="slurm: there is no command 'sbatch' here"):
-        Where("slurm").resolved()
-
-
-def test_where__dashboard_without_its_package_or_a_scheduler(tmp_path, monkeypatch):
-    path = tmp_path / "cluster.toml"
-    path.write_text(CLUSTER)
-    monkeypatch.setitem(sys.modules, "bokeh", None)
-    monkeypatch.setattr(clients, "check_means", lambda cluster: None)
-    with pytest.raises(SpecError, match=r"needs bokeh.*pip install '\.\[dashboard\]'"):
-        Where("slurm", path, dashboard=True).resolved()
-    for place in ("threads", "processes", "none"):
-        with pytest.raises(SpecError, match="--dashboard: shows a dask scheduler, and there is none"):
-            Where(place, dashboard=True).resolved()
+    if dashboard:
+        monkeypatch.setitem(sys.modules, "bokeh", None)
+        monkeypatch.setattr(clients, "check_means", lambda cluster: None)
+    with pytest.raises(SpecError, match=words):
+        Where(place, path if has_file else None, dashboard=dashboard).resolved()
+    if words.startswith("slurm:"):
+        monkeypatch.setenv("MAGPEND_CLUSTER", str(path))
+        with pytest.raises(SpecError, match=words):
+            Where("slurm").resolved()
 
 
 def test_run__wrong_address(main, tmp_path, write_spec, sweep_text):
     """Words that cannot be an address create nothing; a scheduler that is not there ends with its code."""
-    path = write_spec(sweep_text)
-    code, _, errors = main("run", path, "--out", tmp_path / "out", "--scheduler", "tcp://host")
+    words = ("run", write_spec(sweep_text), "--out", tmp_path / "out", "--scheduler")
+    code, _, errors = main(*words, "tcp://host")
     assert code == 2
     assert "is no address" in errors
     assert not (tmp_path / "out").exists()
     with closed_port() as port:
-        code, _, errors = main("run", path, "--out", tmp_path / "out", "--scheduler", f"tcp://127.0.0.1:{port}")
+        code, _, errors = main(*words, f"tcp://127.0.0.1:{port}")
     assert code == 4
     assert "nothing listens there" in errors
     assert "Traceback" not in errors

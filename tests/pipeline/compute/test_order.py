@@ -23,10 +23,6 @@ def in_steps_of(n):
     return lambda i: i - 1 if i % n else None
 
 
-def test_order__plain():
-    assert drained(Order([3, 1, 2])) == [3, 1, 2]
-
-
 def test_order__long_chains_first_and_never_before_their_predecessor():
     order = Order(range(12), in_steps_of(4))
     assert [order.take() for _ in range(4)] == [0, 4, 8, None]

@@ -59,12 +59,6 @@ def test_simulate__all_problems_at_once():
         assert any(p.startswith(start) for p in caught.value.problems)
 
 
-def test_write_series__bad_paths(series, tmp_path):
-    for path in (tmp_path / "a.txt", tmp_path / "absent" / "a.csv"):
-        with pytest.raises(SpecError):
-            write_series(series, path)
-
-
 @pytest.mark.parametrize(
     ("name", "value"), [("rtol", 1.0), ("rtol", 1e-14), ("atol", 1.0), ("atol", 0.0), ("n_transient", 10**9)]
 )

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matplotlib.text import Text
 
 from magpend_core import load_preset, run_branches
 from pipeline.compute.simulate import simulate
-from pipeline.plots import plot_trajectory
 from pipeline.specification.drive_files import load_drive
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import edges
 
 HZ, START = 2.2, (0.3, -0.1, 0.0, 0.0)
-DUTY = load_preset().as_dict()["duty_cycle"]
 
 
 @pytest.fixture
 def even(tmp_path):
-    """A drive file of equal periods from 1.5 s on."""
-    rising = 1.5 + np.arange(9) / HZ
-    rows = [f"{a!r},{a + DUTY / HZ!r}" for a in rising.tolist()]
+    """A drive file of eight equal periods from 1.5 s on."""
     path = tmp_path / "even.csv"
-    path.write_text("rising_s,falling_s\n" + "\n".join(rows) + "\n", "utf-8")
+    path.write_text(edges(8, HZ, start=1.5), "utf-8")
     return path
 
 
@@ -88,14 +84,6 @@ def test_simulate__section_is_that_of_a_run(even):
     wrapped = np.angle(np.exp(1j * found.psi2.values[1:]))
     np.testing.assert_allclose(wrapped, expected[:, 1], atol=1e-7)
     np.testing.assert_allclose(found.psi1_dot[1:], expected[:, 2], atol=1e-7)
-
-
-@pytest.mark.slow
-def test_plot_trajectory__marks_the_sections_of_the_recording(even):
-    figure = plot_trajectory(simulate(None, START, drive=even, samples_per_period=40))
-    texts = [text.get_text() for text in figure.findobj(Text)]
-    assert any("recorded drive" in text for text in texts)
-    assert figure.data["section_times"].size == 9
 
 
 @pytest.mark.parametrize(

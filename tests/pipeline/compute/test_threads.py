@@ -15,9 +15,10 @@ import psutil
 import pytest
 
 from pipeline.compute.execute import run_tasks
-from pipeline.compute.order import MOST_IN_A_ROW, Order, TaskFailedError
+from pipeline.compute.order import Order, TaskFailedError
 from pipeline.compute.processes import Processes
 from pipeline.compute.threads import in_threads, writing_results
+from tests.pipeline.factories import wait_for
 
 
 @pytest.mark.slow
@@ -55,13 +56,6 @@ def test_threads__two_at_a_time_and_failed_ones_alone():
     assert max(most) == 2
     assert len(alone) == 2
     assert alone[1] == 1
-
-
-def test_threads__give_up_where_all_fail(faulty, tmp_path):
-    task = partial(faulty.raising, str(tmp_path), poison=range(1000))
-    with pytest.raises(TaskFailedError, match="Given up: so many tasks fail"):
-        list(run_tasks(task, range(1000), workers=2))
-    assert len(faulty.tries(tmp_path)) <= MOST_IN_A_ROW + 1
 
 
 # ---- the end of a run, with tasks still running --------------------------------------------------------
@@ -138,9 +132,7 @@ def asleep(faulty, tmp_path):
 
     thread = threading.Thread(target=call)
     thread.start()
-    end = time.monotonic() + 120
-    while not faulty.tries(tmp_path) and time.monotonic() < end:
-        time.sleep(0.02)
+    wait_for(lambda: faulty.tries(tmp_path))
     yield processes, processes._started[0]
     processes.close()
     thread.join()

@@ -47,14 +47,14 @@ def test_workers__one_that_dies_with_a_result_that_was_not_fetched_yet(faulty, s
     async def late(client, future):
         if not states:
             states.append("finished")
-            await wait_until(lambda: future.status == "finished")
+            await reached(lambda: future.status == "finished")
             (holder,) = (await client.scheduler.who_has(keys=[future.key]))[future.key]
             os.kill((await client._run(os.getpid))[holder], signal.SIGKILL)
-            await wait_until(lambda: future.status != "finished")
+            await reached(lambda: future.status != "finished")
             states[0] = future.status
         return await outcome(client, future)
 
-    async def wait_until(true):
+    async def reached(true):
         until = time.monotonic() + 120
         while not true() and time.monotonic() < until:
             await asyncio.sleep(0.01)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from magpend_core.engine.checks import SystemCheckError
+from tests.pipeline.factories import quietly
+
 OWN = """
 kind = "sweep"
 [axes]
@@ -56,14 +59,13 @@ def test_commands__the_drives_period_and_its_fractions(main, write_spec, drive):
     assert code == 0, err
 
 
-def test_run__a_model_that_fails_its_checks_leaves_no_directory(main, own, write_spec, tmp_path, monkeypatch):
+def test_run__a_model_that_fails_its_checks_leaves_no_directory(own, write_spec, tmp_path, monkeypatch):
     """A model given as a Python object is checked only when it is compiled."""
     own.write_module(tmp_path / "models", "slow_drive")
     module = tmp_path / "models/slow_drive.py"
     module.write_text(module.read_text().replace("sincos(c[1] * t)", "sincos(0.3 * c[1] * t)"))
     monkeypatch.syspath_prepend(str(tmp_path / "models"))
     spec = write_spec(own.spec('model = "slow_drive:MINE"'))
-    code, _, err = main("run", spec, "--workers", "0", "--out", tmp_path / "out")
-    assert code == 2, err
-    assert "must have the period of the drive" in err
+    with pytest.raises(SystemCheckError, match="must have the period of the drive"):
+        quietly(spec, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,16 +63,6 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
         assert size <= planning.CHUNK_BYTES or chunks[0] == 1
 
 
-@pytest.mark.parametrize("n_seeds", [1, 5, 6, 7, 12])
-@pytest.mark.parametrize("wanted", [1, 2, 4, 5, 8, 24])
-def test_make_plan__no_task_walks_both_ways(walk_text, n_seeds, wanted):
-    text = walk_text.replace("n = 5", f"n = {n_seeds}").replace("task = 2", f"task = {wanted}")
-    plan = make_plan(parse_spec(tomllib.loads(text)))
-    assert plan.shape[-1] == 2 * n_seeds
-    for block in plan.tasks():
-        assert block[-1].start // n_seeds == (block[-1].stop - 1) // n_seeds
-
-
 def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
     import os
 
@@ -82,12 +71,6 @@ def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
     monkeypatch.setattr(os, "cpu_count", lambda: 97)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(97)), raising=False)
     assert make_plan(spec) == plan
-
-
-def test_task__out_of_range(sweep_text):
-    plan = make_plan(parse_spec(tomllib.loads(sweep_text)))
-    with pytest.raises(IndexError, match="does not exist"):
-        plan.task(plan.n_tasks)
 
 
 def test_identity__what_counts(sweep_text):
@@ -110,23 +93,6 @@ def test_digest_of__numbers_without_loss():
     assert digest_of({"a": 1}) != digest_of({"a": True})
     assert differences({"seed": 2**53 + 1}, {"seed": 2**53})
     assert not differences({"a": 2.0}, {"a": 2})
-
-
-def test_identity__other_starts_under_the_same_specification(sweep_text, monkeypatch):
-    """Another version of what makes numbers of a specification is another run."""
-    spec = parse_spec(tomllib.loads(sweep_text))
-    before = identity_of(spec, make_plan(spec))
-    original = identity.coordinates
-
-    def moved(spec):
-        found = list(original(spec))
-        i = next(i for i, c in enumerate(found) if c.name == "psi1_0")
-        found[i] = replace(found[i], values=found[i].values + 1e-15)
-        return tuple(found)
-
-    monkeypatch.setattr(identity, "coordinates", moved)
-    lines = differences(before, identity_of(spec, make_plan(spec)))
-    assert [line.split(":")[0] for line in lines] == ["coordinates"]
 
 
 def test_identity__versions_of_what_is_computed(sweep_text):

@@ -8,29 +8,19 @@ import pytest
 
 from pipeline.cli.exits import Exit
 from pipeline.layout.identity import digest_of
-from pipeline.runs.run import run
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key
 from pipeline.store.files import entry_of
+from tests.pipeline.factories import duffing, quietly
 
 pytestmark = pytest.mark.slow
 
-SPEC = """
-kind = "sweep"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 3 }
-[initial_conditions]
-kind = "list"
-points = [[0.5, 0.0]]
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 40
-n_keep = 3
-[execution]
-trajectories_per_task = 1
-"""
+SPEC = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 3 }",
+    'kind = "list"\npoints = [[0.5, 0.0]]',
+    n_transient=40,
+    execution="trajectories_per_task = 1",
+)
 
 
 def made_by(directory, **changes):
@@ -66,7 +56,7 @@ def begun_by(write_spec, tmp_path, **versions):
     and the bytes of that task.
     """
     spec, directory = write_spec(SPEC), tmp_path / "begun"
-    run(spec, directory, workers=0, echo=lambda _: None)
+    quietly(spec, directory)
     made_by(directory, **versions)
     last = directory / marker_key(2)
     content = last.read_bytes()
@@ -77,7 +67,7 @@ def begun_by(write_spec, tmp_path, **versions):
 def test_run__of_versions_that_were_digests_goes_on(write_spec, tmp_path):
     spec, directory, last = begun_by(write_spec, tmp_path, versions=None, **FIRST)
     before = (directory / "run.json").read_bytes()
-    run(spec, directory, workers=0, echo=lambda _: None)
+    quietly(spec, directory)
     assert (directory / marker_key(2)).read_bytes() == last
     assert (directory / "run.json").read_bytes() == before
 
@@ -94,12 +84,7 @@ def test_run__of_another_version(main, write_spec, tmp_path, versions):
     spec, directory, _ = begun_by(write_spec, tmp_path, **versions)
     code, _, err = main("run", spec, "--out", directory, "--workers", "0")
     assert code == Exit.REFUSED
-    for words in (
-        "another version of magpend",
-        "finished cells stay",
-        "status, analyse, plot or report",
-        "--out ANOTHER",
-    ):
+    for words in ("another version of magpend", "finished cells stay", "status, analyse, plot", "--out ANOTHER"):
         assert words in err
     for command in (["status"], ["verify"], ["analyse", "attractors"], ["plot", "bifurcation"]):
         code, _, err = main(*command, directory)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pipeline.products.reporting import is_heard
 from pipeline.runs import notebook
 from pipeline.runs.progress import LINE_EVERY_S, Progress
 
@@ -18,20 +17,6 @@ def test_progress__rate_and_time_left_count_this_session_only():
         assert lines == ["600/1000 cells (60 %), 10 cells/s, 40 s left"]
         progress.add(400)
     assert lines[-1].startswith("1000/1000 cells (100 %)")
-
-
-def test_progress__bar(capsys):
-    with Progress(10, 0, terminal=True, echo=print) as progress:
-        progress.add(10)
-    shown = capsys.readouterr()
-    assert "10/10" in shown.out + shown.err
-
-
-def test_progress__outside_a_notebook_does_nothing(capsys):
-    assert not notebook.is_notebook()
-    with notebook.progress():
-        assert not is_heard()
-    assert capsys.readouterr() == ("", "")
 
 
 def test_bar__shows_counts_then_how_it_ended():

@@ -25,9 +25,9 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
 from pipeline.specification.parsing import parse_spec
-from pipeline.store.errors import LockedError, RefusedError
+from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import read_run
-from tests.pipeline.factories import FOLD, WELL, silent
+from tests.pipeline.factories import FOLD, LOOPBACK, WELL, n_committed, quietly, silent, wait_for
 
 MANY = """
 [axes]
@@ -52,7 +52,7 @@ MANY_WALK = f'kind = "continuation"\n{HALF}\n[continuation]\ndirection = "both"\
 
 @pytest.mark.slow
 def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
-    run(write_spec(walk_text), tmp_path / "run", workers=0, echo=silent)
+    quietly(write_spec(walk_text), tmp_path / "run")
     ds = open_run(tmp_path / "run")
     assert ds.section.dims == ("frequency", "branch", "period_index", "state")
     assert ds.direction.values.tolist() == ["up"] * 5 + ["down"] * 5
@@ -68,18 +68,6 @@ def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
         wanted = getattr(expected, name).copy()
         wanted[5:] = wanted[5:, ::-1]
         assert np.array_equal(found, wanted, equal_nan=True), name
-
-
-def test_run__sweep_is_what_the_kernel_says(write_spec, sweep_text, tmp_path):
-    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
-    ds = open_run(tmp_path / "run")
-    cell = ds.isel(frequency=3, q=1, psi1_0=2, psi2_0=1)
-    start = [float(cell[f"{s}_0"]) for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")]
-    packed = load_preset(q=1.6).pack().reshape(1, 1, -1)
-    options = parse_spec(tomllib.loads(sweep_text)).integration.model_dump()
-    expected = run_branches(packed, np.array([[2.75]]), np.array([start]), **options)
-    assert np.array_equal(cell.section.values, expected.section[0, 0])
-    assert int(cell.n_steps) == expected.n_steps[0, 0]
 
 
 @pytest.mark.slow
@@ -118,7 +106,7 @@ def test_run__in_another_thread_and_inside_an_event_loop(write_spec, walk_text, 
 def test_run__numbers_do_not_depend_on_the_tasks(write_spec, sweep_text, tmp_path):
     for n in (24, 7):
         text = sweep_text.replace("trajectories_per_task = 24", f"trajectories_per_task = {n}")
-        run(write_spec(text), tmp_path / f"run{n}", workers=0, echo=silent)
+        quietly(write_spec(text), tmp_path / f"run{n}")
     one, other = open_run(tmp_path / "run24").load(), open_run(tmp_path / "run7").load()
     assert one.drop_attrs(deep=False).identical(other.drop_attrs(deep=False))
 
@@ -139,11 +127,10 @@ def counted(monkeypatch, fail_at=None, error=None):
 
 
 def test_run__again_does_nothing(write_spec, sweep_text, tmp_path, monkeypatch, bytes_of):
-    path = write_spec(sweep_text)
-    run(path, tmp_path / "run", workers=0, echo=silent)
+    path, lines = write_spec(sweep_text), []
+    quietly(path, tmp_path / "run")
     before = bytes_of(tmp_path / "run")
     calls = counted(monkeypatch)
-    lines = []
     run(path, tmp_path / "run", workers=0, echo=lines.append)
     assert calls == []
     assert "nothing to do" in lines[0]
@@ -153,19 +140,19 @@ def test_run__again_does_nothing(write_spec, sweep_text, tmp_path, monkeypatch, 
 @pytest.mark.slow
 def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, monkeypatch, bytes_of):
     path = write_spec(sweep_text)
-    run(path, tmp_path / "whole", workers=0, echo=silent)
+    quietly(path, tmp_path / "whole")
     n_tasks = state(tmp_path / "whole").plan.n_tasks
     with monkeypatch.context() as patch:
         tried = counted(patch, fail_at=3)
         with pytest.raises(TaskFailedError, match="task 2: RuntimeError: out of luck"):
-            run(path, tmp_path / "run", workers=0, echo=silent)
+            quietly(path, tmp_path / "run")
     assert len(tried) == n_tasks + 1
     assert tried[2] == tried[-1]
     assert state(tmp_path / "run").done == set(range(n_tasks)) - {2}
     for leftover in ("cube.zarr/section/c.2.0.0.0.0.abc.partial", "cube.zarr/status/c.2.0.0.0", "commits/.2.tmp"):
         (tmp_path / "run" / leftover).write_bytes(b"left by a crash")
     calls = counted(monkeypatch)
-    run(path, tmp_path / "run", workers=0, echo=silent)
+    quietly(path, tmp_path / "run")
     assert len(calls) == 1
     assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
 
@@ -173,58 +160,27 @@ def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, m
 def test_run__ctrl_c_in_process(write_spec, sweep_text, tmp_path, monkeypatch):
     counted(monkeypatch, fail_at=2, error=KeyboardInterrupt())
     with pytest.raises(InterruptedRunError, match="the same command continues") as caught:
-        run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+        quietly(write_spec(sweep_text), tmp_path / "run")
     assert caught.value.signal_number == signal.SIGINT
     assert state(tmp_path / "run").done == {0}
 
 
-def test_run__changed_spec_is_refused(write_spec, sweep_text, tmp_path, bytes_of):
-    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
+def test_run__changed_spec_or_other_kernel_is_refused(write_spec, sweep_text, tmp_path, bytes_of, monkeypatch):
+    path = write_spec(sweep_text)
+    quietly(path, tmp_path / "run")
     before = bytes_of(tmp_path / "run")
     changed = write_spec(sweep_text.replace("rtol = 1e-6", "rtol = 1e-5"), "changed.toml")
-    for function in (
-        lambda: run(changed, tmp_path / "run", workers=0),
-        lambda: list(describe_plan(changed, tmp_path / "run")),
-    ):
+    for use in (lambda: quietly(changed, tmp_path / "run"), lambda: list(describe_plan(changed, tmp_path / "run"))):
         with pytest.raises(RefusedError, match=r"spec\.integration\.rtol: 1e-06 in the directory, 1e-05 now"):
-            function()
-    assert bytes_of(tmp_path / "run") == before
-
-
-def test_run__other_kernel_is_refused(write_spec, sweep_text, tmp_path, monkeypatch):
-    path = write_spec(sweep_text)
-    run(path, tmp_path / "run", workers=0, echo=silent)
+            use()
     monkeypatch.setattr(identity, "ENGINE", 1000)
     with pytest.raises(RefusedError, match=r"versions.engine: \d+ in the directory, 1000 now"):
-        run(path, tmp_path / "run", workers=0, echo=silent)
-
-
-def test_task__other_kernel_on_a_worker_is_refused(write_spec, sweep_text, tmp_path, monkeypatch):
-    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
-    digest = read_run(tmp_path / "run").digest
+        quietly(path, tmp_path / "run")
+    assert bytes_of(tmp_path / "run") == before
+    # and by a worker
     task._prepare.cache_clear()
-    monkeypatch.setattr(identity, "ENGINE", 1000)
     with pytest.raises(RefusedError, match="would not compute the same run"):
-        task.run_task(str(tmp_path / "run"), digest, 0)
-
-
-def test_run__locked(write_spec, sweep_text, tmp_path):
-    from filelock import FileLock
-
-    (tmp_path / "run").mkdir()
-    with FileLock(tmp_path / "run" / "lock", is_singleton=False), pytest.raises(LockedError):
-        run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
-
-
-def wait_for_commits(process, directory, n):
-    """Wait until a running command has committed `n` tasks."""
-    end = time.monotonic() + 120
-    while time.monotonic() < end and process.poll() is None:
-        folder = directory / "commits"
-        if folder.is_dir() and len(list(folder.glob("*.json"))) >= n:
-            return
-        time.sleep(0.002)
-    raise AssertionError((process.poll(), process.communicate()))
+        task.run_task(str(tmp_path / "run"), read_run(tmp_path / "run").digest, 0)
 
 
 @pytest.fixture(scope="module")
@@ -233,14 +189,12 @@ def uninterrupted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("uninterrupted")
     for name, text in (("sweep", MANY_SWEEP), ("walk", MANY_WALK)):
         (folder / f"{name}.toml").write_text(text)
-        run(folder / f"{name}.toml", folder / name, workers=0, echo=silent)
+        quietly(folder / f"{name}.toml", folder / name)
     return folder
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "workers", "seed"), [("sweep", 2, 0), ("walk", 2, 1), ("sweep", 0, 2), ("walk", 0, 3)]
-)
+@pytest.mark.parametrize(("kind", "workers", "seed"), [("sweep", 2, 0), ("walk", 0, 3)])
 def test_kill__resumed_run_has_the_same_bytes(uninterrupted, start, tmp_path, bytes_of, kind, workers, seed):
     rng = np.random.default_rng(seed)
     spec, directory = uninterrupted / f"{kind}.toml", tmp_path / "run"
@@ -248,12 +202,12 @@ def test_kill__resumed_run_has_the_same_bytes(uninterrupted, start, tmp_path, by
     n_kills = 2 if (kind, workers) == ("sweep", 2) else 1
     for share in np.sort(rng.uniform(0, 0.8, n_kills)):
         process = start("run", spec, "--out", directory, "--workers", workers)
-        wait_for_commits(process, directory, int(share * n_tasks))
+        wait_for(lambda least=int(share * n_tasks): n_committed(directory) >= least, process)
         time.sleep(rng.uniform(0, 0.05))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
     assert not state(directory).complete
-    assert run(spec, directory, workers=0, echo=silent).complete
+    assert quietly(spec, directory).complete
     assert bytes_of(directory) == bytes_of(uninterrupted / kind)
 
 
@@ -265,7 +219,7 @@ def test_kill__of_processes_over_and_over_loses_nothing(uninterrupted, start, tm
     process = start("run", spec, "--out", directory, "--workers", 2, "--scheduler", "processes")
     killed = 0
     for count in range(2, 14, 3):
-        wait_for_commits(process, directory, count)
+        wait_for(lambda count=count: n_committed(directory) >= count, process)
         with contextlib.suppress(psutil.NoSuchProcess):
             found = psutil.Process(process.pid).children()
             found[rng.integers(len(found))].kill()
@@ -283,7 +237,7 @@ def test_kill__of_processes_over_and_over_loses_nothing(uninterrupted, start, tm
 def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes_of, number, code):
     spec, directory = uninterrupted / "sweep.toml", tmp_path / "run"
     process = start("run", spec, "--out", directory, "--workers", 1)
-    wait_for_commits(process, directory, 2)
+    wait_for(lambda: n_committed(directory) >= 2, process)
     # a terminal sends Ctrl-C to the whole group
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     out, err = process.communicate(timeout=200)
@@ -291,7 +245,7 @@ def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes
     assert "the same command continues" in err
     assert "Traceback" not in err
     assert not state(directory).complete
-    assert run(spec, directory, workers=0, echo=silent).complete
+    assert quietly(spec, directory).complete
     assert bytes_of(directory) == bytes_of(uninterrupted / "sweep")
 
 
@@ -301,14 +255,7 @@ def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, mon
 
     path = write_spec(sweep_text)
     run(path, tmp_path / "alone", scheduler="none", echo=silent)
-    with LocalCluster(
-        n_workers=1,
-        threads_per_worker=2,
-        processes=False,
-        host="127.0.0.1",
-        protocol="tcp",
-        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-    ) as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", **LOOPBACK) as cluster:
         run(path, tmp_path / "address", scheduler=cluster.scheduler_address, echo=silent)
         monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", cluster.scheduler_address)
         run(path, tmp_path / "environment", echo=silent)

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from pipeline.layout.cells import coordinates
 from pipeline.runs.preview import describe_plan
-from pipeline.runs.run import run
 from pipeline.runs.workflows import shipped_workflows
 from pipeline.runs.zoom import Changes, read_source, to_toml, write_zoom, zoom
 from pipeline.specification.parsing import load_spec, parse_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.runfile import read_run
+from tests.pipeline.factories import quietly
 
 
 @pytest.fixture
@@ -178,7 +178,7 @@ def test_zoom__refinement_must_fit(sweep_text):
 def test_write_zoom__from_a_run(write_spec, sweep_text, tmp_path):
     text = sweep_text + "\n[smoke]\naxes.frequency_hz.num = 2\n"
     directory = tmp_path / "run"
-    run(write_spec(text), directory, workers=0, smoke=True, echo=lambda line: None)
+    quietly(write_spec(text), directory, smoke=True)
     out = tmp_path / "zoom.toml"
     assert write_zoom(read_source(directory), Changes({"psi1": (0.0, 0.1)}), out) == []
     head, *rest = out.read_text("utf-8").splitlines()

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from pathlib import Path
 
 import pytest
 
 from pipeline.runs.workflows import find_spec
+from tests.pipeline.factories import free_port, wait_for
 
 DOCKERFILE = Path(__file__).parents[3] / "Dockerfile"
 pytestmark = pytest.mark.slow
@@ -86,35 +85,24 @@ def test_manifest__commands_start(pods, tmp_path):
             )
         url = f"http://127.0.0.1:{probe}"
         path = pods["scheduler"]["containers"][0]["readinessProbe"]["httpGet"]["path"]
-        assert asked(url + path) == "ok"
-        deadline = time.monotonic() + 60
-        while "worker-0" not in asked(url + "/json/identity.json"):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        wait_for(lambda: answer(url + path) == "ok")
+        wait_for(lambda: "worker-0" in answer(url + "/json/identity.json"))
     finally:
         for process in reversed(started):
             process.terminate()
             process.wait(20)
 
 
-def free_port():
-    with socket.socket() as chosen:
-        chosen.bind(("127.0.0.1", 0))
-        return int(chosen.getsockname()[1])
+def answer(url):
+    """What a server says; nothing if it is not there yet."""
+    try:
+        with urllib.request.urlopen(url, timeout=5) as found:
+            return found.read().decode()
+    except OSError:
+        return ""
 
 
 def words(pod, dask, replaced):
     (container,) = pod["containers"]
     assert container["command"] == ["dask"]
     return [dask, *(replaced.get(word, word) for word in container["args"])]
-
-
-def asked(url):
-    deadline = time.monotonic() + 60
-    while True:
-        try:
-            with urllib.request.urlopen(url, timeout=5) as answer:
-                return answer.read().decode()
-        except OSError:
-            assert time.monotonic() < deadline, url
-            time.sleep(0.1)

@@ -35,12 +35,9 @@ def test_method__of_order_8_gives_the_same_motion_in_fewer_steps():
     assert (3 * eighth["n_steps"] < fifth["n_steps"]).all()
 
 
-def test_method__is_part_of_what_a_run_is():
-    assert spec_of("dop853").as_dict()["integration"]["method"] == "dop853"
-    assert spec_of("dop853").as_dict() != spec_of("dopri5").as_dict()
-
-
-def test_method__of_order_8_goes_with_nothing_that_looks_into_steps():
+def test_method__is_one_of_two_and_order_8_goes_with_nothing_that_looks_into_steps():
+    with pytest.raises(SpecError, match=r"integration.method = 'rk4'"):
+        spec_of("rk4")
     extremes = {"extremes": {"quantities": ["energy"]}}
     assert spec_of("dopri5", products=extremes).products
     with pytest.raises(SpecError) as caught:
@@ -50,8 +47,3 @@ def test_method__of_order_8_goes_with_nothing_that_looks_into_steps():
         'integration.method = "dop853": products.extremes looks within steps; drop one of the two, or set '
         'method = "dopri5".'
     )
-
-
-def test_method__is_one_of_two():
-    with pytest.raises(SpecError, match=r"integration.method = 'rk4'"):
-        spec_of("rk4")

@@ -13,6 +13,7 @@ import xarray as xr
 from pipeline.store import consolidate
 from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
+from tests.pipeline.factories import contents
 
 
 def _open(folder):
@@ -45,25 +46,18 @@ def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
 def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
     made.commit(0)
     entries = consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "q", {})
-    files = {
-        p.relative_to(tmp_path / "out").as_posix(): p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()
-    }
-    assert {k: v["sha256"] for k, v in entries.items()} == {
-        k: hashlib.sha256(content).hexdigest() for k, content in files.items()
-    }
-    group = json.loads(files["cube.zarr/zarr.json"])
-    assert "section" in group["consolidated_metadata"]["metadata"]
+    files = contents(tmp_path / "out")
+    assert {k: v["sha256"] for k, v in entries.items()} == {k: hashlib.sha256(c).hexdigest() for k, c in files.items()}
+    assert "section" in json.loads(files["cube.zarr/zarr.json"])["consolidated_metadata"]["metadata"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("along", "chunk"), [("frequency", (3, 1, 3, 4)), ("q", (1, 2, 3, 4)), (None, (1, 2, 3, 4))])
-def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(made, tmp_path, monkeypatch, along, chunk):
+def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(whole, tmp_path, monkeypatch, along, chunk):
     """12 starts x 3 sections x 8 bytes a column; room for three of them."""
     monkeypatch.setattr(consolidate, "CHUNK_BYTES", 3 * 12 * 3 * 8)
     monkeypatch.setattr(consolidate, "SLAB_BYTES", 1)
-    for index in range(made.plan.n_tasks):
-        made.commit(index)
-    run = Run.open(made.info.directory)
+    run = Run.open(whole.info.directory)
     consolidate.write_cube(run, tmp_path / "out", along, {})
     metadata = json.loads((tmp_path / "out" / "cube.zarr" / "section" / "zarr.json").read_text())
     assert run.plan.dims == ("frequency", "q", "psi1_0", "psi2_0")
@@ -71,10 +65,8 @@ def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(made, tmp_p
     np.testing.assert_array_equal(_open(tmp_path / "out")["section"], run.cube()["section"])
 
 
-def test_write_cube__refuses_a_damaged_source(made, tmp_path):
-    for index in range(made.plan.n_tasks):
-        made.commit(index)
-    chunk = next((made.info.directory / "cube.zarr" / "section").glob("c.*"))
+def test_write_cube__refuses_a_damaged_source(whole, tmp_path):
+    chunk = next((whole.info.directory / "cube.zarr" / "section").glob("c.*"))
     chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
     with pytest.raises(DamagedError, match="section"):
-        consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "frequency", {})
+        consolidate.write_cube(Run.open(whole.info.directory), tmp_path / "out", "frequency", {})
