@@ -21,7 +21,7 @@ from pipeline.cli.common import tell
 from pipeline.cli.console import Work, progress
 from pipeline.cli.exits import Exit
 from pipeline.products.product import Table
-from pipeline.products.reporting import report, reporting, track
+from pipeline.products.reporting import report, reporting
 from tests.programs import fresh_python
 
 TABLE = Table([{"x": np.float64(1.5), "name": "a"}, {"x": np.nan, "name": "b"}], ["two lines", "for people"])
@@ -93,16 +93,6 @@ def test_at_rest__ends_the_lines_of_a_command_that_serves(monkeypatch, capsys):
         time.sleep(0.5)
     assert capsys.readouterr().err == ""
     console.at_rest()  # without a display there is nothing to end
-
-
-def test_track__reports_each_item():
-    heard = []
-    with reporting(lambda *said: heard.append(said)):
-        assert list(track([7, 8], "work")) == [7, 8]
-        report("more", 1, 3)
-    assert [said[:3] for said in heard] == [("work", 0, 2), ("work", 1, 2), ("work", 2, 2), ("more", 1, 3)]
-    report("nobody listens", 0, 1)
-    assert len(heard) == 4
 
 
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import tomllib
 
 import numpy as np
@@ -25,7 +23,7 @@ from pipeline.layout.schema import REFINEMENT, base_variables
 from pipeline.runs.status import state
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
-from tests.pipeline.factories import n_committed, quietly, wait_for
+from tests.pipeline.factories import quietly
 
 VARIABLES = base_variables(load_model())
 
@@ -264,19 +262,6 @@ def test_run__refined_against_the_full_grid(refined_run):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2])
-def test_kill__refined_run_resumes_to_the_same_bytes(refined_run, start, tmp_path, bytes_of, workers):
-    directory = tmp_path / "run"
-    process = start("run", refined_run / "refined.toml", "--out", directory, "--workers", workers)
-    wait_for(lambda: n_committed(directory) >= 2, process)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
-    assert not state(directory).complete
-    assert quietly(refined_run / "refined.toml", directory).complete
-    assert bytes_of(directory) == bytes_of(refined_run / "refined")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("lengths", [(17,), (5, 4, 4, 5)])
 def test_compute__one_and_four_grid_dims(lengths):
     ranges = [
@@ -329,13 +314,6 @@ def test_make_plan__tiles(shape, stride, wanted):
     if cut and wanted is None:
         # sides grow in turns, then are made equal along each axis, in whole strides
         assert max(cut) <= 2 * min(cut) + stride
-
-
-def test_make_plan__near_square_tiles_of_enough_lattice_cells():
-    plan = make_plan(parse_spec(tomllib.loads(refined_text((400, 400), 8))))
-    assert plan.block[1] == plan.block[2]
-    assert plan.block[1] % 8 == 0
-    assert plan.cells_in(0) >= 0.9 * 64 * 8**2
 
 
 def test_identity__refinement_counts():

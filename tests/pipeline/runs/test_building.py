@@ -208,25 +208,6 @@ def test_preview__is_the_dry_run(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
-def test_run__of_a_spec_of_a_dict_and_of_equations(tmp_path, bytes_of):
-    spec = built()
-    (tmp_path / "spec.toml").write_text(TEXT, "utf-8")
-    given = {
-        "spec": spec,
-        "dict": {**spec, "model": oscillator()},
-        "text": tmp_path / "spec.toml",
-        "lines": {**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"},
-    }
-    runs = {name: magpend.run(one, tmp_path / name, workers=0, echo=silent) for name, one in given.items()}
-    assert runs["spec"].complete
-    same = [bytes_of(tmp_path / name) for name in ("spec", "dict", "text")]
-    for files in same:
-        del files["cube.zarr/zarr.json"]  # it has the text as it was given
-    assert same[0] == same[1] == same[2]
-    assert np.array_equal(runs["lines"].cube().section.values, runs["spec"].cube().section.values)
-
-
 def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = []

@@ -147,7 +147,7 @@ def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
 @pytest.mark.slow
 def test_animate__a_start_with_and_without_a_run(main, run, tmp_path):
     """States come first, or after the directory: neither is taken for the other."""
-    small = ["--seconds", "1", "--fps", "4", "--size", "200", "--out", "film.gif"]
+    small = ["--seconds", "1", "--fps", "4", "--size", "200", "--force", "--out", "film.gif"]
     alone = ["--th", "0.4", "--w", "-0.2", "--model", "driven-pendulum", "--frequency", str(HZ)]
     for words, start in ((alone, [0.4, -0.2]), ([str(run), "--at", "frequency=0.16", "--x", "0.3"], [0.3, 0.0])):
         code, _, err = main("animate", *words, *small)

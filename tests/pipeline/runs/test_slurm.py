@@ -139,19 +139,3 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     # nothing is left: no job, no keys
     wait_for(lambda: not shell("squeue", "-h"))
     assert not list(logs.glob(".keys-*"))
-
-
-@pytest.mark.long
-def test_submit__a_cancelled_coordinator_takes_its_workers_along(tmp_path, shell, magpend):
-    (tmp_path / "spec.toml").write_text(SPEC.replace("n_transient = 2000", "n_transient = 20000"))
-    (tmp_path / "several.toml").write_text(SEVERAL_JOBS)
-    out, logs = tmp_path / "out", tmp_path / "out.jobs"
-    magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out")
-    wait_for(lambda: (out / "timings.jsonl").exists())
-    assert len(shell("squeue", "-h").splitlines()) >= 2
-    (keys,) = logs.glob(".keys-*")
-    assert keys.stat().st_mode & 0o777 == 0o700
-    assert {file.stat().st_mode & 0o777 for file in keys.iterdir()} == {0o600}
-    shell("scancel", json.loads((logs / "job.json").read_text())["job"])
-    wait_for(lambda: not shell("squeue", "-h"))
-    assert not keys.exists()

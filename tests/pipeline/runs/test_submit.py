@@ -7,16 +7,19 @@ import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline.compute.jobqueue import settings
 from pipeline.runs.batch import coordinator_script
+from pipeline.runs.sizing import Work, complete, remarks
 from pipeline.runs.submit import prepare
+from pipeline.runs.systems import find_systems
 from pipeline.runs.workflows import find_spec
 from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import QUEUES, cluster_of, load_cluster
+from pipeline.specification.clusters import QUEUES, cluster_of, load_cluster, seconds_of
 from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import duffing, quietly
 
@@ -46,8 +49,7 @@ SLURM = """#!/usr/bin/env bash
 #SBATCH --mem=7630M
 #SBATCH --time=04:00:00
 #SBATCH -pe smp 4
-#SBATCH --exclusive
-"""
+#SBATCH --exclusive"""
 # lines of a job that holds all, and of a coordinator of other jobs: one core, whatever they need, and a longer life
 LINES = {
     "slurm": ("--cpus-per-task=4; --mem=7630M", "--cpus-per-task=1; --mem=3815M; --time=48:00:00"),
@@ -89,7 +91,7 @@ def test_script__one_job_holds_all_or_coordinates_others(cluster, kind):
         assert "--exclusive" in found
     assert "-pe smp" in one
     assert "-pe smp" not in other
-    assert one == SLURM.rstrip("\n") + BODY or kind != "slurm"
+    assert one == SLURM + BODY or kind != "slurm"
     done = subprocess.run(["bash", "-n"], input=one, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -299,3 +301,104 @@ def test_scripts__no_name_puts_a_line_of_its_own_into_them(kind, tmp_path, write
     with pytest.raises(SpecError, match="line breaks"):
         prepare(spec, tmp_path / "out", "pbs", ["walltime=01:00:00", "cores=1", "memory=1 GB"])
     assert not (tmp_path / "out.jobs").exists()
+
+
+# ---- cores, memory and time by the work ------------------------------------------------------------------
+
+HOUR = 3600.0
+WORK = Work(
+    n_cells=100_000,
+    n_left=100_000,
+    n_tasks=2000,
+    n_tasks_left=2000,
+    n_parallel=2000,
+    periods=1e7,
+    seconds=10 * HOUR,
+    how="measured",
+    n_bytes=10**9,
+    task_bytes=500_000,
+)
+
+
+def sized(work=WORK, **given):
+    table, reasons = complete({"kind": "slurm", **given}, work)
+    return cluster_of(table), reasons
+
+
+def test_complete__what_is_asked_for():
+    """Ten hours of one core would be half an hour of 20; more than 16 cores are not asked for by themselves."""
+    found, reasons = sized()
+    assert found.cores == 16
+    assert "no more are asked for" in reasons["cores"]
+    assert found.memory_bytes == 10**9 + 16 * (5 * 10**8 + 1_500_000)
+    wall = WORK.wall(16)
+    assert wall == pytest.approx(10 * HOUR / 16, rel=0.01)
+    # twice the estimate
+    assert 2 * wall + 600 <= seconds_of(found.walltime) < 2 * wall + 600 + 300
+
+
+@pytest.mark.parametrize(
+    ("change", "cores", "why"),
+    [
+        ({"seconds": 5.0}, 1, "a job aims at 30 min or less"),
+        ({"seconds": 5 * HOUR}, 10, "a job aims at 30 min or less"),
+        ({"n_parallel": 7}, 7, "no more tasks can run at a time"),
+    ],
+)
+def test_complete__the_least_bound_decides(change, cores, why):
+    found, reasons = sized(replace(WORK, **change))
+    assert found.cores == cores
+    assert why in reasons["cores"]
+
+
+def test_complete__grid_engine_needs_a_parallel_environment():
+    assert complete({"kind": "sge"}, WORK)[0]["cores"] == 1
+    assert complete({"kind": "sge", "directives": ["-pe smp 16"]}, WORK)[0]["cores"] == 16
+
+
+def test_complete__what_is_given_stays():
+    found, reasons = sized(cores=2, memory="3 GB", walltime="00:05:00")
+    assert (found.cores, found.memory, found.walltime, reasons) == (2, "3 GB", "00:05:00", {})
+
+
+def test_remarks():
+    assert remarks(sized()[0], WORK) == []
+    often, nodes = remarks(sized(cores=4, walltime="01:00:00")[0], WORK)
+    assert "2 h 30 min on 4 cores, and the job ends after 60 min: send it about 3 times" in often
+    assert "--job max_jobs=5" in nodes
+
+
+# ---- batch systems found by their commands ---------------------------------------------------------------
+
+
+def kinds():
+    return [system.kind for system in find_systems()]
+
+
+@pytest.mark.parametrize(
+    ("version", "kind"),
+    [
+        ("pbs_version = 20.0.1", "pbs"),
+        ("pbs_version = 2020.1.0.20200711141213", "pbs"),
+        ("Version: 6.1.2\nCommit: 661e092552de43a785c15d39a3634a541d86898e", "torque"),
+        ("version: 2.4.16", "torque"),
+        ("something else", "pbs"),
+    ],
+)
+def test_find_systems__qsub_has_several_makers(command_of, version, kind):
+    command_of("qsub", "true")
+    command_of("qstat", f"echo '{version}' >&2")
+    assert kinds() == [kind]
+
+
+def test_find_systems__several_and_the_qsub_of_slurm_is_none_of_them(command_of):
+    """Debian's slurm-wlm-torque has a qsub in Perl, which calls sbatch; that of Grid Engine has qconf beside it."""
+    assert find_systems() == []
+    path = command_of("sbatch", "true")
+    command_of("qsub", "# This file is part of Slurm, a resource management program.", "#! /usr/bin/perl -w")
+    (found,) = find_systems()
+    assert (found.kind, found.command, found.named) == ("slurm", path, f"SLURM ({path})")
+    command_of("qstat", "exit 1")
+    for name in ("bsub", "qsub", "qconf"):
+        command_of(name, "true")
+    assert kinds() == ["slurm", "lsf", "sge"]

@@ -1,10 +1,13 @@
-"""What a task writes, record and chunks, records in packs and their copy: the same bytes whatever happens."""
+"""What a task writes, records, their packs and copy, and what readers get: the same bytes whatever happens."""
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import pickle
+import warnings
+from pathlib import Path
 
 import google_crc32c
 import numpy as np
@@ -12,28 +15,31 @@ import pytest
 import xarray as xr
 from zarr.storage import LocalStore
 
+from magpend_core import Status
+from magpend_core.models import load_model
 from pipeline import open_run
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import make_plan
+from pipeline.layout.schema import base_variables
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.parsing import load_spec, parse_spec
-from pipeline.store import commits, packing, products, records
+from pipeline.store import commits, consolidate, packing, parallel_reads, products, records
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, scan, write_task
 from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
-from pipeline.store.keys import Owners, keys_of
+from pipeline.store.keys import keys_of
 from pipeline.store.packing import Packer, pack_block, withdraw
 from pipeline.store.record_copy import copied_records, write_copy
-from pipeline.store.records import block_of_pack
 from pipeline.store.run import Run
 from pipeline.store.runfile import read_run, write_run
 from pipeline.store.setup import create
 from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
-from tests.pipeline.factories import silent
+from pipeline.store.view import CommittedStore
+from tests.pipeline.factories import contents, silent
 
 PACKED = ["000000-000001.jsonl", "000002-000003.jsonl", "000004.json"]
 
@@ -188,12 +194,9 @@ def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
     assert go_on(whole) == []
     assert names_in(whole) == PACKED
     together = Run.open(whole.info.directory)
-    assert (together.digest, together.commits.cells()) == (digest, cells)
     found = together.commits
-    assert dict(found) == first
+    assert (together.digest, found.cells(), dict(found)) == (digest, cells, first)
     assert (list(found), len(found), 5 in found) == ([0, 1, 2, 3, 4], 5, False)
-    with pytest.raises(KeyError):
-        found[5]
     assert sorted(found[3].objects) == sorted(keys_of(whole.plan, 3))
     assert pickle.loads(pickle.dumps(found))[1] == found[1]
     assert state(whole.info.directory).cells == {"bounded": whole.plan.n_cells}
@@ -231,18 +234,6 @@ def test_read_commits__while_records_move_into_a_pack(whole, monkeypatch):
     monkeypatch.setattr(files, "read_each", read_each)
     assert len(read_commits(whole.info, whole.plan)) == 5
     assert moved
-
-
-def test_keys__of_packs_and_chunks_lead_back(made):
-    assert block_of_pack("000002-000003.jsonl") == 1
-    for name in ("000001-000002.jsonl", "000002.json", "2-3.jsonl", "x-y.jsonl", ".000002-000003.jsonl.a.tmp"):
-        assert block_of_pack(name) is None
-    owners = Owners(made.plan)
-    for index in range(made.plan.n_tasks):
-        assert {owners.task(key) for key in keys_of(made.plan, index)} == {index}
-    no_chunks = ["zarr.json", "status/zarr.json", "x/c.0", "frequency/c.0", "status/d.0.0.0.0"]
-    for key in [*no_chunks, *(f"status/c.{w}" for w in ("9.9.9.9", "00.0.0.0", "0", "0.0.0.-1"))]:
-        assert owners.task(key) is None, key
 
 
 # ---- the copy of the records: one request instead of many ---------------------------------------------
@@ -328,3 +319,115 @@ def test_group__of_an_earlier_version_opens_as_before(whole):
     (whole.info.directory / "cube.zarr/frequency/zarr.json").unlink()
     found = verify_run(whole.info.directory, repair=True)
     assert (found.skeleton, found.rebuilt) == ([], ["frequency/zarr.json: missing"])
+
+
+# ---- reading ---------------------------------------------------------------------------------------------
+
+VARIABLES = base_variables(load_model())
+
+
+@pytest.mark.slow
+def test_open_run__explains_itself(made):
+    made.commit(0)
+    ds = open_run(made.info.directory)
+    assert ds.section.dims == ("frequency", "q", "psi1_0", "psi2_0", "period_index", "state")
+    assert list(ds.data_vars) == [v.name for v in VARIABLES]
+    assert [ds[name].attrs["units"] for name in ("frequency", "q", "psi1_0")] == ["Hz", "N m", "rad"]
+    assert ds.psi1_dot_0.item() == 0.1
+    assert np.allclose(np.rad2deg(ds.psi1_0), [-30, 0, 30])
+    assert ds.state.values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+    meanings = dict(zip(ds.status.attrs["flag_values"], ds.status.attrs["flag_meanings"].split(), strict=True))
+    assert meanings == {int(s): s.name.lower() for s in Status}
+    kept = {"spec": made.info.spec_text, "title": "small sweep", "closure_tolerance": 1e-6, "n_transient": 2}
+    assert ds.attrs.items() >= kept.items()
+    assert "q = 1.543" in ds.attrs["parameters"]
+    assert ds.section.sel(frequency=2.25, q=1.6, state="psi1").dims == ("psi1_0", "psi2_0", "period_index")
+
+
+@pytest.mark.slow
+def test_open_run__reads_no_chunk_before_it_is_used(whole, monkeypatch):
+    asked = []
+    original = CommittedStore.get
+
+    async def get(self, key, *arguments, **options):
+        asked.append(key)
+        return await original(self, key, *arguments, **options)
+
+    monkeypatch.setattr(CommittedStore, "get", get)
+    names = tuple(f"{v.name}/c" for v in VARIABLES)
+    for chunks in (None, {}):
+        ds = open_run(whole.info.directory, chunks=chunks)
+        ds.section.sel(frequency=2.25)
+        assert not [key for key in asked if key.startswith(names)]
+        ds.status.isel(frequency=0, q=0).values  # noqa: B018
+        read = [key for key in asked if key.startswith(names)]
+        assert read
+        assert {key.split("/")[0] for key in read} == {"status"}
+        assert len(set(read)) < whole.plan.n_tasks
+        asked.clear()
+
+
+def test_quick__builds_on_what_zarr_makes_public():
+    """No module of `zarr.core`: what is there may change with any version."""
+    tree = ast.parse(Path(parallel_reads.__file__).read_text("utf-8"))
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert not {name for name in modules if name and name.startswith("zarr.core")}
+
+
+# ---- the cube rewritten for browsers: the same numbers, cut by columns -----------------------------------
+
+
+def _open(folder):
+    with warnings.catch_warnings():
+        # what zarr says of gzip after shuffling, and of metadata in one file
+        warnings.simplefilter("ignore")
+        return xr.open_zarr(folder / "cube.zarr", mask_and_scale=False).load()
+
+
+@pytest.mark.slow
+def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
+    for index in range(made.plan.n_tasks - 1):
+        made.commit(index)
+    run = Run.open(made.info.directory)
+    layer = np.arange(made.plan.n_cells, dtype=np.uint16).reshape(made.plan.shape)
+    consolidate.write_cube(
+        run, tmp_path / "out", "frequency", {"colour": consolidate.Layer(layer, {"title": "of cells"})}
+    )
+    written, cube = _open(tmp_path / "out"), run.cube()
+    assert set(written.variables) == {*cube.variables, "colour"}
+    for name in cube.variables:
+        np.testing.assert_array_equal(written[name].values, cube[name].values, err_msg=str(name))
+        assert written[name].dims == cube[name].dims
+    np.testing.assert_array_equal(written["colour"], layer)
+    assert written.attrs["spec"] == cube.attrs["spec"]
+    assert "host" in cube.attrs
+    assert "host" not in written.attrs
+
+
+def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
+    made.commit(0)
+    entries = consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "q", {})
+    files = contents(tmp_path / "out")
+    assert {k: v["sha256"] for k, v in entries.items()} == {k: hashlib.sha256(c).hexdigest() for k, c in files.items()}
+    assert "section" in json.loads(files["cube.zarr/zarr.json"])["consolidated_metadata"]["metadata"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("along", "chunk"), [("frequency", (3, 1, 3, 4)), ("q", (1, 2, 3, 4)), (None, (1, 2, 3, 4))])
+def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(whole, tmp_path, monkeypatch, along, chunk):
+    """12 starts x 3 sections x 8 bytes a column; room for three of them."""
+    monkeypatch.setattr(consolidate, "CHUNK_BYTES", 3 * 12 * 3 * 8)
+    monkeypatch.setattr(consolidate, "SLAB_BYTES", 1)
+    run = Run.open(whole.info.directory)
+    consolidate.write_cube(run, tmp_path / "out", along, {})
+    metadata = json.loads((tmp_path / "out" / "cube.zarr" / "section" / "zarr.json").read_text())
+    assert run.plan.dims == ("frequency", "q", "psi1_0", "psi2_0")
+    assert tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"]) == (*chunk, 3, 1)
+    np.testing.assert_array_equal(_open(tmp_path / "out")["section"], run.cube()["section"])
+
+
+def test_write_cube__refuses_a_damaged_source(whole, tmp_path):
+    chunk = next((whole.info.directory / "cube.zarr" / "section").glob("c.*"))
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
+    with pytest.raises(DamagedError, match="section"):
+        consolidate.write_cube(Run.open(whole.info.directory), tmp_path / "out", "frequency", {})
