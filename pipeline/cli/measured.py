@@ -245,7 +245,7 @@ def branch(
     from pipeline.rig.measured_branch.comparison import amplitudes, branch_table, compare
     from pipeline.rig.measured_branch.figure import plot_branch
     from pipeline.rig.measured_branch.reading import read_branch
-    from pipeline.runs.workflows import find_spec
+    from pipeline.specification.files import find_spec
 
     _check_targets(out, csv)
     path = find_spec(source)

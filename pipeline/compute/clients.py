@@ -14,8 +14,7 @@ from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, rea
 from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
 from pipeline.compute.probe import check_directory, check_versions
 from pipeline.specification.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 
 Echo = Callable[[str], None]
 

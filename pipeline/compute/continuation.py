@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from magpend_core import Status
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 
 WALKED = ("section", "rest_state", "status", "step_size")
 """Variables that say where a branch was left; the last kept section is the state at the cell's end."""

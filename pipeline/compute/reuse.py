@@ -18,15 +18,16 @@ from magpend_core import Sections, Status
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from pipeline.store.task_cells import read_block
 
@@ -51,7 +52,7 @@ class Source:
         Specification of the run that takes its cells.
     """
 
-    run: Run
+    run: RunDirectory
     wanted: Spec
     finder: Finder = field(init=False)
     names: list[str] = field(init=False)
@@ -118,7 +119,7 @@ class Source:
         return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
 
 
-def same_products(run: Run, wanted: Spec) -> list[str]:
+def same_products(run: RunDirectory, wanted: Spec) -> list[str]:
     """Return those products of a specification that a run has already computed with the same options and version."""
     versions = numbered(run.info.identity)["versions"]
     return [
@@ -128,7 +129,7 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
     ]
 
 
-def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
+def obstacles(run: RunDirectory, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
     """Return the reasons why a new run cannot copy the cells of an earlier run; an empty list if it can.
 
     Parameters
@@ -176,7 +177,7 @@ class Pool:
         Runs that hold cells; the first one that has a cell provides it.
     """
 
-    def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
+    def __init__(self, spec: Spec, runs: Sequence[RunDirectory]) -> None:
         self.spec = spec
         self.sources = [Source(run, spec) for run in runs]
 
@@ -303,8 +304,8 @@ def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
     """
     runs = []
     for place, expected in sources:
-        run = Run.open(place)
+        run = RunDirectory.open(place)
         if run.info.digest != expected:
             raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
         runs.append(run)
-    return Pool(kept_spec(read_run(directory).spec), runs)
+    return Pool(Spec.parse(read_run(directory).spec, KEPT), runs)

@@ -13,11 +13,11 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
+from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of, periods_of
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import BasinFigureOptions
 
 _DARKEST = 0.62
@@ -254,7 +254,7 @@ def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Datase
     return stored
 
 
-def draw(run: Run, options: BasinFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: BasinFigureOptions) -> style.DataFigure:
     """Draw the figure ``basins`` of a run."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")

@@ -14,11 +14,12 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from pipeline.layout.units import shown_unit
+from pipeline.analysis.run import OpenRun
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bands import draw_bands, with_bands
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.plots.missing_cells import absent_handles, draw_absent, say_empty
 from pipeline.plots.points import Survey, View, make_view, survey
@@ -314,7 +315,7 @@ def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int,
     return panels
 
 
-def draw(run: Run, options: BifurcationOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: BifurcationOptions) -> style.DataFigure:
     """Draw the figure ``bifurcation`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

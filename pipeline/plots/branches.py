@@ -12,11 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bands import draw_bands, with_bands
 from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions
@@ -305,7 +306,7 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
     ]
 
 
-def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: BranchFigureOptions) -> style.DataFigure:
     """Draw the figure ``branches`` of a run, over its own bifurcation diagram or that of another run."""
     other = run.of(options.over) if options.over else run
     at, notes = values_of(other, options)

@@ -12,11 +12,11 @@ from matplotlib.patches import Patch
 
 from pipeline.analysis.outcomes import left_out
 from pipeline.analysis.ragged import dense
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, STABILITIES
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.fractions import swept_parameter
 from pipeline.products.product import StateOptions
 
@@ -201,7 +201,7 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
     return entries
 
 
-def draw(run: Run, options: StateOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: StateOptions) -> style.DataFigure:
     """Draw the figure ``attractors`` of a run, with hysteresis loops if it was continued in both directions."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import xarray as xr
 from matplotlib.lines import Line2D
 
-from pipeline.layout.units import shown_unit
+from pipeline.analysis.run import OpenRun
+from pipeline.layout.conventions import shown_unit
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, NAMES
 from pipeline.plots.curve_lines import DASHES, mark_points
-from pipeline.plots.figure import Run, frame_of
+from pipeline.plots.figure import frame_of
 from pipeline.plots.regimes import plot_regimes
 from pipeline.products.branches import CurveOptions
 from pipeline.products.figures import CurveFigureOptions
@@ -64,7 +65,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     return fig
 
 
-def draw(run: Run, options: CurveFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: CurveFigureOptions) -> style.DataFigure:
     """Draw the figure ``curves`` of a run, alone or over the regime map of another run."""
     found = run.derive("curves", **options.part(CurveOptions))
     if not options.over:

@@ -10,9 +10,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import PowerNorm
 from matplotlib.ticker import MaxNLocator
 
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
 from pipeline.plots import labels, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import DensityFigureOptions
 from pipeline.products.noise import DensityOptions
 from pipeline.specification.problems import unknown_name
@@ -118,7 +119,7 @@ def _at_one_point(part: xr.Dataset, frame: style.Frame) -> style.DataFigure:
     return fig
 
 
-def draw(run: Run, options: DensityFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: DensityFigureOptions) -> style.DataFigure:
     """Draw the figure ``density`` of a run."""
     at, notes = values_of(run, options)
     ds = run.derive("density", **options.part(DensityOptions))

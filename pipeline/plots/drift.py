@@ -11,11 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_hex
 
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tipping.delay import moving_parameter
-from pipeline.layout.moving import at_section
+from pipeline.layout.cells import at_section
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import DriftFigureOptions
 
@@ -149,7 +150,7 @@ def _label(part: xr.Dataset, parameter: str) -> str:
     return labels.with_unit(f"{name} at the section", one.unit)
 
 
-def draw(run: Run, options: DriftFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: DriftFigureOptions) -> style.DataFigure:
     """Draw the figure ``drift`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

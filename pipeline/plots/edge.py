@@ -8,11 +8,12 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, is_grid_dim, is_start_dim
 from pipeline.plots import labels, style
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import with_diagram
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import EdgeFigureOptions
 from pipeline.products.resilience import EdgeOptions
 
@@ -92,7 +93,7 @@ def _draw_points(ax: Axes, ds: xr.Dataset, names: tuple[str, ...], measures: lis
     return shown
 
 
-def draw(run: Run, options: EdgeFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: EdgeFigureOptions) -> style.DataFigure:
     """Draw the figure ``edge`` of a run, over the basins if its initial states form a grid in two states."""
     at, notes = values_of(run, options)
     found = run.derive("edge", **{**options.part(EdgeOptions), "at": at})

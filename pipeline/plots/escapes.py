@@ -10,11 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.noise.escapes import strength_dim
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
 from pipeline.analysis.tabular import words_of
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.plots import labels, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import EscapeFigureOptions
 from pipeline.products.noise import EscapeOptions
 from pipeline.specification.problems import unknown_name
@@ -145,7 +146,7 @@ def _at(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
     return ds.isel({d: 0 for d in dims if d in ds.dims and ds.sizes[d] == 1})
 
 
-def draw(run: Run, options: EscapeFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: EscapeFigureOptions) -> style.DataFigure:
     """Draw the figure ``escapes`` of a run."""
     at, notes = values_of(run, options)
     ds = run.derive("escapes", **options.part(EscapeOptions))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import xarray as xr
 
 from pipeline.analysis.chaos.lyapunov import period_seconds
-from pipeline.layout.period_names import period_of
-from pipeline.layout.vocabulary import model_of
+from pipeline.layout.vocabulary import model_of, period_of
 from pipeline.plots import style
 from pipeline.plots.motions import motion_codes, motions_of
 from pipeline.plots.points import ABSENT, DRAWN

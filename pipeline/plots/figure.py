@@ -7,11 +7,10 @@ which knows nothing about runs. This module adds the request and the provenance 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any
 
-import xarray as xr
-
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place, snap
 from pipeline.layout.vocabulary import told_by
 from pipeline.plots.files import with_provenance
@@ -22,32 +21,7 @@ from pipeline.products.registry import FIGURES
 from pipeline.specification.problems import unknown_name
 
 
-class Run(Protocol):
-    """The parts of a run that figures use: its record, its result cube and its analyses."""
-
-    @property
-    def info(self) -> Any:
-        """Return the record of the run (``run.json``)."""
-
-    @property
-    def digest(self) -> str:
-        """Return the digest of the run's stored cells."""
-
-    @property
-    def echo(self) -> Callable[[str], None]:
-        """Return the function that prints a line for the user."""
-
-    def of(self, source: str) -> Run:
-        """Open another run by its source, such as a run directory."""
-
-    def cube(self, chunks: Any = None) -> xr.Dataset:
-        """Return the result cube of the run as a dataset."""
-
-    def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of an analysis of the run, computed now or read if it is stored."""
-
-
-def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
+def draw_figure(run: OpenRun, name: str, options: FigureOptions) -> DataFigure:
     """Draw a figure of a run by the figure's name, and record in its data where they come from.
 
     Parameters
@@ -84,7 +58,7 @@ def request(name: str, options: Options) -> dict[str, Any]:
     return {"figure": name, "options": wanted}
 
 
-def run_provenance(run: Run) -> dict[str, Any]:
+def run_provenance(run: OpenRun) -> dict[str, Any]:
     """Return where a run's data come from: source, title, digests and versions."""
     info, attrs = run.info, run.cube().attrs
     found: dict[str, Any] = {
@@ -103,7 +77,7 @@ def frame_of(options: FigureOptions) -> Frame:
     return Frame(options.width, options.xlim, options.ylim, options.style, options.dpi)
 
 
-def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
+def values_of(run: OpenRun, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
     """Return the axis values at which a figure is drawn, and notes where they differ from the options.
 
     Raises

@@ -13,10 +13,11 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
-from pipeline.layout.attractor_letters import letter
+from pipeline.layout.vocabulary import letter
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.product import FigureOptions
 
 MOST_BARS = 60
@@ -222,7 +223,7 @@ def _raster(
     return raster
 
 
-def draw(run: Run, options: FigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``fractions`` of a run."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")

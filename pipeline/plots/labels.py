@@ -16,7 +16,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
 
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import axis_name, model_of, overrides_of
 from pipeline.plots.style import check_choice, join
 

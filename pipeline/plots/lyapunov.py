@@ -12,11 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
 from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents
+from pipeline.analysis.run import OpenRun
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, swept_parameter, with_diagram
 from pipeline.plots.exponent_map import plot_lyapunov_map, swept_pair
 from pipeline.plots.exponents import UNITS, exponent_values, rate_unit
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
 from pipeline.plots.motions import motions_of
 from pipeline.plots.points import Survey
@@ -190,7 +191,7 @@ def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
     return joined
 
 
-def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: LyapunovFigureOptions) -> style.DataFigure:
     """Draw the figure ``lyapunov`` of a run: over one parameter, or as colours in the plane of two."""
     cube = run.cube()
     at, notes = values_of(run, options)

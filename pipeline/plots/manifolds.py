@@ -7,11 +7,12 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import is_start_dim
 from pipeline.plots import labels, style
 from pipeline.plots.basins import plot_basins
 from pipeline.plots.bifurcation import fixed_of, with_diagram
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import ManifoldFigureOptions
 from pipeline.products.manifolds import ManifoldOptions
@@ -76,7 +77,7 @@ def _draw_lines(ax: Axes, ds: xr.Dataset, scales: list[float], colours: dict[int
         ax.plot(*points.T, color=colours[stable], linewidth=0.8, gid=f"{_NAMES[stable]}:{i}", zorder=4.0)
 
 
-def draw(run: Run, options: ManifoldFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: ManifoldFigureOptions) -> style.DataFigure:
     """Draw the figure ``manifolds`` of a run, over the basins if the run's initial states form a grid in two states."""
     at, notes = values_of(run, options)
     found = run.derive("manifolds", **options.part(ManifoldOptions))

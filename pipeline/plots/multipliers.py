@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
+from pipeline.analysis.run import OpenRun
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, MARKERS, SHORT
-from pipeline.plots.figure import Run, frame_of
+from pipeline.plots.figure import frame_of
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import MultiplierOptions
 
@@ -117,7 +118,7 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
     return handles
 
 
-def draw_multipliers(run: Run, options: MultiplierOptions) -> style.DataFigure:
+def draw_multipliers(run: OpenRun, options: MultiplierOptions) -> style.DataFigure:
     """Draw the figure ``multipliers`` of a run."""
     found = run.derive("branches", **options.part(BranchOptions))
     return plot_multipliers(found, options.branch, frame=frame_of(options))

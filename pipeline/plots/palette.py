@@ -23,8 +23,6 @@ from scipy.ndimage import distance_transform_edt
 from pipeline.analysis import outcomes
 from pipeline.analysis.ragged import N_IDS, SET, is_ragged
 from pipeline.analysis.sets import rows_by_number
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import period_of
 from pipeline.layout.vocabulary import (
     ABSENT,
     ATTRACTS,
@@ -38,7 +36,9 @@ from pipeline.layout.vocabulary import (
     TORUS,
     TRANSIENT,
     UNSTABLE,
+    letter,
     model_of,
+    period_of,
 )
 from pipeline.plots import style
 

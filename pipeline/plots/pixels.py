@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.plots import style
 from pipeline.plots.motions import Motions
 from pipeline.plots.points import Points, Range, View

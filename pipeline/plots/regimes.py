@@ -17,13 +17,13 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.analysis.sets import rows_by_number
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, parameter_name
+from pipeline.layout.vocabulary import ATTRACTS, letter, parameter_name
 from pipeline.plots import labels, palette, style
 from pipeline.plots.curve_lines import draw_over, line_note
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
 
 BESIDE = 0.85
@@ -317,7 +317,7 @@ def _rank(name: str) -> tuple[bool, list[tuple[float, str]]]:
     return name == "none", [(float(m) if m.isdigit() else math.inf, f"{len(m)}{m}") for m in members]
 
 
-def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: RegimeOptions) -> style.DataFigure:
     """Draw the figure ``regimes`` of a run."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")
@@ -325,7 +325,7 @@ def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
     return noted(plot_regimes(found, show=options.show, at=at, curves=curves, frame=frame_of(options)), notes)
 
 
-def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
+def _curves_of(run: OpenRun, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
     """Compute the bifurcation curves of a run in the plane of a regime map, within the map's ranges."""
     x, y = _axes(attractors, at)
     axis = _swept_of(run, x, y)
@@ -342,7 +342,7 @@ def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.
     )
 
 
-def _swept_of(run: Run, x: str, y: str) -> str:
+def _swept_of(run: OpenRun, x: str, y: str) -> str:
     """Return the parameter along which branches are followed: `x` or `y`, whichever the run sweeps."""
     swept = [name for name in (x, y) if run.cube().sizes.get(name, 1) > 1]
     return swept[0] if len(swept) == 1 else x

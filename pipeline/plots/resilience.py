@@ -11,13 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import ATTRACTS, model_of
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, periods_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import ResilienceFigureOptions
 from pipeline.products.resilience import ResilienceOptions
@@ -160,7 +159,7 @@ def _dress(panels: Any, part: xr.Dataset, along: str, letters: list[str]) -> Non
     style.caption(panels[0], style.join([labels.caption(part, with_start=False), *about]))
 
 
-def draw(run: Run, options: ResilienceFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: ResilienceFigureOptions) -> style.DataFigure:
     """Draw the figure ``resilience`` of a run."""
     at, notes = values_of(run, options)
     cube = at_points(run.cube(), at)

@@ -14,9 +14,10 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from pipeline.analysis.run import OpenRun
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.selection import at_points
 from pipeline.products.product import FigureOptions
 
@@ -166,7 +167,7 @@ def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]
     style.style_bar(bar, "rotation number\n[turns per drive period]")
 
 
-def draw(run: Run, options: FigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``rotation`` of a run."""
     at, notes = values_of(run, options)
     return noted(plot_rotation(run.cube(), at=at, frame=frame_of(options)), notes)

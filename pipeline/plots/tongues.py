@@ -7,11 +7,12 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from pipeline.layout.units import shown_unit
+from pipeline.analysis.run import OpenRun
+from pipeline.layout.conventions import shown_unit
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import fixed_of, swept_parameters
 from pipeline.plots.curve_lines import take_room
-from pipeline.plots.figure import Run, frame_of
+from pipeline.plots.figure import frame_of
 from pipeline.plots.rotation import draw_map, rotation_data
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import TongueFigureOptions
@@ -137,7 +138,7 @@ def _explain(fig: style.DataFigure, ds: xr.Dataset) -> None:
     style.legend_above(fig, [style.dot(name, colour) for name, colour in colours.items()])
 
 
-def draw(run: Run, options: TongueFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: TongueFigureOptions) -> style.DataFigure:
     """Draw the figure ``tongues`` of a run, over its rotation numbers if the run sweeps both parameters."""
     found = run.derive("tongues", **options.part(TongueOptions))
     plane = {str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")}

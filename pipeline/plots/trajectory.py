@@ -13,7 +13,7 @@ from matplotlib.gridspec import GridSpec, SubplotSpec
 from matplotlib.lines import Line2D
 
 from magpend_core.models.model import Drawing, Model
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.plots import labels, style
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles

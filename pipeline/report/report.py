@@ -41,7 +41,7 @@ def report(
     SpecError
         If an analysis is unknown.
     RefusedError, DamagedError, UnreadableError
-        See `pipeline.store.run.Run.open`.
+        See `pipeline.store.run.RunDirectory.open`.
     """
     unknown = [unknown_name("analysis", name, SHOWN) for name in also if name not in SHOWN]
     if unknown:

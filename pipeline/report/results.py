@@ -10,9 +10,9 @@ from pipeline.layout.writing import write_atomically
 from pipeline.report.study import Study
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
-from pipeline.runs.workflows import find_spec
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -66,7 +66,7 @@ class Results:
         """Read all needed specifications and headers; raise a SpecError that lists all problems."""
         table, problems = self.study.table, []
         checks: list[tuple[str, Callable[[str], Any]]] = [
-            *((name, lambda name: load_spec(self.spec(name), smoke=self.smoke)) for name in table.runs),
+            *((name, lambda name: Spec.read(self.spec(name), smoke=self.smoke)) for name in table.runs),
             *((name, self.rig) for name in table.recordings),
             *((name, self._measurement) for name in table.torques),
         ]

@@ -15,9 +15,8 @@ import numpy as np
 
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.units import shown_unit
-from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
+from pipeline.layout.conventions import shown_unit
+from pipeline.layout.vocabulary import is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.page import Block, Facts, Grid, Note, Part, Source, grid_of, picture_of
@@ -96,7 +95,7 @@ def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tu
     Raises
     ------
     RefusedError, DamagedError, UnreadableError
-        See `pipeline.store.run.Run.open`.
+        See `pipeline.store.run.RunDirectory.open`.
     """
     shown = Shown(AnalysedRun.of(source, echo), computed)
     title = shown.run.info.title or shown.run.name.rpartition("/")[2]

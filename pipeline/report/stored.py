@@ -11,10 +11,10 @@ from pipeline.runs.versions import current
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in, read_product_attrs
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 
-def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
+def stored_options(run: RunDirectory, name: str) -> list[dict[str, Any]]:
     """Return the options of each valid stored result of an analysis.
 
     Parameters

@@ -21,7 +21,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore
 
-from pipeline.specification.extras import INSTALL
+from pipeline.specification.problems import INSTALL
 from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
 
 T = TypeVar("T")

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from magpend_core.models.model import Model
-from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
-from pipeline.layout.conventions import conventional
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.conventions import conventional, netcdf_safe
+from pipeline.layout.identity import numbered
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import (
     drift_attributes,
@@ -20,7 +19,7 @@ from pipeline.layout.vocabulary import (
     overrides_attribute,
     section_attributes,
 )
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.declared import METADATA, consolidated_metadata
 from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.records import Commit
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class OpenedRun(Protocol):
-    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.Run`."""
+    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.RunDirectory`."""
 
     @property
     def info(self) -> RunInfo: ...  # noqa: D102

@@ -12,9 +12,10 @@ from typing import Any
 
 from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.recorded_drive import is_whole
+from pipeline.specification.spec import Spec
 from pipeline.store.checksums import CHECKSUM, fits, has_seal, seal
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files
@@ -38,7 +39,7 @@ class RunInfo:
     title : str
         Title from the specification.
     spec : dict
-        Specification as plain data for `parse_spec`.
+        Specification as plain data for `Spec.parse`.
     spec_text : str
         Text of the TOML file.
     versions : dict
@@ -67,7 +68,7 @@ class RunInfo:
     def parsed_spec(self) -> Spec:
         """Parse the specification; raise `DamagedError` if this version cannot read it."""
         try:
-            return kept_spec(self.spec)
+            return Spec.parse(self.spec, KEPT)
         except SpecError as error:
             made = self.versions.get("magpend", "not named")
             raise DamagedError(

@@ -14,14 +14,13 @@ import numpy as np
 import zarr
 from zarr.storage import MemoryStore
 
-from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.cells import Coordinate, coordinates, moving_coordinates
 from pipeline.layout.conventions import CONVENTIONS, Described, conventional_attributes
 from pipeline.layout.identity import digest_of
-from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.arrays import create_array, write_whole
 from pipeline.store.declared import METADATA, consolidated_metadata, disagreements
 from pipeline.store.errors import DamagedError

@@ -11,7 +11,7 @@ from pipeline.layout.plan import Plan
 from pipeline.store.commits import read_commit
 from pipeline.store.errors import IncompleteError
 from pipeline.store.records import Commit
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import RunInfo
 from pipeline.store.view import committed_view
 
@@ -55,7 +55,7 @@ def read_cells(
     return _read(info, plan, index, commit, region, names)
 
 
-def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+def read_block(run: RunDirectory, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read variables of one committed task of an open run. The dims of the task's block of cells come first, then those
     of the variable.
 

@@ -15,10 +15,10 @@ from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
 from pipeline.products.tipping import TippingOptions
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 
@@ -107,7 +107,7 @@ class Group:
 
 
 def endings(
-    run: Run, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
+    run: OpenRun, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
 ) -> Iterator[Group]:
     """Integrate cells on at their final parameters, and find the attractors on which they end.
 
@@ -139,7 +139,7 @@ def endings(
         yield Group(final, cells, ids, going, settled, outcome)
 
 
-def _going_on(run: Run, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
+def _going_on(run: OpenRun, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
     """Return a cube of trajectories that go on from given states at constant parameters, as of a sweep."""
     integration, model = run.spec.integration, final.parameters.model
     n = len(states)

@@ -21,7 +21,7 @@ from pipeline.layout.writing import write_atomically
 from pipeline.products.reporting import track
 from pipeline.store.errors import RefusedError
 from pipeline.store.local import refuse_place, unwritable
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 MOST_BYTES = 20_000_000
 """Size of a copy in one file: beyond some 20 to 30 MB, browsers have trouble with a page."""
@@ -54,7 +54,7 @@ class Exported:
 
 
 def export_page(
-    source: Run,
+    source: RunDirectory,
     out: Path,
     *,
     force: bool = False,

@@ -20,7 +20,7 @@ from pipeline.store.consolidate import Layer, write_cube
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import CUBE, entry_of
 from pipeline.store.local import refuse_place, remove_tree, unwritable
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.txt"
 
@@ -32,7 +32,12 @@ MOST_BYTES = 500_000_000
 
 
 def export_folder(
-    source: Run, out: Path, *, force: bool = False, quantities: Sequence[str] = (), most_orbits: int = MOST_ORBITS
+    source: RunDirectory,
+    out: Path,
+    *,
+    force: bool = False,
+    quantities: Sequence[str] = (),
+    most_orbits: int = MOST_ORBITS,
 ) -> Exported:
     """Write the interactive page of a run, and its data, as a folder that any static web host can serve.
 

@@ -19,7 +19,7 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.series import fixed_points, orbit_series
 from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
 from pipeline.plots.motions import motion_codes, motions_of
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -88,7 +88,7 @@ def cell_of(run: ExploredRun, number: int) -> Cell:
     return Cell(number, index, data, parameters, float(inputs.frequency_hz[0, 0]), inputs.initial_states[0])
 
 
-def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
+def orbit(run: RunDirectory, cell: int, point: int, *, linearised: bool = True) -> bytes:
     """Integrate the orbit through a point of the diagram; return arrays and attributes, packed for the page.
 
     Parameters
@@ -174,7 +174,7 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
     return f"cell {cell.number} has no section: {cell.status.sentence}."
 
 
-def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
+def _seconds(run: RunDirectory, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
     """Return the time at which each period after a section point ends [s]; without a drive, a period is a return to the
     section.
     """

@@ -20,7 +20,7 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.verticals import Vertical, vertical
 from pipeline.layout.vocabulary import PENDING
 from pipeline.plots.points import DRAWN, selections
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 MOST_POINTS = 20_000_000
 """Points of one diagram; 8 bytes each go to the page."""
@@ -58,7 +58,7 @@ class Points:
     kept: int
 
 
-def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
+def diagram(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> bytes:
     """Return the points of a bifurcation diagram as arrays and attributes, packed for the page.
 
     Parameters

@@ -16,12 +16,11 @@ from pipeline.explorer.data.clicked_orbit import finite
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.overlays import MOST_SECTION, SAME_VALUE
 from pipeline.explorer.data.view import can_have
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, KINDS
-from pipeline.store.run import Run
+from pipeline.layout.vocabulary import ATTRACTS, KINDS, letter
+from pipeline.store.run import RunDirectory
 
 
-def disturbances(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
+def disturbances(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the critical shocks of the attractors at a parameter point, and the edge states between them.
 
     Parameters

@@ -11,12 +11,12 @@ import numpy as np
 
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.runs.derive import stored, stored_each
 from pipeline.specification.problems import unknown_name
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,7 +58,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class ExploredRun(Run):
+class ExploredRun(RunDirectory):
     """A run opened for the explorer. It reads its result cube and its stored analyses only once.
 
     Reading never computes: what is not in the cube or in ``derived/`` is not there.
@@ -69,18 +69,18 @@ class ExploredRun(Run):
         Run whose bifurcation curves are shown; None for those of the run itself.
     """
 
-    curves: Run | None = None
+    curves: RunDirectory | None = None
 
     _opened: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     _lock: Any = field(default_factory=threading.RLock, compare=False, repr=False)
 
     @classmethod
-    def of(cls, source: str | Path | Run) -> ExploredRun:
+    def of(cls, source: str | Path | RunDirectory) -> ExploredRun:
         """Open a run directory for the explorer, or convert a run that is open already."""
-        run = Run.open(source)
+        run = RunDirectory.open(source)
         if isinstance(run, cls):
             return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(Run)})
+        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)})
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Return the run's result cube as a lazy dataset; each chunk is verified when it is read."""
@@ -116,7 +116,7 @@ class ExploredRun(Run):
     def refreshed(self) -> ExploredRun:
         """Return the run as it is now, with the cells and results that were added since it was opened."""
         if not self.complete:
-            return replace(ExploredRun.of(Run.open(self.info.files)), curves=self.curves)
+            return replace(ExploredRun.of(RunDirectory.open(self.info.files)), curves=self.curves)
         if self._derived_names() == self.remembered("derived names", self._derived_names):
             return self
         # the cells of a complete run stay as they are

@@ -20,14 +20,12 @@ from pipeline.explorer.data.clicked_orbit import finite, shown
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.verticals import vertical
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, model_of
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, letter, model_of, periods_of
 from pipeline.plots import palette
 from pipeline.plots.branches import NAMES, SHORT, pieces
 from pipeline.plots.labels import state_measure
 from pipeline.plots.lyapunov import EXPONENT_COLOURS
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 SAME_VALUE = 1e-9
 """Largest relative difference between a value of an axis and that at which branches were followed."""
@@ -39,7 +37,7 @@ MOST_SECTION = 2000
 # ---------------------------------------------------------------- curves under a diagram
 
 
-def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
+def curves(run: RunDirectory, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the curves of Lyapunov exponents and basin fractions along the horizontal axis of a diagram.
 
     Parameters
@@ -148,7 +146,7 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
 # ---------------------------------------------------------------- branches over a diagram
 
 
-def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
+def branches(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the branches of periodic orbits that are drawn over a diagram, and their bifurcations.
 
     Parameters
@@ -253,7 +251,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 # ---------------------------------------------------------------- attractors at a point
 
 
-def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
+def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the attractors and other sets at a parameter point; the set with the largest basin fraction comes first.
 
     Parameters

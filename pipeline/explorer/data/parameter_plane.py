@@ -17,17 +17,17 @@ from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.series import fixed_points, orbit_series
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
 from pipeline.plots.branches import NAMES
 from pipeline.plots.curve_lines import POINT_NAMES
 from pipeline.plots.labels import swept_label
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or name their run with --curves"
 
 
-def parameter_plane(run: Run) -> dict[str, Any]:
+def parameter_plane(run: RunDirectory) -> dict[str, Any]:
     """Return the bifurcation curves of a run, with the number of attractors over the plane if the run sweeps both
     parameters.
 
@@ -108,7 +108,7 @@ def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
     }
 
 
-def curve_orbit(run: Run, curve: int, point: int) -> bytes:
+def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
     """Integrate the orbit at a point of a bifurcation curve; return arrays and attributes, packed for the page.
 
     Parameters

@@ -12,7 +12,7 @@ from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import Category, Scheme, rgb, schemes
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.vocabulary import DIVERGED, grid_dim, is_grid_dim
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 NONE = -1
 """Label of a start that leads to nothing known."""
@@ -53,7 +53,7 @@ class Plane:
     start_label: np.ndarray
 
 
-def plane(run: Run, at: Mapping[str, int]) -> bytes:
+def plane(run: RunDirectory, at: Mapping[str, int]) -> bytes:
     """Return the labelled plane of initial states at a parameter point, packed for the page.
 
     Parameters

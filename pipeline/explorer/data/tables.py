@@ -18,12 +18,12 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane_of
 from pipeline.explorer.data.verticals import vertical
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
 from pipeline.layout.writing import netcdf_bytes
 from pipeline.plots.files import with_provenance
 from pipeline.specification.problems import unknown_name
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 FORMATS = {"csv": "text/csv; charset=utf-8", "nc": "application/x-netcdf"}
 """Formats by name, and what they are called in an answer."""
@@ -36,7 +36,7 @@ _ROWS_AT_ONCE = 65_536
 Asked = Mapping[str, Any]
 
 
-def table(run: Run, kind: str, asked: Asked, form: str = "csv") -> bytes:
+def table(run: RunDirectory, kind: str, asked: Asked, form: str = "csv") -> bytes:
     """Return the numbers of what the page shows (diagram, orbit, plane, ...) as the bytes of a CSV or NetCDF file.
 
     Parameters

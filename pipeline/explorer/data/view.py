@@ -16,12 +16,11 @@ from pipeline.explorer.data.explored import Axis, ExploredRun
 from pipeline.explorer.data.plain_text import plain
 from pipeline.explorer.data.series import fixed_points
 from pipeline.explorer.data.verticals import verticals
-from pipeline.layout.period_names import period_of, section_name
-from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
+from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim, period_of, section_name
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 FORMAT = 1
 """Of the answers; a page refuses another one."""
@@ -29,7 +28,7 @@ FORMAT = 1
 _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
-def describe_view(run: Run, live: bool) -> dict[str, Any]:
+def describe_view(run: RunDirectory, live: bool) -> dict[str, Any]:
     """Return a dictionary with all that the page needs to know about a run when it loads.
 
     Parameters
@@ -72,7 +71,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
     }
 
 
-def _name(run: Run) -> str:
+def _name(run: RunDirectory) -> str:
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 

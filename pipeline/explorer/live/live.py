@@ -24,11 +24,11 @@ from pipeline.explorer.live.legend import Legend
 from pipeline.explorer.live.messages import RequestError
 from pipeline.explorer.live.settling import Flight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
-from pipeline.layout.domains import check_states
+from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import axis_name
 from pipeline.runs.derive import stored
 from pipeline.specification.tables import FREQUENCY
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 LOG = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ CLOSING_S = PATIENCE_S + 2.0
 """Time that all jobs have to end when the run is closed [s]."""
 
 
-def live_problem(run: Run) -> str | None:
+def live_problem(run: RunDirectory) -> str | None:
     """Return the reason why trajectories of a run cannot be computed live; None if they can."""
     if problem := run.spec.motion.refusal("a live trajectory"):
         return f"{run.name}: {problem}"
@@ -81,7 +81,7 @@ class LiveRun:
         An opened run for which `live_problem` has nothing to say.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RunDirectory) -> None:
         problem = live_problem(run)
         if problem is not None:
             raise RequestError(problem)

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING
 
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.notebook import LEAST_HEIGHT
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.specification.problems import SpecError, import_extra
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from pipeline.explorer.notebook.widget import Explorer
 
 
-def explorer(run: str | Path | Run, *, curves: str | Path | Run | None = None, height: int = 720) -> Explorer:
+def explorer(
+    run: str | Path | RunDirectory, *, curves: str | Path | RunDirectory | None = None, height: int = 720
+) -> Explorer:
     """Show a run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
 
     The kernel answers the page: there is no server, and nothing is read from elsewhere.
@@ -40,7 +41,7 @@ def explorer(run: str | Path | Run, *, curves: str | Path | Run | None = None, h
     SpecError
         If anywidget is not installed, or the height is too small.
     RefusedError, DamagedError, UnreadableError
-        As `Run.open`.
+        As `RunDirectory.open`.
     """
     if height < LEAST_HEIGHT:
         raise SpecError(f"height = {height}: must be {LEAST_HEIGHT} pixels or more.")
@@ -48,4 +49,4 @@ def explorer(run: str | Path | Run, *, curves: str | Path | Run | None = None, h
     from pipeline.explorer.notebook.widget import Explorer
 
     found = ExploredRun.of(run)
-    return Explorer(found if curves is None else replace(found, curves=Run.open(curves)), height=height)
+    return Explorer(found if curves is None else replace(found, curves=RunDirectory.open(curves)), height=height)

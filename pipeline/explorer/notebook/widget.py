@@ -20,7 +20,7 @@ from pipeline.explorer.data.tables import orbit_dataset
 from pipeline.explorer.notebook import LEAST_HEIGHT
 from pipeline.explorer.notebook.connection import Connection, GoneError
 from pipeline.explorer.serving.answering import Answering
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -53,7 +53,7 @@ class Explorer(anywidget.AnyWidget):
     view = traitlets.Unicode("").tag(sync=True)
     height = traitlets.Int(720, min=LEAST_HEIGHT).tag(sync=True)
 
-    def __init__(self, run: Run, *, height: int = 720) -> None:
+    def __init__(self, run: RunDirectory, *, height: int = 720) -> None:
         self._answering = Answering(run)
         self._connection = Connection(self._answering, self._deliver)
         super().__init__(height=height)

@@ -11,7 +11,7 @@ from pipeline.explorer.live.live import LiveRun, live_problem
 from pipeline.explorer.serving.answers import ANSWERS, Answer, Query, Reply, first_answers
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import StoreError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 LOG = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class Answering:
         Run to show.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RunDirectory) -> None:
         self.run = ExploredRun.of(run)
         self.live_problem = live_problem(self.run)
         self.live = None if self.live_problem else LiveRun(self.run)

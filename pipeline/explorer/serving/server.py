@@ -23,7 +23,7 @@ from tornado import httpserver, web
 from pipeline.explorer.serving import page_html
 from pipeline.explorer.serving.security import Guard, Rate, headers_of, new_token
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from pipeline.explorer.serving.answers import Answer
@@ -76,7 +76,7 @@ class Service:
         Check of a request's origin and token.
     """
 
-    def __init__(self, run: Run, guard: Guard) -> None:
+    def __init__(self, run: RunDirectory, guard: Guard) -> None:
         from pipeline.explorer.serving.answering import Answering
 
         self.answering = Answering(run)
@@ -279,12 +279,12 @@ def listening(port: int) -> socket.socket:
 
 
 def serve(
-    source: str | Path | Run,
+    source: str | Path | RunDirectory,
     port: int = 0,
     *,
     echo: Callable[[str], None],
     opened: Callable[[str], None] | None = None,
-    curves: str | Path | Run | None = None,
+    curves: str | Path | RunDirectory | None = None,
 ) -> None:
     """Serve the interactive page of a run until the process is stopped.
 
@@ -306,13 +306,13 @@ def serve(
     SpecError
         If the port cannot be had.
     RefusedError, DamagedError, UnreadableError
-        As `Run.open`.
+        As `RunDirectory.open`.
     """
     from pipeline.explorer.data.explored import ExploredRun
 
-    run: Run = Run.open(source)
+    run: RunDirectory = RunDirectory.open(source)
     if curves is not None:
-        run = replace(ExploredRun.of(run), curves=Run.open(curves))
+        run = replace(ExploredRun.of(run), curves=RunDirectory.open(curves))
     taken = listening(port)
     guard = Guard(new_token(), taken.getsockname()[1])
     address = f"http://{HOST}:{guard.port}/?token={guard.token}"

@@ -39,7 +39,7 @@ from pipeline.rig.identify.orbit_rows import orbit_rows
 from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.specification import load_identification
 from pipeline.rig.identify.statistics import Linearised
-from pipeline.runs.workflows import find_spec
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError
 

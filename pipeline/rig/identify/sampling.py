@@ -23,8 +23,7 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.directory import OUTCOMES, Outcomes, read_info
 from pipeline.rig.identify.log_posterior import LogPosterior
 from pipeline.rig.identify.statistics import root_of
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from pipeline.rig.identify.first_guesses import choose_phases, fit_starts
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.specification.extras import import_extra
+from pipeline.specification.problems import import_extra
 
 Array = NDArray[np.float64]
 

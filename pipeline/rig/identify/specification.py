@@ -19,9 +19,8 @@ from magpend_core.models.presets import is_file
 from pipeline.rig.identify.orbit_tables import OrbitsTable
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown
-from pipeline.specification.files import read_toml
+from pipeline.specification.files import IDENTIFICATION, read_toml
 from pipeline.specification.models import add_model
-from pipeline.specification.parsing import IDENTIFICATION
 from pipeline.specification.problems import SpecError, checked, table_at, unknown_choice, unknown_key
 from pipeline.specification.tables import Table
 

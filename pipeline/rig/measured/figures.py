@@ -14,8 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import FREQUENCY_DIM
+from pipeline.layout.vocabulary import FREQUENCY_DIM, letter
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.motions import Motions, motions_of

@@ -15,7 +15,7 @@ from pydantic import Field
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
 from pipeline.analysis.branches.units import parameter_units
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_attribute
 from pipeline.rig.measured_branch.cycles import N_HARMONICS, Cycles, CyclesError, cycles_of
 from pipeline.rig.recordings import parse_mapping, read_recording

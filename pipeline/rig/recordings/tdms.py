@@ -13,8 +13,7 @@ import numpy as np
 
 from pipeline.rig.recordings.findings import Finding
 from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 
 SIMULATED = "simulated"
 """Property of a file with simulated readings."""

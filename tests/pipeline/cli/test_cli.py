@@ -19,7 +19,7 @@ from pipeline.runs import workflows
 from pipeline.runs.derive import derive
 from pipeline.runs.preview import figure_command
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def test_hint_after_a_run__is_a_figure_that_the_run_can_draw(main, tables, hint,
         workers=0,
         echo=lambda _: None,
     )
-    command = figure_command(Run.open("run"))
+    command = figure_command(RunDirectory.open("run"))
     assert command == f"magpend plot {hint}"
     code, _, err = main(*command.split()[1:])
     assert code == 0, err

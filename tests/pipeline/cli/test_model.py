@@ -14,7 +14,7 @@ from magpend_core.models.preset_writing import write_preset
 from magpend_core.models.text.grammar import FUNCTIONS
 from magpend_core.models.text.reading import KEYS
 from pipeline.runs.modelling import TEMPLATE
-from pipeline.specification.parsing import load_spec, parse_spec
+from pipeline.specification.spec import Spec
 
 
 @pytest.mark.slow
@@ -38,7 +38,7 @@ def test_template__every_line_that_is_offered_can_be_taken(tmp_path):
     path = tmp_path / "whole.toml"
     # a state more has an equation more: those two come together
     path.write_text("\n".join(whole))
-    spec = load_spec(path)
+    spec = Spec.read(path)
     assert spec.model.state_names == ("x", "v", "th")
     assert spec.model.drawing is not None
     assert spec.model.classifier is not None
@@ -170,7 +170,7 @@ def test_own_system__section_without_a_drive_fits():
     data = tomllib.loads(block("file: mine.toml", "toml") + "\n" + section)
     data["model"]["equations"]["v"] = "(1 - x**2)*v - x"
     del data["parameters"], data["model"]["define"], data["smoke"]
-    assert parse_spec(data).section is not None
+    assert Spec.parse(data).section is not None
 
 
 # ---- presets in files ------------------------------------------------------------------------------------

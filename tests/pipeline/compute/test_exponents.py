@@ -10,8 +10,8 @@ from pipeline import open_run
 from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
 from pipeline.products.lyapunov import LyapunovFlag
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from tests.pipeline.factories import finished
 
 SPEC = """
@@ -85,7 +85,7 @@ def test_lyapunov__failed_cells_have_none(tmp_path):
 
 
 def test_lyapunov__without_the_product_there_is_no_variable():
-    plan, whole = (make_plan(parse_spec(tomllib.loads(text))) for text in (SPEC[: SPEC.index("[products]")], SPEC))
+    plan, whole = (make_plan(Spec.parse(tomllib.loads(text))) for text in (SPEC[: SPEC.index("[products]")], SPEC))
     assert "lyapunov" not in [v.name for v in plan.variables]
     # 260 more periods at twice the cost of the 304
     assert whole.core_seconds / plan.core_seconds == pytest.approx(1.0 + 2.0 * 260 / 304)
@@ -136,4 +136,4 @@ def test_flags__say_what_is_wrong(changes, expected):
 def test_products__mistakes_are_named(old, new, words):
     assert old in SPEC
     with pytest.raises(SpecError, match=words):
-        parse_spec(tomllib.loads(SPEC.replace(old, new)))
+        Spec.parse(tomllib.loads(SPEC.replace(old, new)))

@@ -14,8 +14,8 @@ import xarray as xr
 from magpend_core import load_preset, run_branches, trajectory
 from pipeline.compute.closing import TOLERANCE, closing_of
 from pipeline.compute.simulate import simulate, write_series
-from pipeline.specification.drive_files import load_drive
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import load_drive
 from tests.pipeline.factories import edges
 
 START = (0.2, 0.1, 0.0, 0.0)

@@ -12,7 +12,7 @@ from magpend_core import Status
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
 from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import marker_key
 from tests.pipeline.factories import duffing, quietly
 
@@ -200,7 +200,7 @@ def test_walk__needs_the_task_before(write_spec, tmp_path):
 @pytest.mark.parametrize("axes", [FREQUENCIES, f"amplitude = {{ values = [0.2, 0.3] }}\n{FREQUENCIES}"])
 @pytest.mark.parametrize("cut", [1, 2, 3, 7])
 def test_predecessor__walks_from_end_to_end(direction, axes, cut):
-    plan = make_plan(parse_spec(tomllib.loads(cut_at(walk(axes, direction=direction), cut))))
+    plan = make_plan(Spec.parse(tomllib.loads(cut_at(walk(axes, direction=direction), cut))))
     path, n_chains = plan.path, 0
     for index in range(plan.n_tasks):
         block, before = plan.task(index), plan.predecessor(index)
@@ -223,7 +223,7 @@ SEEDS = [1, 2, 7, 16, 17, 24, 32, 37, 48, 100, 101, 640]
 
 @pytest.mark.parametrize("n", SEEDS)
 def test_make_plan__directions_apart(n):
-    plan = make_plan(parse_spec(tomllib.loads(walk(n=n))))
+    plan = make_plan(Spec.parse(tomllib.loads(walk(n=n))))
     for index in range(plan.n_tasks):
         branches = plan.task(index)[-1]
         assert branches.stop <= n or branches.start >= n
@@ -235,7 +235,7 @@ def test_make_plan__directions_apart(n):
 @pytest.mark.parametrize(("n", "n_keep"), [(16, 100), (32, 3000), (640, 100), (5, 20)])
 def test_make_plan__tasks_of_some_seconds(axis, n, n_keep):
     text = walk(f"frequency_hz = {{ {axis} }}", n=n, n_keep=n_keep, n_transient=300)
-    plan = make_plan(parse_spec(tomllib.loads(text)))
+    plan = make_plan(Spec.parse(tomllib.loads(text)))
     seconds = [plan.seconds(index) for index in range(plan.n_tasks)]
     # a single point of so many branches may take longer
     assert max(seconds) <= 20 or plan.block[0] == 1

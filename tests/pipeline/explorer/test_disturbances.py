@@ -14,7 +14,7 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live import noisy_starting
 from pipeline.explorer.serving.answers import ANSWERS, Query
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
 
 DAMPING, AMPLITUDES = 0.15, (0.1, 0.2)
@@ -143,7 +143,7 @@ noise = {{ seed = 7, strengths = {{ v = 0.05 }} }}
 @pytest.mark.slow
 def test_noisy_start__has_the_bits_of_a_noisy_run(watcher, tmp_path):
     directory = finished(tmp_path, NOISY)
-    cell = Run.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
+    cell = RunDirectory.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
     end, section = noisy(watcher, noise=0.05, seed=7, periods=40)
     np.testing.assert_array_equal(section, cell["section"].transpose("period_index", "state").values)
     assert (end["kind"], end["noise"], end["seed"], end["noisy_states"]) == ("done", 0.05, 7, ["v"])

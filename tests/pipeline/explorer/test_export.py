@@ -22,7 +22,7 @@ from pipeline.explorer.copies.orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.store.errors import RefusedError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 HOSTILE = '</script><script>alert(1)</script><!-- \\" onload=alert(1) &lt;b'
 
@@ -54,7 +54,7 @@ def run(made):
     """All of the small sweep but its last task."""
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
-    return Run.open(made.info.directory)
+    return RunDirectory.open(made.info.directory)
 
 
 @pytest.mark.slow

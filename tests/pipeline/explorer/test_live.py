@@ -32,8 +32,8 @@ from pipeline.layout.vocabulary import (
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.status import state
-from pipeline.specification.parsing import load_spec
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.small_runs import FLOW, finished
 
 HZ = 0.15915494309189535
@@ -76,7 +76,7 @@ def start_of(cube, at):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["whole", "closing"])
 def test_start__has_the_bits_and_the_attractor_of_the_cell(directories, watch, name):
-    opened = Run.open(directories[name])
+    opened = RunDirectory.open(directories[name])
     cube, attractors = opened.cube(), derive(directories[name], "attractors")
     watcher, seen = watch(opened), set()
     ids = attractors["attractor_id"].transpose("A", "x_0", "v_0").values
@@ -134,7 +134,7 @@ def test_start__off_the_cube_is_told_by_its_orbit(directories, watch):
 @pytest.mark.slow
 def test_start__ends_of_a_flow(directories, watch):
     """At rest or on the cycle, as the analysis says of the cell; what leaves, and what lies beside, says so."""
-    cube = Run.open(directories["flow"]).cube()
+    cube = RunDirectory.open(directories["flow"]).cube()
     attractors = dense(derive(directories["flow"], "attractors"))
     watcher, kinds = watch(directories["flow"]), set()
     for mu in (0, 1):
@@ -207,7 +207,7 @@ def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, wat
         return settle_cells(place, integration, catalog, states, check)
 
     monkeypatch.setattr(slices, "settle_cells", counted)
-    opened = Run.open(directories["whole"])
+    opened = RunDirectory.open(directories["whole"])
     attractors = dense(derive(directories["whole"], "attractors"), points=True)
     cube = opened.cube()
     watcher = watch(opened)
@@ -267,7 +267,7 @@ def follow(watcher, origin, value, parameter="A"):
 
 
 def test_follow__is_the_orbit_at_the_value(directories, watch):
-    live = LiveRun(Run.open(directories["whole"]))
+    live = LiveRun(RunDirectory.open(directories["whole"]))
     watcher = watch(live)
     orbit = follow(watcher, {"cell": closed_cell(live), "point": 2}, 0.23)
     assert (orbit["lost"], orbit["value"], orbit["parameters"]["A"]) == (False, 0.23, 0.23)
@@ -288,7 +288,7 @@ def test_follow__is_the_orbit_at_the_value(directories, watch):
 
 @pytest.mark.slow
 def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directories, watch):
-    live = LiveRun(Run.open(directories["whole"]))
+    live = LiveRun(RunDirectory.open(directories["whole"]))
     watcher = watch(live)
     held = {"cell": closed_cell(live), "point": 0}
     stable = []
@@ -307,7 +307,7 @@ def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directori
 
 @pytest.mark.slow
 def test_follow__refuses_with_a_sentence(directories, watch):
-    live = LiveRun(Run.open(directories["whole"]))
+    live = LiveRun(RunDirectory.open(directories["whole"]))
     watcher, cell = watch(live), closed_cell(live)
     for origin, parameter, value, word in (
         ({"cell": 10**9, "point": 0}, "A", 0.2, "the cube has"),
@@ -322,7 +322,7 @@ def test_follow__refuses_with_a_sentence(directories, watch):
 
 @pytest.mark.slow
 def test_follow__of_a_flow(directories, watch):
-    live = LiveRun(Run.open(directories["flow"]))
+    live = LiveRun(RunDirectory.open(directories["flow"]))
     watcher = watch(live)
     period = live.cube["orbit_period"].isel(mu=1).transpose("x_0", "y_0").values
     x, y = map(int, np.argwhere(period == 1)[0])
@@ -345,10 +345,10 @@ REGION = {"x": [-0.5, 0.5], "y": [0.0, 0.5], "axes": ["x_0", "v"], "at": {"A": 1
 
 
 def test_zoomed__is_the_region_and_reads_back(directories, tmp_path):
-    opened = Run.open(directories["whole"])
+    opened = RunDirectory.open(directories["whole"])
     region = Region.model_validate_json(json.dumps(REGION))
     (tmp_path / "zoom.toml").write_text(zoom_toml(opened, region))
-    spec = load_spec(tmp_path / "zoom.toml")
+    spec = Spec.read(tmp_path / "zoom.toml")
     assert spec == zoomed(opened, region)[0]
     assert spec.values["A"] == 0.25
     assert not spec.axes
@@ -381,7 +381,7 @@ def test_run__a_region_beside_the_run(directories, watch, monkeypatch):
     assert state(beside / end["name"]).complete
     last = [a for a in watcher.of(second) if a["kind"] == "progress"][-1]
     assert last["done"] == last["total"] == end["cells"] == 112
-    cube = Run.open(beside / end["name"]).cube()
+    cube = RunDirectory.open(beside / end["name"]).cube()
     np.testing.assert_allclose(cube["x_0"].values[[0, -1]], [-0.5, 0.5])
 
 

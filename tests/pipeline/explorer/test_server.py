@@ -23,7 +23,7 @@ from pipeline.explorer.serving.answers import ANSWERS
 from pipeline.explorer.serving.security import Guard, Rate, content_policy, new_token
 from pipeline.explorer.serving.server import listening
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import Client
 
 
@@ -209,7 +209,7 @@ def test_api__damage_is_said_and_nothing_is_shown(made_run):
             content = bytearray(file.read_bytes())
             content[len(content) // 2] ^= 1
             file.write_bytes(bytes(content))
-    client = Client(Run.open(made_run))
+    client = Client(RunDirectory.open(made_run))
     try:
         answer = client.ask("/api/diagram?x=frequency&y=psi1&at.q=0")
     finally:

@@ -20,7 +20,7 @@ from pipeline.explorer.notebook.connection import MOST_PAGES, Connection
 from pipeline.explorer.serving import socket as sockets
 from pipeline.explorer.serving.answering import Answering
 from pipeline.explorer.serving.answers import ANSWERS
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import PATIENCE_S
 
 REGION = {"x": [-0.9, 0.5], "axes": ["x_0", None]}
@@ -69,7 +69,7 @@ class Notebook:
 
     def __init__(self, directory):
         self.sent = queue.Queue()
-        self.answering = Answering(Run.open(directory))
+        self.answering = Answering(RunDirectory.open(directory))
         self.connection = Connection(self.answering, lambda content, buffers: self.sent.put((content, buffers)))
         self.dropped = []
 

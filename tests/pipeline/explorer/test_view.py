@@ -31,8 +31,8 @@ from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import load_spec
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create
 from tests.pipeline.explorer.small_runs import FLOW, finished
 
@@ -140,7 +140,7 @@ def test_describe_view__reads_what_is_computed_later(walk):
     derive(walk, "settling")
     assert explored.refreshed() is not explored
     # whoever holds an opened run may hand it over; an explored one is taken as it is
-    opened = Run.open(walk)
+    opened = RunDirectory.open(walk)
     assert ExploredRun.of(ExploredRun.of(opened)).digest == opened.digest
     assert ExploredRun.of(explored) is explored
 
@@ -383,7 +383,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
         "[integration]\nn_transient = 5\nn_keep = 3\n"
     )
     (tmp_path / "spec.toml").write_text(text, "utf-8")
-    spec = load_spec(tmp_path / "spec.toml")
+    spec = Spec.read(tmp_path / "spec.toml")
     plan = make_plan(spec)
     create(tmp_path / "run", spec, plan, identity_of(spec, plan), text)
     explored = ExploredRun.of(tmp_path / "run")

@@ -10,7 +10,7 @@ import pytest
 import magpend
 from pipeline.explorer.notebook.showing import explorer
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import PATIENCE_S
 from tests.pipeline.explorer.test_transports import LONG
 from tests.programs import fresh_python
@@ -40,7 +40,7 @@ def test_selected__is_of_the_cube_and_shown_in_the_page(widget, little):
     seen = []
     widget.observe(lambda change: seen.append(change["new"]), "selected")
     widget.selected = {"cell": 2}
-    cube = Run.open(little).cube().load()
+    cube = RunDirectory.open(little).cube().load()
     one = cube.isel(x_0=2)
     section = one["section"].transpose("period_index", "state").values
     found = widget.selected

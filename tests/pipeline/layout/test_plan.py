@@ -19,7 +19,7 @@ from pipeline.layout.cells import CellMap, coordinates, initial_states
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import base_variables, sizes_of
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 
 VARIABLES = base_variables(load_model())
 
@@ -69,7 +69,7 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
 def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
     import os
 
-    spec = parse_spec(tomllib.loads(sweep_text))
+    spec = Spec.parse(tomllib.loads(sweep_text))
     plan = make_plan(spec)
     monkeypatch.setattr(os, "cpu_count", lambda: 97)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(97)), raising=False)
@@ -78,7 +78,7 @@ def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
 
 def test_identity__what_counts(sweep_text):
     def digest(text):
-        spec = parse_spec(tomllib.loads(text))
+        spec = Spec.parse(tomllib.loads(text))
         return digest_of(identity_of(spec, make_plan(spec)))
 
     same = digest(sweep_text)
@@ -100,8 +100,8 @@ def test_digest_of__numbers_without_loss():
 
 def test_identity__versions_of_what_is_computed(sweep_text):
     """A product that a run does not ask for bars nobody from completing it."""
-    plain = parse_spec(tomllib.loads(sweep_text))
-    spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
+    plain = Spec.parse(tomllib.loads(sweep_text))
+    spectra = Spec.parse(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
     assert set(identity.versions_of(plain)) == {"engine", "cells"}
     assert set(identity.versions_of(spectra)) == {"engine", "cells", "lyapunov"}
     lines = differences(*(identity_of(s, make_plan(s)) for s in (plain, spectra)))
@@ -126,7 +126,7 @@ def whole(shape):
 
 
 def test_inputs__sweep_cell_by_cell(sweep_text):
-    spec = parse_spec(tomllib.loads(sweep_text))
+    spec = Spec.parse(tomllib.loads(sweep_text))
     cells = CellMap(spec)
     assert cells.dims == ("frequency", "q", "psi1_0", "psi2_0")
     coords = {c.name: c.values for c in coordinates(spec)}
@@ -143,7 +143,7 @@ def test_inputs__sweep_cell_by_cell(sweep_text):
 
 
 def test_inputs__branches_walk_up_and_down(walk_text):
-    spec = parse_spec(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
+    spec = Spec.parse(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
     cells = CellMap(spec)
     assert cells.dims == ("q", "frequency", "branch")
     assert cells.shape == (2, 6, 10)
@@ -160,7 +160,7 @@ def test_inputs__branches_walk_up_and_down(walk_text):
 def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
     axis = "frequency_hz = { start = 2.0, stop = 2.5, num = 6 }"
     axes = f"{axis}\n{extra}" if first else f"{extra}\n{axis}"
-    spec = parse_spec(tomllib.loads(walk_text.replace(axis, axes)))
+    spec = Spec.parse(tomllib.loads(walk_text.replace(axis, axes)))
     cells = CellMap(spec)
     coords = {c.name: c.values for c in coordinates(spec)}
     q = coords.get("q", np.array([load_preset()["q"]]))
@@ -175,8 +175,8 @@ def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
 
 
 def test_initial_states__samples_do_not_depend_on_what_is_fixed(walk_text):
-    free = parse_spec(tomllib.loads(walk_text)).initial_conditions
-    fixed = parse_spec(tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))).initial_conditions
+    free = Spec.parse(tomllib.loads(walk_text)).initial_conditions
+    fixed = Spec.parse(tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))).initial_conditions
     rows = np.arange(5)
     assert (initial_states(free).at(rows)[:, 1] == initial_states(fixed).at(rows)[:, 1]).all()
     assert (np.abs(initial_states(free).at(rows)[:, :2]) <= np.deg2rad(40)).all()
@@ -191,7 +191,7 @@ def test_coordinates__fixed_frequency_and_single_cell():
     kind = "grid"
     psi1 = 0.1
     """
-    spec = parse_spec(tomllib.loads(text))
+    spec = Spec.parse(tomllib.loads(text))
     cells = CellMap(spec)
     assert cells.shape == ()
     inputs = cells.inputs(())

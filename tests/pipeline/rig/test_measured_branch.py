@@ -12,7 +12,7 @@ from pipeline.rig.measured_branch.cycles import CyclesError, cycles_of
 from pipeline.rig.measured_branch.figure import plot_branch
 from pipeline.rig.measured_branch.reading import read_branch
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from pipeline.specification.problems import SpecError
 
 LINEAR = """

@@ -18,13 +18,13 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs import estimate as estimates
-from pipeline.runs import notebook
+from pipeline.runs import progress as notebook
 from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
 from pipeline.runs.outcome import outcomes_of
 from pipeline.runs.progress import LINE_EVERY_S, Progress
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import duffing
 
 CLOSING = duffing(
@@ -36,7 +36,7 @@ CLOSING = duffing(
 
 
 def read(text):
-    spec = parse_spec(tomllib.loads(text))
+    spec = Spec.parse(tomllib.loads(text))
     return spec, make_plan(spec)
 
 
@@ -152,7 +152,7 @@ def test_run__says_how_its_cells_ended_and_what_to_do_next(main, tmp_path):
     gains = np.linspace(-0.5, 0.5, 11)
     gone = [a for a in gains if 0.1 * math.exp(a / 2 * at_end) > 1e8]
     stay = [a for a in gains if math.exp(a / 2 * at_end) < 1e5]
-    found = {o.status: o for o in outcomes_of(Run.open(tmp_path / "runs" / "spec"))}
+    found = {o.status: o for o in outcomes_of(RunDirectory.open(tmp_path / "runs" / "spec"))}
     ((name, low, high, unit),) = found[DIVERGED].where
     assert (name, high, unit) == ("a", 0.5, "1/s")
     assert max(stay) < low <= min(gone)

@@ -19,8 +19,7 @@ from pipeline.plots.films import durations
 from pipeline.products.animation import AnimationOptions
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.filming import Start, animation
-from pipeline.runs.moving import of_attractors
+from pipeline.runs.filming import Start, animation, of_attractors
 from tests.pipeline.factories import duffing, finished
 
 HZ = 0.11

@@ -15,7 +15,6 @@ import numpy as np
 import psutil
 import pytest
 
-from magpend import Spec
 from magpend_core import load_preset, run_branches
 from pipeline import open_run
 from pipeline.cli.exits import Exit
@@ -27,7 +26,7 @@ from pipeline.runs.preview import describe_plan
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key
 from pipeline.store.errors import RefusedError
@@ -47,7 +46,7 @@ n_transient = 100
 n_keep = 4
 """
 EIGHT = "[execution]\ntrajectories_per_task = 8"
-DRIFT = Spec(**FOLD).integration(n_keep=8).execution(trajectories_per_task=2).toml()
+DRIFT = Spec(**FOLD).with_integration(n_keep=8).with_execution(trajectories_per_task=2).toml()
 NOISE = WELL.replace("[0.45, 0.55, 0.7]", "[0.45, 0.7]").replace("stop = 199", "stop = 7")
 NOISE = NOISE.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 8")
 NOISE = f"{NOISE}\n[execution]\ntrajectories_per_task = 4"
@@ -63,7 +62,7 @@ def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
     assert ds.section.dims == ("frequency", "branch", "period_index", "state")
     assert ds.direction.values.tolist() == ["up"] * 5 + ["down"] * 5
     assert ds.attrs["path"] == "frequency"
-    spec = parse_spec(tomllib.loads(walk_text))
+    spec = Spec.parse(tomllib.loads(walk_text))
     path = spec.axes["frequency_hz"].array()
     starts = np.column_stack([ds[f"{s}_0"] for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")])
     frequency = np.array([path] * 5 + [path[::-1]] * 5)

@@ -13,13 +13,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.compute.jobqueue import settings
-from pipeline.runs.batch import coordinator_script
-from pipeline.runs.sizing import Work, complete, remarks
+from pipeline.runs.batch_systems import find_systems
+from pipeline.runs.jobs import Work, complete, coordinator_script, remarks
 from pipeline.runs.submit import prepare
-from pipeline.runs.systems import find_systems
-from pipeline.runs.workflows import find_spec
-from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import QUEUES, cluster_of, load_cluster, seconds_of
+from pipeline.specification.clusters import QUEUES, SYSTEMS, cluster_of, load_cluster, seconds_of
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import duffing, quietly
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runs.workflows import find_spec
 from pipeline.specification.clusters import load_cluster
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import free_port, wait_for
 

@@ -28,7 +28,7 @@ from pipeline.store.checksums import seal, unseal
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.places import open_files
 from pipeline.store.products import write_product
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import contents, duffing, finished, quietly, silent
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
@@ -425,7 +425,7 @@ def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(wh
     """The record's digest, and the checksum in the chunk, for readers that know no records."""
     directory = whole()
 
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     chunk = next(path for path in chunks(directory) if path.parent.name == name)
     content = chunk.read_bytes()
     for i in range(20):

@@ -14,13 +14,14 @@ import pytest
 
 from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store import products
 from pipeline.store.commits import read_commits
 from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.places import open_files
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from tests.pipeline.store.conftest import QUICK
 
@@ -28,7 +29,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def plan_of(directory):
-    return make_plan(kept_spec(read_run(directory).spec))
+    return make_plan(Spec.parse(read_run(directory).spec, KEPT))
 
 
 def bomb(n_bytes):
@@ -83,7 +84,7 @@ def test_declared__metadata_of_other_shapes_and_codecs(place, change, words):
 
 def committed(directory, key, content):
     """Put a chunk in place with a record that vouches for it, as who made the directory could."""
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     commits = dict(read_commits(opened.info, opened.plan))
     for commit in commits.values():
         if key in commit.objects:
@@ -91,7 +92,7 @@ def committed(directory, key, content):
             objects[key] = {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
             object.__setattr__(commit, "objects", objects)
     (directory / "cube.zarr" / key).write_bytes(content)
-    return Run(opened.info, opened.spec, opened.plan, commits)
+    return RunDirectory(opened.info, opened.spec, opened.plan, commits)
 
 
 @pytest.mark.parametrize("key", ["section/c.0.0.0.0.0", "n_steps/c.0.0.0"])

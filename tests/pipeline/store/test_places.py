@@ -27,7 +27,7 @@ from pipeline.store.errors import IncompleteError, LockedError, RefusedError, St
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.local import writer_lock
 from pipeline.store.products import open_product
-from pipeline.store.run import Run, open_run
+from pipeline.store.run import RunDirectory, open_run
 from pipeline.store.setup import check, establish
 from tests.pipeline.factories import contents, duffing, quietly, silent
 
@@ -193,7 +193,7 @@ def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch
         return original(path, mode, **options)
 
     monkeypatch.setattr(local, "open_plain", open_plain)
-    for use in (Run.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
+    for use in (RunDirectory.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
         with pytest.raises(UnreadableError, match=r"000001\.json: cannot be read .* Nothing was removed"):
             use(place)
     assert contents(place) == before
@@ -201,7 +201,7 @@ def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch
 
 def test_scan__commits_that_never_stay_the_same_stop(place, monkeypatch):
     """Somebody packs and unpacks for ever: reading ends all the same."""
-    opened, calls = Run.open(place), []
+    opened, calls = RunDirectory.open(place), []
 
     def names(folder):
         calls.append(folder)
@@ -334,7 +334,7 @@ def test_rebuild__files_worded_by_another_version(whole):
     assert "another version" in describe(found, directory, repaired=True)[-1]
     establish(directory, whole.spec, whole.plan, whole.identity, whole.info.spec_text, silent)
     assert verify_run(directory).sound
-    assert len(Run.open(directory).commits) == whole.plan.n_tasks
+    assert len(RunDirectory.open(directory).commits) == whole.plan.n_tasks
 
 
 # ---- two coordinators in one directory -------------------------------------------------------------------

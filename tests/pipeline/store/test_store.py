@@ -21,10 +21,10 @@ from pipeline import open_run
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import base_variables
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.specification.parsing import load_spec, parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits, consolidate, packing, parallel_reads, products, records
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, scan, write_task
@@ -34,7 +34,7 @@ from pipeline.store.files import RECORD_COPY
 from pipeline.store.keys import keys_of
 from pipeline.store.packing import Packer, pack_block, withdraw
 from pipeline.store.record_copy import copied_records, write_copy
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run, write_run
 from pipeline.store.setup import create
 from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
@@ -114,10 +114,10 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
     text = 'kind = "sweep"\n[axes]\n' + "".join(
         f"{name} = {{ values = [1.5, 1.6] }}\n" for name in ("q", "frequency_hz", "eps_drive")
     )
-    spec = load_spec(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
+    spec = Spec.read(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
     identity = identity_of(spec, make_plan(spec))
     create(tmp_path / "run", spec, make_plan(spec), identity, text)
-    again = parse_spec(read_run(tmp_path / "run").spec)
+    again = Spec.parse(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
     assert digest_of(identity_of(again, make_plan(again))) == digest_of(identity)
 
@@ -189,11 +189,11 @@ def test_write_product__a_bit_flips_while_it_is_written(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
-    alone = Run.open(whole.info.directory)
+    alone = RunDirectory.open(whole.info.directory)
     digest, cells, first = alone.digest, alone.commits.cells(), dict(alone.commits)
     assert go_on(whole) == []
     assert names_in(whole) == PACKED
-    together = Run.open(whole.info.directory)
+    together = RunDirectory.open(whole.info.directory)
     found = together.commits
     assert (together.digest, found.cells(), dict(found)) == (digest, cells, first)
     assert (list(found), len(found), 5 in found) == ([0, 1, 2, 3, 4], 5, False)
@@ -388,7 +388,7 @@ def _open(folder):
 def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
-    run = Run.open(made.info.directory)
+    run = RunDirectory.open(made.info.directory)
     layer = np.arange(made.plan.n_cells, dtype=np.uint16).reshape(made.plan.shape)
     consolidate.write_cube(
         run, tmp_path / "out", "frequency", {"colour": consolidate.Layer(layer, {"title": "of cells"})}
@@ -406,7 +406,7 @@ def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
 
 def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
     made.commit(0)
-    entries = consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "q", {})
+    entries = consolidate.write_cube(RunDirectory.open(made.info.directory), tmp_path / "out", "q", {})
     files = contents(tmp_path / "out")
     assert {k: v["sha256"] for k, v in entries.items()} == {k: hashlib.sha256(c).hexdigest() for k, c in files.items()}
     assert "section" in json.loads(files["cube.zarr/zarr.json"])["consolidated_metadata"]["metadata"]
@@ -418,7 +418,7 @@ def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(whole, tmp_
     """12 starts x 3 sections x 8 bytes a column; room for three of them."""
     monkeypatch.setattr(consolidate, "CHUNK_BYTES", 3 * 12 * 3 * 8)
     monkeypatch.setattr(consolidate, "SLAB_BYTES", 1)
-    run = Run.open(whole.info.directory)
+    run = RunDirectory.open(whole.info.directory)
     consolidate.write_cube(run, tmp_path / "out", along, {})
     metadata = json.loads((tmp_path / "out" / "cube.zarr" / "section" / "zarr.json").read_text())
     assert run.plan.dims == ("frequency", "q", "psi1_0", "psi2_0")
@@ -430,4 +430,4 @@ def test_write_cube__refuses_a_damaged_source(whole, tmp_path):
     chunk = next((whole.info.directory / "cube.zarr" / "section").glob("c.*"))
     chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
     with pytest.raises(DamagedError, match="section"):
-        consolidate.write_cube(Run.open(whole.info.directory), tmp_path / "out", "frequency", {})
+        consolidate.write_cube(RunDirectory.open(whole.info.directory), tmp_path / "out", "frequency", {})

@@ -1,17 +1,26 @@
-"""Choose cores, memory and time of a batch job from the work of a run, with the reasons."""
+"""Size the jobs of a batch system from the work of a run, and write the script of the job that coordinates it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import shlex
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.layout.plan import Plan, periods_per_cell
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import size, whole
-from pipeline.specification.clusters import Cluster, clock
-from pipeline.specification.parsing import Spec
+from pipeline.specification.clusters import (
+    SYSTEMS,
+    Cluster,
+    bytes_of,
+    clock,
+    hours_and_minutes,
+    refuse_breaks,
+    seconds_of,
+)
+from pipeline.specification.spec import Spec
 
 AIM_S = 1800.0
 """Time that a job is given enough cores for [s]: short enough to start soon, long enough to be worth a job."""
@@ -31,34 +40,19 @@ LONG_S = 86400.0
 
 @dataclass(frozen=True)
 class Work:
-    """The work that a run still has to do, measured on this machine.
+    """The work that a run still has to do, measured on this machine."""
 
-    Attributes
-    ----------
-    n_cells, n_left : int
-        Cells of the run, and those that are not computed yet.
-    n_tasks, n_tasks_left : int
-        Tasks of the run, and those that are not committed yet.
-    n_parallel : int
-        Most tasks that can run at a time.
-    periods : float
-        Most drive periods (returns of a flow) of the cells that are left, with those of their products.
-    seconds : float
-        Time of one core for all of it [s].
-    how : str
-        Phrase on how it was measured.
-    n_bytes, task_bytes : int
-        Size of the cube and of a task's results, before compression [bytes].
-    """
-
+    # cells of the run, and those that are not computed yet
     n_cells: int
     n_left: int
+    # tasks of the run, and those that are not committed yet
     n_tasks: int
     n_tasks_left: int
-    n_parallel: int
-    periods: float
-    seconds: float
-    how: str
+    n_parallel: int  # most tasks that can run at a time
+    periods: float  # most drive periods (returns of a flow) of the cells that are left, with those of their products
+    seconds: float  # time of one core for all of it [s]
+    how: str  # phrase on how it was measured
+    # size of the cube and of a task's results, before compression [bytes]
     n_bytes: int
     task_bytes: int
 
@@ -76,7 +70,7 @@ class Work:
         ]
 
 
-def measure(spec: Spec, plan: Plan, done: Mapping[int, Any]) -> Work:
+def measure(spec: Spec, plan: Plan, done: Container[int]) -> Work:
     """Measure the work that a run still has to do, as ``magpend run --dry-run`` does."""
     left = [index for index in range(plan.n_tasks) if index not in done]
     n_left = sum(plan.cells_in(index) for index in left)
@@ -164,3 +158,68 @@ def remarks(cluster: Cluster, work: Work) -> list[str]:
             f"{whole(work.wall(jobs * cluster.cores))} (docs/clusters.md, more than one node)"
         )
     return found
+
+
+def is_whole(cluster: Cluster) -> bool:
+    """Return whether a single batch job both coordinates the run and does its work."""
+    return cluster.max_jobs == 1
+
+
+def resources(cluster: Cluster) -> tuple[int, int, int]:
+    """Return the cores, the memory [bytes] and the wall time [s] of the job that coordinates a run."""
+    if is_whole(cluster):
+        return cluster.cores, cluster.memory_bytes, cluster.walltime_s
+    time = cluster.coordinator_walltime
+    return 1, bytes_of(cluster.coordinator_memory), cluster.walltime_s if time is None else seconds_of(time)
+
+
+def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, command: Sequence[str]) -> str:
+    """Return the batch script of the job that coordinates a run.
+
+    Parameters
+    ----------
+    cluster
+        Description of a job.
+    name
+        Name of the job.
+    log
+        Path of the job's output, without the suffix that the batch system adds.
+    folder
+        Working directory of the command.
+    command
+        Words of the command.
+
+    Raises
+    ------
+    SpecError
+        If a name or a word has a line break or another control character.
+    """
+    refuse_breaks((name, log, folder, *command))
+    system = SYSTEMS[cluster.kind]
+    cores, memory, time_s = resources(cluster)
+    values = {
+        "name": name,
+        "log": log,
+        "queue": cluster.queue,
+        "account": cluster.account,
+        "cores": cores,
+        "host": 1 if cores > 1 else None,
+        "mebibytes": -(-memory // 2**20),
+        "megabytes": -(-memory // 10**6),
+        "clock": clock(time_s),
+        "hours_and_minutes": hours_and_minutes(time_s),
+    }
+    # a job of one core gets no -pe (parallel environment)
+    more = [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]
+    lines = [
+        "#!/usr/bin/env bash",
+        *system.lines(values),
+        *(f"{system.mark} {line}" for line in more),
+        "",
+        "set -eo pipefail",
+        f"cd {shlex.quote(folder)}",
+        *cluster.prologue,
+        # exec: signals of the batch system reach the command, and its exit code is the job's
+        f"exec {shlex.join(command)}",
+    ]
+    return "\n".join(lines) + "\n"

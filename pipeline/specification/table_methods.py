@@ -5,16 +5,20 @@ from __future__ import annotations
 import inspect
 import textwrap
 from collections.abc import Callable
-from typing import Any, Generic, ParamSpec, TypeVar
+from functools import wraps
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel
 
-from pipeline.runs.arguments import knows_its_keys
-from pipeline.specification.words import bounds_in_words, default_in_words
+from pipeline.products.product import bounds_of
+from pipeline.specification.problems import shown, unknown_key
 
 P = ParamSpec("P")
 S = TypeVar("S")
 
+T = TypeVar("T")
+
+PREFIX = "with_"
 _FILLED_IN = ("kind", "sha256", "text")
 """Keys that are not given by hand."""
 
@@ -39,7 +43,7 @@ class TableMethod(Generic[P]):
         self.summary, self.path, self.argument = summary, path, argument
 
     def __set_name__(self, owner: type, name: str) -> None:
-        self.path = self.path or name
+        self.path = self.path or name.removeprefix(PREFIX)
         fields = {k: info for k, info in self.table.model_fields.items() if k not in _FILLED_IN}
         required = [k for k, info in fields.items() if info.is_required()]
         replaces = bool(self.argument or required)
@@ -87,3 +91,46 @@ def _note(info: Any) -> str:
     default = "" if info.is_required() else default_in_words(info).strip("`")
     words += [f"default {default}" if default not in ("", "()") else ""]
     return "; ".join(word for word in words if word) + "."
+
+
+def default_in_words(info: Any) -> str:
+    """Return the default of a key as Markdown; empty if it says nothing."""
+    if info.is_required():
+        return "required"
+    default = info.get_default(call_default_factory=True)
+    if default is None or default in ("", {}):
+        return ""
+    return f"`{str(default).lower() if isinstance(default, bool) else repr(default)}`"
+
+
+def bounds_in_words(info: Any) -> str:
+    """Return the bounds or the choices of a key as Markdown."""
+    if get_origin(info.annotation) is Literal:
+        return ", ".join(f"`{choice}`" for choice in get_args(info.annotation))
+    inner = [part for kind in get_args(info.annotation) for part in getattr(kind, "__metadata__", ())]
+    words = [bounds_of(info)] + [bounds_of(part) for part in inner if hasattr(part, "metadata")]
+    return ", ".join(word for word in words if word)
+
+
+def knows_its_keys(method: Callable[P, T]) -> Callable[P, T]:
+    """Wrap a method of `Spec` so that an unknown keyword raises a TypeError with the nearest known keys."""
+    path = method.__qualname__.removesuffix(".__init__").rpartition(".")[2].removeprefix(PREFIX)
+
+    @wraps(method)
+    def called(*args: P.args, **kwargs: P.kwargs) -> T:
+        parameters = inspect.signature(method).parameters
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            keys = list(parameters)[1:]
+            unknown = [_unknown(path, key, value, keys) for key, value in kwargs.items() if key not in keys]
+            if unknown:
+                raise TypeError("\n".join(unknown))
+        return method(*args, **kwargs)
+
+    return called
+
+
+def _unknown(path: str, key: str, value: Any, keys: list[str]) -> str:
+    hint = (
+        f" A parameter of the model is given by overrides={{{key!r}: {shown(value)}}}." if "overrides" in keys else ""
+    )
+    return unknown_key(f"{path}.{key}", key, keys) + hint

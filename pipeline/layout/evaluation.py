@@ -1,4 +1,4 @@
-"""Find the sizes of a run's states from its starts and a short motion, where the text of its model gives no scale.
+"""Evaluate a run's equations at its starts: refuse those without values, and find the sizes of states.
 
 A state of 1e-9 m or of 1e9 persons would be compared with tolerances made for numbers of the order of one. Its size
 becomes its scale, and the unit of its absolute tolerance and of its bound. It is a power of ten, and 1 for all that is
@@ -11,8 +11,9 @@ size that it began with. The motion is integrated with numpy as the text is writ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,10 +22,150 @@ from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.natural import natural_size
-from pipeline.layout.cells import initial_states
-from pipeline.layout.domains import parameter_points
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.layout.cells import initial_states, parameter_axes
+from pipeline.specification.models import KEPT
+from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+    from magpend_core.models.text.domains import Fault
+
+MOST_STARTS = 4096
+"""Most starts at which the equations are evaluated. Of more starts so many are chosen, evenly spread."""
+SHARES = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19]) % 1.0
+"""Instants in the drive's period at which the equations are compared with themselves one period later: at none of
+them an edge is to be expected.
+"""
+PERIODIC, TWICE = 1e-6, 2
+"""Largest relative difference after a period, and least number of instants with a larger one."""
+MOST_CORNERS = 64
+"""Most corners of the box of swept parameters at which the equations are evaluated."""
+
+
+def check_starts(spec: Spec) -> None:
+    """Refuse a run of a model written as text if its equations cannot be evaluated at the initial conditions.
+
+    They must also have the drive's period in time, in most of some drawn states at the ends of every axis.
+
+    They are evaluated at time 0 at all starts (at most `MOST_STARTS`), at both ends of every axis. If they
+    have values at some of the ends, the run is not refused: the status of its cells shows where they have
+    none.
+
+    Raises
+    ------
+    SpecError
+        If they have none. The message names each part of the text without a value, the reason, and the
+        numbers.
+    """
+    states = initial_states(spec.initial_conditions)
+    chosen = np.unique(np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(np.int64))
+    points = parameter_points(spec)
+    model = load_model(spec.reference)
+    check_states(model, states.at(chosen), points)
+    if isinstance(model, TextModel) and not model.autonomous and spec.drive is None:
+        _check_period(model, states.at(chosen[: len(SHARES)]), points)
+
+
+def parameter_points(spec: Spec) -> list[dict[str, Any]]:
+    """Return the values of the parameters and of the frequency at both ends of every axis, at most `MOST_CORNERS`."""
+    axes = parameter_axes(spec)
+    ends = [np.unique([a.values.min(), a.values.max()]).tolist() for a in axes]
+    corners = itertools.islice(itertools.product(*ends), MOST_CORNERS)
+    fixed = {**spec.values, FREQUENCY: spec.frequency_hz}
+    return [{**fixed, **dict(zip([a.parameter for a in axes], corner, strict=True))} for corner in corners]
+
+
+def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
+    """Raise `SpecError` for an equation that does not repeat after a period of the drive."""
+    definition = model.definition
+    problems: dict[str, str] = {}
+    for point in points:
+        before, after = (_rates(model, states, point, late) for late in (0.0, 1.0))
+        for name in definition.equations:
+            size = np.abs(before[name]).max()
+            if (np.abs(after[name] - before[name]) > PERIODIC * size).sum() >= TWICE:
+                at = ", ".join(f"{n} = {point[n]:.6g}" for n in (FREQUENCY, *model.parameter_names))
+                problems.setdefault(
+                    name,
+                    f"model.equations.{name} = {definition.table['equations'][name]!r}: does not repeat after a period "
+                    f"of the drive, 1/f, at {at}. Time must enter with this period: write 2*pi*f*t, or phase, and give "
+                    "the drive's rate as frequency_hz.",
+                )
+    if problems:
+        raise SpecError(list(problems.values()))
+
+
+def _rates(model: TextModel, states: np.ndarray, point: Mapping[str, Any], late: float) -> dict[str, np.ndarray]:
+    """Return the rates of the states at some instants of the drive's period, `late` periods later."""
+    definition, frequency = model.definition, point[FREQUENCY] or 1.0
+    rows = np.resize(states, (len(SHARES), states.shape[1])).T
+    known: dict[str, Any] = {
+        "pi": np.pi,
+        **{name: float(point[name]) for name in model.parameter_names},
+        **dict(zip(model.state_names, rows, strict=True)),
+        "f": frequency,
+        "phase": SHARES,
+        "t": (SHARES + late) / frequency,
+    }
+    with np.errstate(all="ignore"):
+        values = rates_of(definition, known)
+    return {name: np.nan_to_num(np.broadcast_to(value, SHARES.shape)) for name, value in values.items()}
+
+
+def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse states at which the equations of a model written as text cannot be evaluated.
+
+    Parameters
+    ----------
+    model
+        Any model; one that is not a text is not checked.
+    states
+        Initial states in the model's units, shape (n, n_states).
+    points
+        Parameter points at which the states are checked: values by parameter name, and ``frequency_hz``
+        (None for none).
+
+    Raises
+    ------
+    SpecError
+        If the equations have no value; see `check_starts`.
+    """
+    if not isinstance(model, TextModel):
+        return
+    from magpend_core.models.text.domains import domain_faults
+
+    n = len(states)
+    columns = dict(zip(model.state_names, np.tile(states, (len(points), 1)).T, strict=True))
+    for name in model.parameter_names:
+        columns[name] = np.repeat([float(p[name]) for p in points], n)
+    zero = np.zeros(n * len(points))
+    frequency = [p.get(FREQUENCY) or 1.0 for p in points]
+    columns |= {"t": zero, "phase": zero, "f": np.repeat(frequency, n)}
+    faults = domain_faults(model.definition, columns)
+    parts = [{name: v[i * n : (i + 1) * n] for name, v in columns.items()} for i in range(len(points))]
+    # an axis may end at a pole; cells at other parameters then have values
+    if faults and (len(points) == 1 or all(domain_faults(model.definition, part) for part in parts)):
+        raise SpecError([_sentence(model, fault, columns, n * len(points)) for fault in faults])
+
+
+def _sentence(model: Model, fault: Fault, columns: Mapping[str, np.ndarray], total: int) -> str:
+    own = {n: v for n, v in fault.values.items() if n not in model.state_names}
+    if fault.is_constant:
+        at = ", ".join(f"{name} = {value:.6g}" for name, value in own.items())
+        return (
+            f"model.{fault.place}: {fault.part}: {fault.why}{' at ' if at else ''}{at}, in every state; "
+            "choose other values, or write the part otherwise."
+        )
+    with_states = {name: columns[name][fault.row] for name in model.state_names}
+    at = ", ".join(f"{name} = {value:.6g}" for name, value in {**with_states, **own}.items())
+    share = f" ({fault.count} of {total} starts)" if total > 1 else ""
+    return (
+        f"model.{fault.place}: {fault.part}: {fault.why} at the start {at}{share}; begin elsewhere, or write "
+        "where(condition, a, b) with a value that exists there."
+    )
+
 
 MOST_CELLS, MOST_POINTS = 32, 8
 """Most cells whose motion is integrated, and most parameter points that they are spread over."""
@@ -65,7 +206,7 @@ def with_sizes(spec: Spec, kept: Spec | None = None) -> Spec:
     if not changed:
         return spec
     states = {name: {**_entry(given[name]), "size": size} for name, size in changed.items()}
-    return kept_spec({**spec.as_dict(), "model": {**model.definition.table, "states": {**given, **states}}})
+    return Spec.parse({**spec.as_dict(), "model": {**model.definition.table, "states": {**given, **states}}}, KEPT)
 
 
 def size_remarks(spec: Spec) -> list[str]:

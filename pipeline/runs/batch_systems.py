@@ -1,18 +1,91 @@
-"""Choose the batch system of a run, and collect what is given about its jobs: by a file, an option, or nothing."""
+"""Find the batch systems of this machine, choose one, and collect what is given about its jobs."""
 
 from __future__ import annotations
 
 import os
+import re
+import shutil
+import subprocess
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.runs.systems import LOOKED_FOR, System, find_systems
-from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import QUEUES, Cluster, cluster_of, read_table
+from pipeline.specification.clusters import QUEUES, SYSTEMS, Cluster, cluster_of, read_table
 from pipeline.specification.problems import SpecError, unknown_key
+
+LOOKED_FOR = "sbatch (SLURM), bsub (LSF), qsub (PBS, Torque, Grid Engine)"
+ANSWER_S = 20.0
+"""Longest time for a batch system to answer a question [s]."""
+
+_WRAPPER = re.compile(rb"\bSlurm\b|\bSLURM\b")
+_PBS, _TORQUE = re.compile(r"pbs_version\s*="), re.compile(r"^\s*version:\s*\d", re.I | re.M)
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class System:
+    """Batch system of this machine."""
+
+    kind: str  # its name in a ``[cluster]`` table
+    command: str  # path of the command that submits a batch script
+
+    @property
+    def named(self) -> str:
+        """Name and command, for messages."""
+        return f"{SYSTEMS[self.kind].title} ({self.command})"
+
+
+def find_systems() -> list[System]:
+    """Return the batch systems whose commands are on the PATH.
+
+    Several systems have a command ``qsub``. Grid Engine is recognized by ``qconf`` or by SGE_ROOT in the
+    environment, OpenPBS and Torque by the version that ``qstat --version`` prints. A ``qsub`` that is a script
+    of SLURM (Debian's package slurm-wlm-torque) is no further system.
+    """
+    found = [
+        System(kind, path) for kind, name in (("slurm", "sbatch"), ("lsf", "bsub")) if (path := shutil.which(name))
+    ]
+    qsub = shutil.which("qsub")
+    if qsub and not _is_script_of_slurm(qsub):
+        found.append(System(_kind_of_qsub(), qsub))
+    return found
+
+
+def _is_script_of_slurm(path: str) -> bool:
+    try:
+        with Path(path).open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+    return head.startswith(b"#!") and bool(_WRAPPER.search(head))
+
+
+def _kind_of_qsub() -> str:
+    if shutil.which("qconf") or os.environ.get("SGE_ROOT"):
+        return "sge"
+    said = answer(["qstat", "--version"]) or ""
+    return "torque" if _TORQUE.search(said) and not _PBS.search(said) else "pbs"
+
+
+def answer(command: Sequence[str]) -> str | None:
+    """Return the output of a command, both its streams; None if it fails, does not answer in time, or is not there."""
+    try:
+        done = subprocess.run(
+            list(command),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            timeout=ANSWER_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None
+
 
 CLUSTER_FILE = "MAGPEND_CLUSTER"
 _LONGEST = "9999:00:00"
@@ -20,27 +93,13 @@ _LONGEST = "9999:00:00"
 
 @dataclass(frozen=True)
 class Choice:
-    """Batch system of a run, and the values of ``[cluster]`` that are given.
+    """Batch system of a run, and the values of ``[cluster]`` that are given."""
 
-    Attributes
-    ----------
-    kind : str
-        The batch system.
-    table : dict
-        Values of ``[cluster]`` that are given.
-    why : str
-        Phrase on how the batch system was chosen.
-    sources : dict of str
-        Source of each given value, by key.
-    file : Path, optional
-        File with the values, if nothing else changes them.
-    """
-
-    kind: str
-    table: Mapping[str, Any]
-    why: str
-    sources: Mapping[str, str] = field(default_factory=dict)
-    file: Path | None = None
+    kind: str  # the batch system
+    table: Mapping[str, Any]  # values of ``[cluster]`` that are given
+    why: str  # phrase on how the batch system was chosen
+    sources: Mapping[str, str] = field(default_factory=dict)  # source of each given value, by key
+    file: Path | None = None  # file with the values, if nothing else changes them
 
 
 def choose(cluster: str | Path | None, changes: Sequence[str], retry: str) -> Choice:
