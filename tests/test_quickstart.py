@@ -18,7 +18,7 @@ from magpend_core import Status
 from magpend_core.engine import lanes
 from magpend_core.models.pendulum.sides import Side
 from pipeline.analysis.sides import classify
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 
 ROOT = Path(__file__).parents[1]
 

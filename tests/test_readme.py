@@ -14,7 +14,7 @@ from pipeline.cli import main, reference
 from pipeline.cli.exits import Exit
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from tests.programs import ROOT
 
 README = (ROOT / "README.md").read_text("utf-8")

@@ -39,7 +39,7 @@ identify_app = command_group(
 
 
 def _identifications() -> Iterable[str]:
-    from pipeline.runs.workflows import shipped_identifications
+    from pipeline.specification.files import shipped_identifications
 
     return shipped_identifications()
 

@@ -243,7 +243,7 @@ def branch(
     from pipeline.rig.measured.branch import branch_table, compare, read_branch
     from pipeline.rig.measured.branch_computed import amplitudes
     from pipeline.rig.measured.branch_figure import plot_branch
-    from pipeline.runs.workflows import find_spec
+    from pipeline.specification.files import find_spec
 
     _check_targets(out, csv)
     path = find_spec(source)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.specification.words import bounds_in_words, default_in_words
+from pipeline.specification.table_methods import bounds_in_words, default_in_words
 
 Row = tuple[str, str]
 ROOT = Path(__file__).parents[2]
@@ -178,7 +178,7 @@ def _text(text: str) -> str:
 
 def workflows() -> str:
     """Return the Markdown table of the specifications that ship with magpend."""
-    from pipeline.runs.workflows import shipped_identifications, shipped_workflows
+    from pipeline.specification.files import shipped_identifications, shipped_workflows
 
     def title(path: Path) -> str:
         return str(tomllib.loads(path.read_text("utf-8")).get("title", ""))

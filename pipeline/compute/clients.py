@@ -21,8 +21,7 @@ from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
 from pipeline.layout.identity import CELLS
 from pipeline.layout.writing import TEMPORARY
 from pipeline.specification.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 from pipeline.store.errors import StoreError
 from pipeline.store.files import COMMITS
 from pipeline.store.local import open_files

@@ -9,10 +9,10 @@ import numpy as np
 
 from magpend_core import Sections, Status
 from pipeline.layout.schema import REST_STATE, base_variables
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.specification.batch_systems import SYSTEMS, TORQUE_RESOURCES
-from pipeline.specification.clusters import Cluster, hours_and_minutes, refuse_breaks
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.clusters import SYSTEMS, TORQUE_RESOURCES, Cluster, hours_and_minutes, refuse_breaks
+from pipeline.specification.problems import SpecError, import_extra
 
 JOB_NAME = "magpend-worker"
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")

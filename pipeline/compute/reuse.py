@@ -17,16 +17,17 @@ import numpy as np
 from magpend_core import Sections, Status
 from pipeline.compute.integrate import WALKED, Integrate, Job, going_on, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.reading import read_block
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 
 Origin = tuple[str, str]
@@ -42,7 +43,7 @@ ABSENT = (Status.PENDING, Status.INFERRED)
 class Source:
     """An earlier run from which a new run copies cells."""
 
-    run: Run  # the run, with the tasks that were committed when it was opened
+    run: RunDirectory  # the run, with the tasks that were committed when it was opened
     wanted: Spec  # specification of the run that takes its cells
     finder: Finder = field(init=False)
     names: list[str] = field(init=False)
@@ -109,7 +110,7 @@ class Source:
         return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
 
 
-def same_products(run: Run, wanted: Spec) -> list[str]:
+def same_products(run: RunDirectory, wanted: Spec) -> list[str]:
     """Return those products of a specification that a run has already computed with the same options and version."""
     versions = numbered(run.info.identity)["versions"]
     return [
@@ -119,7 +120,7 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
     ]
 
 
-def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
+def obstacles(run: RunDirectory, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
     """Return the reasons why a new run, with its specification and identity, cannot copy the cells of another one."""
     lines = unlike(run.info.identity, identity)
     if line := _no_extension(run.spec, wanted):
@@ -151,7 +152,7 @@ def _no_extension(old: Spec, new: Spec) -> str:
 class Pool:
     """Earlier runs from which a new run copies cells; the first one that has a cell provides it."""
 
-    def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
+    def __init__(self, spec: Spec, runs: Sequence[RunDirectory]) -> None:
         self.spec = spec
         self.sources = [Source(run, spec) for run in runs]
 
@@ -268,8 +269,8 @@ def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
     """
     runs = []
     for place, expected in sources:
-        run = Run.open(place)
+        run = RunDirectory.open(place)
         if run.info.digest != expected:
             raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
         runs.append(run)
-    return Pool(kept_spec(read_run(directory).spec), runs)
+    return Pool(Spec.parse(read_run(directory).spec, KEPT), runs)

@@ -17,13 +17,12 @@ from magpend_core.engine.system import System
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
-from pipeline.layout.domains import check_states
+from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import write_atomically, write_netcdf
-from pipeline.specification.drive_files import RecordedDrive, load_drive
 from pipeline.specification.files import check_new_file
 from pipeline.specification.problems import SpecError, unknown_name, validated
-from pipeline.specification.recorded_drive import model_problems
+from pipeline.specification.recorded_drive import RecordedDrive, load_drive, model_problems
 from pipeline.specification.tables import FREQUENCY, Integration
 
 if TYPE_CHECKING:
@@ -179,7 +178,7 @@ def simulate(
     initial_state
         The model's states at time 0, or where the recorded drive begins, in their units.
     drive
-        A drive file (see `pipeline.specification.drive_files`): the drive is a recording.
+        A drive file (see `pipeline.specification.recorded_drive`): the drive is a recording.
     model
         A model, or what `magpend_core.load_model` takes for one.
     preset, overrides

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -22,12 +21,12 @@ from pipeline.compute.integrate import WALKED, Integrate, going_on, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences, identity_of
+from pipeline.layout.identity import differences, identity_of, numbered
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.reading import read_cells
@@ -45,7 +44,7 @@ def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tup
     if origin is not None:
         import_model(*origin)
     info = read_run(directory)
-    spec = kept_spec(info.spec)
+    spec = Spec.parse(info.spec, KEPT)
     plan = make_plan(spec)
     different = differences(numbered(info.identity), identity_of(spec, plan))
     if digest != info.digest or different:
@@ -168,5 +167,5 @@ def warm_up(spec: Spec) -> float:
         short = Inputs(short.parameters[:1, :1], short.frequency_hz[:1, :1], short.initial_states[:1])
     integration = spec.integration.model_copy(update={"n_transient": 0, "n_keep": 1})
     products = {name: CELL_PRODUCTS[name].shortest(options) for name, options in spec.products.items()}
-    integrate(replace(spec, integration=integration, products=products), short)
+    integrate(spec.replace(integration=integration, products=products), short)
     return time.perf_counter() - started

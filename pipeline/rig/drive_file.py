@@ -1,4 +1,4 @@
-"""Make a drive file from a recording, readable by `pipeline.specification.drive_files`."""
+"""Make a drive file from a recording, readable by `pipeline.specification.recorded_drive`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.rig.edges import DRIVE, Timing, edges_of
-from pipeline.specification.drive_files import EDGES, HEADERS, TORQUE, parse_drive
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import EDGES, HEADERS, TORQUE, parse_drive
 
 Floats = npt.NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from zarr.storage import LocalStore
 from pipeline.layout.cells import parameter_axes
 from pipeline.products.reporting import report
 from pipeline.store.files import CUBE, entry_of
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 CHUNK_BYTES = 500_000
 """Bytes of a chunk before compression, so large that a request's delay is short beside its transfer."""
@@ -52,7 +52,7 @@ class Layer:
 Layers = Mapping[str, Layer]
 
 
-def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
+def write_cube(run: RunDirectory, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
     """Write the committed cells of a run as a zarr cube with small chunks, which browsers can read, in a new
     ``cube.zarr``.
 
@@ -75,7 +75,7 @@ class _Columns:
     of one swept parameter.
     """
 
-    def __init__(self, run: Run, along: str | None) -> None:
+    def __init__(self, run: RunDirectory, along: str | None) -> None:
         self.dims, self.shape, self._sizes = run.plan.dims, run.plan.shape, run.plan.sizes
         swept = [axis.dim for axis in parameter_axes(run.spec)]
         starts = [dim for dim in reversed(self.dims) if dim not in swept]
@@ -111,7 +111,7 @@ class _Columns:
             yield tuple(part if k == i else slice(None) for k in range(len(self.dims)))
 
 
-def _write_group(run: Run, store: LocalStore, columns: _Columns, layers: Layers) -> None:
+def _write_group(run: RunDirectory, store: LocalStore, columns: _Columns, layers: Layers) -> None:
     ds = run.cube()
     attrs = {str(k): v for k, v in ds.attrs.items() if k not in PRIVATE}
     others = " ".join(sorted(str(name) for name in ds.coords if name not in ds.dims))

@@ -30,7 +30,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore
 
-from pipeline.specification.extras import INSTALL
+from pipeline.specification.problems import INSTALL
 from pipeline.store.errors import DamagedError, LockedError, RefusedError, StoreError, UnreadableError
 from pipeline.store.files import LOCK
 from pipeline.store.local import has_ended, holder, in_words

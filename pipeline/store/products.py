@@ -23,7 +23,7 @@ import zarr
 from zarr.core.buffer import cpu
 from zarr.storage import MemoryStore
 
-from pipeline.layout.attributes import netcdf_safe
+from pipeline.layout.conventions import netcdf_safe
 from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, writing
 from pipeline.store.arrays import create_array, disagreements, product_problem
 from pipeline.store.errors import DamagedError, UnreadableError

@@ -15,10 +15,9 @@ from zarr.registry import get_pipeline_class, register_pipeline
 from zarr.storage import StorePath
 
 from magpend_core.models.model import Model
-from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
-from pipeline.layout.conventions import conventional
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.conventions import conventional, netcdf_safe
+from pipeline.layout.identity import numbered
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import (
     drift_attributes,
@@ -27,12 +26,12 @@ from pipeline.layout.vocabulary import (
     overrides_attribute,
     section_attributes,
 )
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.arrays import METADATA, consolidated_metadata
 from pipeline.store.commits import read_commit
 from pipeline.store.errors import IncompleteError
 from pipeline.store.records import Commit
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import RunInfo
 from pipeline.store.view import CommittedStore, committed_view
 
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class OpenedRun(Protocol):
-    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.Run`."""
+    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.RunDirectory`."""
 
     @property
     def info(self) -> RunInfo: ...  # noqa: D102
@@ -188,7 +187,7 @@ def read_cells(
     return _read(info, plan, index, commit, region, names)
 
 
-def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+def read_block(run: RunDirectory, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read variables of one committed task of an open run. The dims of the task's block come first, then the
     variable's.
 

@@ -12,9 +12,10 @@ from typing import Any
 
 from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.recorded_drive import is_whole
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files
 from pipeline.store.local import open_files
@@ -30,7 +31,7 @@ class RunInfo:
     digest: str  # digest of `identity`
     identity: dict[str, Any]  # everything that decides the numbers and the layout
     title: str  # title from the specification
-    spec: dict[str, Any]  # specification as plain data for `parse_spec`
+    spec: dict[str, Any]  # specification as plain data for `Spec.parse`
     spec_text: str  # text of the TOML file
     versions: dict[str, str]  # versions of the packages that made the run
     provenance: dict[str, str]  # see `pipeline.store.provenance`
@@ -44,7 +45,7 @@ class RunInfo:
     def parsed_spec(self) -> Spec:
         """Parse the specification; raise `DamagedError` if this version cannot read it."""
         try:
-            return kept_spec(self.spec)
+            return Spec.parse(self.spec, KEPT)
         except SpecError as error:
             made = self.versions.get("magpend", "not named")
             raise DamagedError(

@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences, digest_of
+from pipeline.layout.identity import differences, digest_of, numbered
 from pipeline.layout.plan import Plan
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.arrays import METADATA
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.commits import withdraw

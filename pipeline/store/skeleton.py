@@ -14,14 +14,13 @@ import numpy as np
 import zarr
 from zarr.storage import MemoryStore
 
-from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.cells import Coordinate, coordinates, moving_coordinates
 from pipeline.layout.conventions import CONVENTIONS, Described, conventional_attributes
 from pipeline.layout.identity import digest_of
-from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.store.arrays import METADATA, consolidated_metadata, create_array, disagreements, write_whole
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files, compared, entry_of

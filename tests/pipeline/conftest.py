@@ -123,12 +123,12 @@ def made(tmp_path, write_spec, sweep_text):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
-    from pipeline.specification.parsing import load_spec
+    from pipeline.specification.spec import Spec
     from pipeline.store.commits import write_task
     from pipeline.store.setup import create
 
     path = write_spec(sweep_text)
-    spec = load_spec(path)
+    spec = Spec.read(path)
     plan = make_plan(spec)
     identity = identity_of(spec, plan)
     info = create(tmp_path / "run", spec, plan, identity, sweep_text)

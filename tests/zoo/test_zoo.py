@@ -43,7 +43,7 @@ def test_zoo__other_units_change_no_conclusion(name, setting):
 
 @pytest.mark.slow
 def test_zoo__systems_have_a_source_and_valid_specifications_that_vary_in_one_thing(tmp_path):
-    from pipeline.specification.parsing import load_spec
+    from pipeline.specification.spec import Spec
 
     assert len(ANSWERS) >= 114
     for name, answer in ANSWERS.items():
@@ -55,7 +55,7 @@ def test_zoo__systems_have_a_source_and_valid_specifications_that_vary_in_one_th
         for word, data in every.items():
             changed = [key for key in own if own[key] != data[key]]
             assert len(changed) == (word != variants.OWN), (name, word)
-        load_spec(variants.write(own, tmp_path))
+        Spec.read(variants.write(own, tmp_path))
 
 
 # ---- the judge ---------------------------------------------------------------------------------

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import xarray as xr
 
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.products.product import Options
 
 
-def needs_directions(run: Run, options: Options) -> None:
+def needs_directions(run: OpenRun, options: Options) -> None:
     """Raise ValueError unless the run is a continuation both up and down its parameter."""
     from pipeline.analysis.attractors.matching.hysteresis import check_directions
 
     check_directions(run.cube())
 
 
-def hysteresis(run: Run, options: Options) -> xr.Dataset:
+def hysteresis(run: OpenRun, options: Options) -> xr.Dataset:
     """Compute the hysteresis loops of a run and the jumps between its attractors."""
     from pipeline.analysis.attractors.matching.hysteresis import hysteresis as compute
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import xarray as xr
 
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions
 
 
-def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
+def identified(run: OpenRun, options: IdentifyOptions) -> xr.Dataset:
     """Find the attractors of a run at each parameter point, without ids that connect the points."""
     from pipeline.analysis.attractors.attractors import identify
 
     return identify(run.cube(), options)
 
 
-def attractors(run: Run, options: AttractorOptions) -> xr.Dataset:
+def attractors(run: OpenRun, options: AttractorOptions) -> xr.Dataset:
     """Find the attractors of a run, and give them ids that stay the same along the swept parameters."""
     from pipeline.analysis.attractors.attractors import match
 

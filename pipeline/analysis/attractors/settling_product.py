@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.products.product import Options
 
 VARIABLES = (
@@ -33,7 +33,7 @@ VARIABLES = (
 """Variables of the attractors that the settling table shows."""
 
 
-def settling(run: Run, options: Options) -> xr.Dataset:
+def settling(run: OpenRun, options: Options) -> xr.Dataset:
     """Return the evidence on whether each non-periodic set attracts or is transient."""
     found: xr.Dataset = run.derive("attractors")
     return found[list(VARIABLES)]

@@ -9,8 +9,7 @@ import xarray as xr
 
 from pipeline.analysis.ragged import dims_of
 from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, plain, sets_of, values
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import APERIODIC, model_of
+from pipeline.layout.vocabulary import APERIODIC, model_of, periods_of
 from pipeline.products.product import Table
 
 

@@ -28,8 +28,7 @@ from pipeline.analysis.tabular import (
     with_interval,
     words_of,
 )
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, model_of, split_dims
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims
 from pipeline.products.product import Table
 
 MOST_STATES = 2

@@ -22,7 +22,7 @@ from pipeline.analysis.tabular import (
     summary,
     with_interval,
 )
-from pipeline.layout.attractor_letters import letter
+from pipeline.layout.vocabulary import letter
 from pipeline.products.product import Table
 
 

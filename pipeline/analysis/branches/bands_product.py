@@ -15,7 +15,7 @@ from pipeline.analysis.branches.carrying import ORBIT, Along, OrbitData, Solutio
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.product import settle_branches
 from pipeline.analysis.draws import LEVELS, interval_of
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import aligned, words_of
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
 from pipeline.products.branches import BandOptions, BranchOptions
@@ -26,7 +26,7 @@ DRAWS_FILE = "posterior.nc"
 """Name of the file of draws in the directory of an identification."""
 
 
-def settle_bands(run: Run, options: BandOptions) -> BandOptions:
+def settle_bands(run: OpenRun, options: BandOptions) -> BandOptions:
     """Complete the interval of the branches, and the digest of the draws; raise SpecError if there are none."""
     path = _path(options.posterior)
     try:
@@ -44,7 +44,7 @@ def _path(posterior: str) -> Path:
     return path / DRAWS_FILE if path.is_dir() else path
 
 
-def bands(run: Run, options: BandOptions) -> xr.Dataset:
+def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     """Carry draws of the parameters through the branches of a run.
 
     Returns
@@ -89,7 +89,7 @@ def bands(run: Run, options: BandOptions) -> xr.Dataset:
     )
 
 
-def _draws(run: Run, options: BandOptions) -> xr.Dataset:
+def _draws(run: OpenRun, options: BandOptions) -> xr.Dataset:
     with xr.open_dataset(_path(options.posterior), engine="scipy") as ds:
         drawn = ds.load()
     names = [str(name) for name in drawn["parameter"].values]

@@ -12,7 +12,7 @@ from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.codimension_two import POINT_KINDS, merged
 from pipeline.analysis.branches.curves import CURVE_ENDS, Curve
 from pipeline.analysis.branches.units import parameter_units, state_units
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import model_attribute, section_attributes
 
 

@@ -23,9 +23,8 @@ from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.stuck import stuck_ends
 from pipeline.analysis.branches.units import parameter_units, state_units
-from pipeline.layout.attributes import code_flags
-from pipeline.layout.period_names import period_of, periods_of
-from pipeline.layout.vocabulary import model_attribute, section_attributes
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import model_attribute, period_of, periods_of, section_attributes
 
 CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 
@@ -12,7 +12,7 @@ LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
 
 
-def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
+def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
     """Fill in the parameter interval of the branches from the run's swept axis; raise SpecError if it is empty."""
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
@@ -20,7 +20,7 @@ def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
     return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
 
 
-def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
+def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
     """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
     from pipeline.specification.problems import SpecError
 
@@ -30,7 +30,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
         raise SpecError(f"{run.model.name} has no drive frequency to follow; give --parameter: {known}.")
 
 
-def branches(run: Run, options: BranchOptions) -> xr.Dataset:
+def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
     from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
 
@@ -56,7 +56,7 @@ def _ends(options: BranchOptions) -> tuple[float, float]:
     return options.low, options.high
 
 
-def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
+def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
     """Fill in the parameter interval of the branches; raise SpecError unless the second parameter differs from the
     first.
     """
@@ -74,7 +74,7 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
     return settled
 
 
-def curves(run: Run, options: CurveOptions) -> xr.Dataset:
+def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     """Continue the bifurcations on the branches in the plane of the branches' parameter and a second one."""
     from pipeline.analysis.branches import curves_dataset, curves_from
 
@@ -86,13 +86,13 @@ def curves(run: Run, options: CurveOptions) -> xr.Dataset:
     return curves_dataset(found, axis_name(options.parameter), second, base.model)
 
 
-def swept_axis(run: Run, parameter: str) -> xr.DataArray | None:
+def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:
     """Return the axis of a parameter in the run's result cube; None if the run does not sweep it."""
     axis = run.cube().coords.get(axis_name(parameter))
     return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
 
 
-def interval_of(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
+def interval_of(run: OpenRun, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Return the parameter interval of the branches; its default is the range that the run sweeps."""
     from pipeline.specification.problems import SpecError, unknown_name
 

@@ -17,7 +17,7 @@ from pipeline.analysis.branches.bifurcations import FOLD, KINDS
 from pipeline.analysis.branches.product import interval_of, swept_axis
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.branches.tongues import Row, Search, fractions_of, locked_orbits
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.tabular import Row as TableRow
 from pipeline.analysis.tabular import Words, aligned, counted, number
@@ -36,7 +36,7 @@ ACCURACY = 10.0 * BRANCH_RTOL
 """Least error of a fold, in units of the interval of the parameter: that of the integrations."""
 
 
-def needs_rotation(run: Run, options: TongueOptions) -> None:
+def needs_rotation(run: OpenRun, options: TongueOptions) -> None:
     """Raise ValueError unless the run has rotation numbers and sweeps the parameter along which tongues are
     searched.
     """
@@ -47,7 +47,7 @@ def needs_rotation(run: Run, options: TongueOptions) -> None:
         raise ValueError(f"--parameter {options.parameter}: the run does not sweep it; tongues are searched along it.")
 
 
-def settle_tongues(run: Run, options: TongueOptions) -> TongueOptions:
+def settle_tongues(run: OpenRun, options: TongueOptions) -> TongueOptions:
     """Fill in the parameter, its interval and the row of cells; raise SpecError unless the two parameters differ."""
     from pipeline.specification.problems import SpecError
 
@@ -59,7 +59,7 @@ def settle_tongues(run: Run, options: TongueOptions) -> TongueOptions:
     return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
 
 
-def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
+def tongues(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     """Find orbits with rotation numbers p/q along a row of cells, and continue their folds in the parameter plane."""
     point, base = _row_of(run, options), parameters_of(run.cube())
     first, second = axis_name(options.parameter), axis_name(options.second)
@@ -88,7 +88,7 @@ def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
     return ds.assign(_variables(on_row)).assign_attrs(row=row, max_denominator=options.max_denominator)
 
 
-def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
+def _row_of(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     cube, first = run.cube(), axis_name(options.parameter)
     part = select_points(cube, options.at)
     others = [d for d in map(str, split_dims(part["status"])[0]) if d != first]
@@ -99,7 +99,7 @@ def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
     return part.isel(dict.fromkeys(others, 0))
 
 
-def _turning(run: Run) -> tuple[TurningState, int]:
+def _turning(run: OpenRun) -> tuple[TurningState, int]:
     options: Any = run.spec.products["rotation"]
     names = run.model.state_names
     return TurningState(tuple(map(names.index, options.of)), options.center, options.section), options.n_periods

@@ -13,7 +13,7 @@ from pipeline.analysis.chaos.per_attractor import pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.analysis.selection import select_points
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, split_dims
 from pipeline.products.chaos import DimensionOptions
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import PERIODIC
 from pipeline.products.lyapunov import LyapunovFlag
 

@@ -16,9 +16,9 @@ from pipeline.analysis.branches.starting_orbits import parameters_at
 from pipeline.analysis.branches.units import parameter_units, state_units
 from pipeline.analysis.manifolds.growing import Manifold, Resolution, Saddle, stable_manifold, unstable_manifold
 from pipeline.analysis.manifolds.tangency import first_tangency
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, aligned, counted
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     FREQUENCY_DIM,
     axis_name,
@@ -37,7 +37,7 @@ ENDS = ("length", "most", "generations", "lost")
 SIDES = (1.0, -1.0)
 
 
-def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
+def manifolds(run: OpenRun, options: ManifoldOptions) -> xr.Dataset:
     """Grow the manifolds of the saddle orbits that the analysis ``orbits`` finds."""
     base, found = parameters_of(run.cube()), run.derive("orbits", **options.part(OrbitOptions))
     resolution = Resolution(options.chord, options.length, options.most)
@@ -135,7 +135,7 @@ def manifolds_table(ds: xr.Dataset) -> Table:
 # ---- tangencies --------------------------------------------------------------------------------
 
 
-def needs_tangency(run: Run, options: TangencyOptions) -> None:
+def needs_tangency(run: OpenRun, options: TangencyOptions) -> None:
     """Raise ValueError if tangencies cannot be searched along the chosen parameter from the chosen parameter point."""
     from pipeline.specification.problems import unknown_name
 
@@ -150,7 +150,7 @@ def needs_tangency(run: Run, options: TangencyOptions) -> None:
         raise ValueError(f"{base.model.name} has {n_states} states; tangencies are located for two.")
 
 
-def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
+def tangency(run: OpenRun, options: TangencyOptions) -> xr.Dataset:
     """Locate the parameter value at which each unstable manifold of a saddle orbit first touches a stable one of it,
     for all pairs.
     """

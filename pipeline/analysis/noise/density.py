@@ -13,7 +13,7 @@ from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.status import Status
 from pipeline.analysis.noise.cells import PointCells, cells_at_points, coordinates_of, point_dims
 from pipeline.analysis.noise.escapes import mean_and_spread
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.noise import DensityOptions
 
@@ -90,7 +90,7 @@ def find_density_peaks(
     return smoothed, bins[np.argsort(-smoothed[bins], kind="stable")]
 
 
-def density(run: Run, options: DensityOptions) -> xr.Dataset:
+def density(run: OpenRun, options: DensityOptions) -> xr.Dataset:
     """Compute the density of a state's section points at each parameter point, moments and peaks.
 
     Returns

@@ -15,14 +15,14 @@ from pipeline.analysis.noise.cells import PointCells, cells_at_points, coordinat
 from pipeline.analysis.noise.exits import Exits, find_exits, labels_of
 from pipeline.analysis.noise.passages import find_passages
 from pipeline.analysis.noise.rates import NO_FIT, KramersFit, constancy, fit_kramers, rate_interval
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.noise import EscapeOptions
 
 _IN_AND_OUT = ("inside", "outside")
 
 
-def needs_set(run: Run, options: EscapeOptions) -> None:
+def needs_set(run: OpenRun, options: EscapeOptions) -> None:
     """Raise ValueError unless the options say which set cells leave, in states of the model."""
     model = run.model
     for name, given in (("low", options.low), ("high", options.high), ("centre", options.centre)):
@@ -46,7 +46,7 @@ def needs_set(run: Run, options: EscapeOptions) -> None:
         )
 
 
-def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
+def escapes(run: OpenRun, options: EscapeOptions) -> xr.Dataset:
     """Compute rates of escape, exit places and last stretches at each parameter point.
 
     Returns

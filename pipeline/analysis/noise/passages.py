@@ -10,10 +10,10 @@ from magpend_core.noisy import cell_words, first_passages, noisy_sections
 from magpend_core.status import Status
 from pipeline.analysis.noise.cells import PointCells
 from pipeline.analysis.noise.exits import NOT_LEFT, Exits
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.cells import CellMap, parameter_axes
-from pipeline.motion.inputs import Inputs
 from pipeline.motion.noisy import Noisy
+from pipeline.motion.steady import Inputs
 from pipeline.products.noise import EscapeOptions
 
 
@@ -48,7 +48,7 @@ def region_of(model: Model, options: EscapeOptions, first: np.ndarray) -> Region
     return Region(where, least, most, np.zeros(shape), np.full((len(first), 1), np.inf))
 
 
-def find_passages(run: Run, cells: PointCells, options: EscapeOptions, *, halves: bool = False) -> Exits:
+def find_passages(run: OpenRun, cells: PointCells, options: EscapeOptions, *, halves: bool = False) -> Exits:
     """Find the step in which each cell of a parameter point first leaves its box or ball.
 
     Each path is that of the run. With `halves` it is integrated by halved steps, on the same path of the noise.
@@ -107,7 +107,7 @@ def find_passages(run: Run, cells: PointCells, options: EscapeOptions, *, halves
     )
 
 
-def _inputs_at(run: Run, cells: PointCells) -> Inputs:
+def _inputs_at(run: OpenRun, cells: PointCells) -> Inputs:
     """Return the inputs of the cells of a parameter point."""
     layout = CellMap(run.spec)
     block = {d: slice(0, n) for d, n in zip(layout.dims, layout.shape, strict=True)}

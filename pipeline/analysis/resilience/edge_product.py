@@ -39,17 +39,17 @@ from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.resilience.edge_orbits import orbits_on
 from pipeline.analysis.resilience.edge_tracking import REASONS, Limits, Pair, Tracking, nearest_pairs
 from pipeline.analysis.resilience.product import start_states
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import SAME_EQUILIBRIUM
-from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     BOUNDED_SET,
     EQUILIBRIUM,
     KINDS,
     PERIODIC_ORBIT,
+    letter,
     section_attributes,
     split_dims,
     told_by,
@@ -62,7 +62,7 @@ CANDIDATES = 4
 PURPOSE = "edge states are tracked at one parameter point"
 
 
-def needs_pair(run: Run, options: EdgeOptions) -> None:
+def needs_pair(run: OpenRun, options: EdgeOptions) -> None:
     """Raise ValueError unless the run has independent initial states and the options choose a parameter point."""
     cube = run.cube()
     check_starts(cube)
@@ -77,7 +77,7 @@ def needs_pair(run: Run, options: EdgeOptions) -> None:
         )
 
 
-def settle_edge(run: Run, options: EdgeOptions) -> EdgeOptions:
+def settle_edge(run: OpenRun, options: EdgeOptions) -> EdgeOptions:
     """Replace ids of attractors by their letters, in rising order."""
     first, second = sorted(_letters(options.between), key=lambda name: (len(name), name))
     return options.model_copy(update={"between": (first, second)})
@@ -88,7 +88,7 @@ def _letters(names: tuple[str, str]) -> list[str]:
     return [letter(int(name)) if name.isdigit() else name for name in (n.strip().upper() for n in names)]
 
 
-def edge(run: Run, options: EdgeOptions) -> xr.Dataset:
+def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     """Track the edge states between two attractors at a parameter point."""
     whole = run.derive("attractors")
     cube = select_points(run.cube(), options.at, purpose=PURPOSE)
@@ -152,7 +152,7 @@ def _distinct(pairs: list[Pair], geometry: Geometry, least: float) -> tuple[list
 
 
 def _dataset(
-    run: Run,
+    run: OpenRun,
     there: Destinations,
     between: tuple[int, int],
     pairs: list[Pair],

@@ -40,7 +40,7 @@ from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, rows_at
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, bases_of, search_together
 from pipeline.analysis.resilience.shocks import Found, Settings, ShockSearch, Trials
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import ATTRACTS, grid_dim, section_attributes, split_dims, told_by
 from pipeline.products.resilience import ResilienceOptions
@@ -52,7 +52,7 @@ MOST_SEEDS = 8
 """Cells of other basins that start a search of the distance in any direction, for each base state."""
 
 
-def needs_sweep(run: Run, options: ResilienceOptions) -> None:
+def needs_sweep(run: OpenRun, options: ResilienceOptions) -> None:
     """Raise ValueError unless the run has independent initial states and the options suit it."""
     cube = run.cube()
     check_starts(cube)
@@ -60,12 +60,12 @@ def needs_sweep(run: Run, options: ResilienceOptions) -> None:
     _chosen(run, options)
 
 
-def settle_resilience(run: Run, options: ResilienceOptions) -> ResilienceOptions:
+def settle_resilience(run: OpenRun, options: ResilienceOptions) -> ResilienceOptions:
     """Complete the names of the shocked states."""
     return options.model_copy(update={"states": ",".join(_chosen(run, options))})
 
 
-def _chosen(run: Run, options: ResilienceOptions) -> list[str]:
+def _chosen(run: OpenRun, options: ResilienceOptions) -> list[str]:
     """Return the names of the shocked states: those given, or the rates of other states, or all states."""
     model = run.model
     given = [name.strip() for name in options.states.split(",") if name.strip()]
@@ -77,7 +77,7 @@ def _chosen(run: Run, options: ResilienceOptions) -> list[str]:
     return [name for name in model.state_names if name in wanted]
 
 
-def resilience(run: Run, options: ResilienceOptions) -> xr.Dataset:
+def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
     """Measure the response of the attractors at each parameter point to shocks."""
     whole = run.derive("attractors")
     cube, attractors = select_points(run.cube(), options.at), select_points(whole, options.at)
@@ -108,7 +108,7 @@ def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> np.ndarray:
 class _Point:
     """The attractors of one parameter point, with what is asked of them."""
 
-    def __init__(self, there: Destinations, options: ResilienceOptions, run: Run) -> None:
+    def __init__(self, there: Destinations, options: ResilienceOptions, run: OpenRun) -> None:
         self._there, self._options = there, options
         names = list(run.model.state_names)
         self._which = np.array([names.index(name) for name in _chosen(run, options)])
@@ -178,7 +178,7 @@ _SEARCHED: dict[str, tuple[str, float, str]] = {
 class _Result:
     """Arrays of the result, filled point by point."""
 
-    def __init__(self, run: Run, options: ResilienceOptions, attractors: xr.Dataset) -> None:
+    def __init__(self, run: OpenRun, options: ResilienceOptions, attractors: xr.Dataset) -> None:
         self._run, self._options, self._attractors = run, options, attractors
         number = attractors["attractor"].values.tolist()
         self._rows = {at: {number[row]: row for row in rows} for at, rows in rows_at(attractors).items()}

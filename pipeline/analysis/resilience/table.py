@@ -21,9 +21,7 @@ from pipeline.analysis.tabular import (
     summary,
     values,
 )
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import ATTRACTS, model_of
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, periods_of
 from pipeline.products.product import Table
 
 _ENDS = {-1: "-", DIVERGED: "diverges", -3: "elsewhere"}

@@ -9,7 +9,7 @@ import numpy as np
 
 from magpend_core import Status
 from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tipping.endings import NONE, Final, Group, endings, finals_of
 from pipeline.layout.cells import initial_states
 from pipeline.motion.drifting import Drifting
@@ -102,7 +102,7 @@ class Bisection:
 
     def __init__(
         self,
-        run: Run,
+        run: OpenRun,
         axis: str,
         others: tuple[str, ...],
         groups: list[Group],
@@ -183,7 +183,7 @@ def _examples(group: Group, ids: dict[int, int]) -> tuple[np.ndarray, np.ndarray
     return np.concatenate(states), np.array(labels, np.int64)
 
 
-def drifted(run: Run, packed: np.ndarray, frequency_hz: np.ndarray, starts: np.ndarray) -> Sections:
+def drifted(run: OpenRun, packed: np.ndarray, frequency_hz: np.ndarray, starts: np.ndarray) -> Sections:
     """Integrate cells of a run over its whole length, with other parameters; only the last section is kept."""
     motion, integration = run.spec.motion, run.spec.integration
     assert isinstance(motion, Drifting)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.analysis.tipping.critical import Bisection, Bracket, brackets_of
 from pipeline.analysis.tipping.endings import NONE, Group, endings, ends_s, finals_of
@@ -17,7 +17,7 @@ from pipeline.products.tipping import TippingOptions
 from pipeline.specification.tables import FREQUENCY
 
 
-def needs_drift(run: Run, options: TippingOptions) -> None:
+def needs_drift(run: OpenRun, options: TippingOptions) -> None:
     """Raise ValueError unless the run's parameters come to rest before it ends."""
     spec = run.spec
     total = spec.integration.n_transient + spec.integration.n_keep
@@ -33,7 +33,7 @@ def needs_drift(run: Run, options: TippingOptions) -> None:
         raise ValueError(f"{options.parameter} is not an axis of this run; its axes: {', '.join(spec.axes)}.")
 
 
-def tipping(run: Run, options: TippingOptions) -> xr.Dataset:
+def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     """Find the attractor that each cell reaches after the drift, and bisect the values at which it changes."""
     cube, model = run.cube(), run.spec.model
     dims, starts = split_dims(cube["status"])
@@ -69,19 +69,19 @@ def tipping(run: Run, options: TippingOptions) -> xr.Dataset:
     return result.assign_attrs(attrs)
 
 
-def _unit(run: Run, axis: str) -> str:
+def _unit(run: OpenRun, axis: str) -> str:
     """Return the unit of a swept number."""
     return "Hz" if axis == FREQUENCY else run.spec.model.parameter(axis).unit
 
 
-def _cells(run: Run) -> tuple[np.ndarray, np.ndarray]:
+def _cells(run: OpenRun) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters and frequencies of all cells, in the order of the cube."""
     cells = CellMap(run.spec)
     inputs = cells.inputs(tuple(slice(0, n) for n in cells.shape))
     return inputs.parameters[:, 0], inputs.frequency_hz[:, 0]
 
 
-def _others(run: Run, axis: str) -> tuple[str, ...]:
+def _others(run: OpenRun, axis: str) -> tuple[str, ...]:
     return tuple(name for name in run.spec.axes if name != axis)
 
 
@@ -130,7 +130,7 @@ def _sentence(group: Group, groups: list[Group]) -> str:
     return ", ".join(parts)
 
 
-def _brackets(run: Run, axis: str, outcome: np.ndarray, dims: tuple[str, ...]) -> list[Bracket]:
+def _brackets(run: OpenRun, axis: str, outcome: np.ndarray, dims: tuple[str, ...]) -> list[Bracket]:
     """Return the intervals of the swept number in which cells change their attractor."""
     at = [parameter_name(d) for d in dims].index(axis)
     values = run.spec.axes[axis].array()

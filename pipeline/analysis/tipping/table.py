@@ -10,8 +10,7 @@ import xarray as xr
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tabular import Row, aligned, counted, plain, unit_of
 from pipeline.analysis.tipping.endings import NONE
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import axis_name, split_dims
+from pipeline.layout.vocabulary import axis_name, letter, split_dims
 from pipeline.products.product import Table
 
 MOST_VALUES = 40

@@ -26,8 +26,7 @@ import xarray as xr
 from magpend_core.models import load_model
 from magpend_core.models.imported import is_object_path
 from magpend_core.versions import ENGINE
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import canonical, differences, digest_of
+from pipeline.layout.identity import canonical, differences, digest_of, numbered
 from pipeline.layout.writing import sync_folder, write_atomically
 from pipeline.rig.identify.measured_orbits import MeasuredTable, stored_table
 from pipeline.rig.identify.specification import IdentificationSpec

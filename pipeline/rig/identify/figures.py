@@ -20,7 +20,7 @@ from scipy.interpolate import PchipInterpolator
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.plots.files import save_data, save_figure
+from pipeline.plots.figure import save_data, save_figure
 from pipeline.rig.identify.statistics import LEVEL, pooled_autocorrelation
 from pipeline.rig.measured.branch_figure import plot_branch
 

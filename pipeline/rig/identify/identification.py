@@ -36,7 +36,7 @@ from pipeline.rig.identify.statistics import (
     n_effective,
 )
 from pipeline.runs.stopping import stoppable
-from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.specification.files import default_directory, find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.files import FIGURES, local_path
 from pipeline.store.local import make_folder, refuse_links, writer_lock

@@ -44,12 +44,12 @@ from pipeline.rig.identify.orbit_residuals import orbit_rows
 from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.specification import load_identification
 from pipeline.rig.identify.statistics import Linearised, linearise, loss_scale_of, root_of
-from pipeline.runs.workflows import find_spec
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.files import find_spec
+from pipeline.specification.problems import SpecError, import_extra
 from pipeline.store.errors import DamagedError
 
 # ---- density ---------------------------------------------------------------------------------------
+pass
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from pipeline.analysis.branches.bands import bifurcation_data, carried, orbit_da
 from pipeline.analysis.branches.carrying import ORBIT, OrbitData, Solution, solve
 from pipeline.analysis.draws import LEVELS, interval_of, stretches
 from pipeline.layout.writing import write_netcdf
-from pipeline.plots.files import save_data, save_figure
+from pipeline.plots.figure import save_data, save_figure
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result, stored_tables
 from pipeline.rig.identify.measured_orbits import MeasuredTable

@@ -23,10 +23,10 @@ from pipeline.rig.identify.directory import read_result
 from pipeline.rig.identify.posterior import kept_draws
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
-from pipeline.runs.workflows import find_spec, read_given
-from pipeline.specification.files import read_toml
+from pipeline.specification.files import find_spec, read_toml
 from pipeline.specification.models import is_model_file
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import local_path
 
@@ -57,7 +57,7 @@ def run_posterior(
     `RefusedError` if the folder holds the runs of another specification or posterior.
     """
     path, result = find_spec(spec), read_result(identification)
-    parsed, _, default = read_given(path, smoke=smoke)
+    parsed = Spec.read(path, smoke=smoke)
     names = [name for name in result["names"] if name in result["values"]] + list(result["tied"])
     _refuse_other_model(parsed.model.reference, result, list(parsed.axes), names)
     drawn = kept_draws(identification, n, seed)
@@ -65,7 +65,7 @@ def run_posterior(
     if isinstance(tables.get("model"), str) and is_model_file(tables["model"]):
         tables["model"] = str((path.parent / tables["model"]).resolve())
     values = drawn["value"].sel(parameter=names).values
-    folder = local_path(out) if out is not None else default.with_name(f"{default.name}-posterior")
+    folder = local_path(out) if out is not None else parsed.directory.with_name(f"{parsed.directory.name}-posterior")
     _establish(folder, tables, values, names, smoke)
     places = [BEST, *(f"draw-{k:04d}" for k in range(n))]
     sets = [np.array([result["values"][name] for name in names]), *values]

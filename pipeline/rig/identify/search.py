@@ -20,7 +20,7 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.local import Echo, Fit, choose_phases, fit_local, fit_starts
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.specification.extras import import_extra
+from pipeline.specification.problems import import_extra
 
 Array = NDArray[np.float64]
 

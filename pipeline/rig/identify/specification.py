@@ -24,9 +24,8 @@ from magpend_core.models.parameters import (
     unknown_name_problem,
 )
 from magpend_core.models.presets import is_file
-from pipeline.specification.files import read_toml
+from pipeline.specification.files import IDENTIFICATION, read_toml
 from pipeline.specification.models import add_model
-from pipeline.specification.parsing import IDENTIFICATION
 from pipeline.specification.problems import SpecError, checked, table_at, unknown_choice, unknown_key
 from pipeline.specification.section import SectionTable
 from pipeline.specification.tables import Table

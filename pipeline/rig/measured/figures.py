@@ -17,13 +17,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from magpend_core.models.model import Model
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM, letter, model_of
 from pipeline.layout.writing import write_atomically
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.files import save_data, save_figure
-from pipeline.plots.motions import Motions, motions_of
+from pipeline.plots.figure import save_data, save_figure
+from pipeline.plots.palette import Motions, motions_of
 from pipeline.plots.style import WIDE, Frame
 from pipeline.rig.measured.comparison import edges_table
 from pipeline.rig.measured.computed import Computed

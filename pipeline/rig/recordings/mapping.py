@@ -12,11 +12,10 @@ from pydantic import BaseModel, Field, model_validator
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from pipeline.rig.recordings import units
-from pipeline.specification.files import read_toml
-from pipeline.specification.models import KEPT, add_model, kept_reference, model_toml
+from pipeline.specification.files import model_toml, read_toml, toml_key, toml_value
+from pipeline.specification.models import KEPT, add_model, kept_reference
 from pipeline.specification.problems import SpecError, checked, unknown_key
 from pipeline.specification.tables import Table
-from pipeline.specification.toml import toml_key, toml_value
 
 DRIVE = "drive"
 """Name of the drive in a recording's dataset."""

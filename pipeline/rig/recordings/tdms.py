@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 
 SIMULATED = "simulated"
 """Property of a file with simulated readings."""

@@ -17,9 +17,9 @@ from pipeline.rig.recordings.channels import Channel, Raw
 from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
 from pipeline.rig.recordings.tdms import SIMULATED
-from pipeline.specification.extras import import_extra
 from pipeline.specification.files import check_new_file
 from pipeline.specification.models import kept_reference
+from pipeline.specification.problems import import_extra
 
 SUFFIXES = (".tdms", ".csv", ".nc")
 GROUP = "recording"

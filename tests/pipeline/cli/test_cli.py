@@ -16,11 +16,12 @@ from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.plots import bifurcation
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
-from pipeline.runs import preview, workflows
+from pipeline.runs import preview
 from pipeline.runs.preview import figure_command, first_figure
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification import files as workflows
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 
 
 @pytest.mark.slow
@@ -117,7 +118,7 @@ def sweep_of(axes, **tables):
     """A sweep over so many values of each axis: its plan and specification."""
     values = {name: {"values": [1.5 + i for i in range(n)]} for name, n in axes.items()}
     parameters = {} if "frequency_hz" in axes else {"frequency_hz": 2.2}
-    spec = parse_spec({"kind": "sweep", "parameters": parameters, "axes": values, **tables})
+    spec = Spec.parse({"kind": "sweep", "parameters": parameters, "axes": values, **tables})
     return SimpleNamespace(spec=spec, plan=make_plan(spec), name="run")
 
 
@@ -178,7 +179,7 @@ def test_hint_after_a_run__is_a_figure_that_the_run_can_draw(main, tables, hint,
         workers=0,
         echo=lambda _: None,
     )
-    command = figure_command(Run.open("run"))
+    command = figure_command(RunDirectory.open("run"))
     assert command == f"magpend plot {hint}"
     code, _, err = main(*command.split()[1:])
     assert code == 0, err

@@ -9,7 +9,7 @@ import tomllib
 import pytest
 
 from pipeline.runs.modelling import TEMPLATE
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.spec import Spec
 
 
 @pytest.mark.slow
@@ -46,7 +46,7 @@ def test_template__every_line_that_is_offered_can_be_taken(tmp_path):
     path = tmp_path / "whole.toml"
     # a state more has an equation more: those two come together
     path.write_text("\n".join(whole))
-    spec = load_spec(path)
+    spec = Spec.read(path)
     assert spec.model.state_names == ("x", "v", "th")
     assert spec.model.drawing is not None
     assert spec.model.classifier is not None

@@ -11,7 +11,7 @@ import pytest
 
 from magpend_core.models.text.grammar import FUNCTIONS
 from magpend_core.models.text.reading import KEYS
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "own-system.md").read_text("utf-8")
@@ -69,4 +69,4 @@ def test_own_system__section_without_a_drive_fits():
     data = tomllib.loads(block("file: mine.toml", "toml") + "\n" + section)
     data["model"]["equations"]["v"] = "(1 - x**2)*v - x"
     del data["parameters"], data["model"]["define"], data["smoke"]
-    assert parse_spec(data).section is not None
+    assert Spec.parse(data).section is not None

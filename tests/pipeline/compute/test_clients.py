@@ -16,8 +16,7 @@ from pipeline.compute.clients import Where, connected
 from pipeline.compute.jobqueue import settings
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import run
-from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import load_cluster
+from pipeline.specification.clusters import SYSTEMS, load_cluster
 
 SPEC = """
 kind = "sweep"

@@ -9,8 +9,8 @@ from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
 from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag
 from pipeline.runs.run import run
-from pipeline.specification.parsing import load_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 
 SPEC = """
 kind = "sweep"
@@ -101,7 +101,7 @@ def test_lyapunov__pending_cells_have_none(tmp_path):
     from pipeline.store.setup import create
 
     (tmp_path / "spec.toml").write_text(SPEC)
-    spec = load_spec(tmp_path / "spec.toml")
+    spec = Spec.read(tmp_path / "spec.toml")
     plan = make_plan(spec)
     create(tmp_path / "run", spec, plan, identity_of(spec, plan), SPEC)
     found = open_run(tmp_path / "run")
@@ -111,9 +111,9 @@ def test_lyapunov__pending_cells_have_none(tmp_path):
 
 def test_lyapunov__without_the_product_there_is_no_variable(tmp_path):
     (tmp_path / "spec.toml").write_text(SPEC[: SPEC.index("[products]")])
-    plan = make_plan(load_spec(tmp_path / "spec.toml"))
+    plan = make_plan(Spec.read(tmp_path / "spec.toml"))
     (tmp_path / "spec.toml").write_text(SPEC)
-    whole = make_plan(load_spec(tmp_path / "spec.toml"))
+    whole = make_plan(Spec.read(tmp_path / "spec.toml"))
     assert "lyapunov" not in [v.name for v in plan.variables]
     # 260 more periods at twice the cost of the 304
     assert whole.core_seconds / plan.core_seconds == pytest.approx(1.0 + 2.0 * 260 / 304)
@@ -173,4 +173,4 @@ def test_products__mistakes_are_named(tmp_path, old, new, words):
     head, products = SPEC.split("[products]")
     (tmp_path / "spec.toml").write_text(head + "[products]" + products.replace(old, new))
     with pytest.raises(SpecError, match=words):
-        load_spec(tmp_path / "spec.toml")
+        Spec.read(tmp_path / "spec.toml")

@@ -25,8 +25,8 @@ from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import REFINEMENT, base_variables
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 
 VARIABLES = base_variables(load_model())
 
@@ -315,7 +315,7 @@ def test_compute__one_and_four_grid_dims(lengths):
     ]
     head, tail = RUN.split("psi1 =")[0], RUN[RUN.index("[integration]") :]
     text = "\n".join([head, *ranges, tail])
-    spec, full = (parse_spec(tomllib.loads(t)) for t in (text, text.replace("refine = 4\n", "")))
+    spec, full = (Spec.parse(tomllib.loads(t)) for t in (text, text.replace("refine = 4\n", "")))
     plan = make_plan(spec)
     assert plan.shape == (2, *lengths)
     block = plan.task(0)
@@ -349,7 +349,7 @@ def refined_text(shape, stride, extra=""):
 )
 def test_make_plan__tiles(shape, stride, wanted):
     extra = "" if wanted is None else f"[execution]\ntrajectories_per_task = {wanted}\n"
-    plan = make_plan(parse_spec(tomllib.loads(refined_text(shape, stride, extra))))
+    plan = make_plan(Spec.parse(tomllib.loads(refined_text(shape, stride, extra))))
     assert plan.block[0] == 1
     for side, n in zip(plan.block[1:], shape, strict=True):
         assert side == n or side % stride == 0
@@ -362,7 +362,7 @@ def test_make_plan__tiles(shape, stride, wanted):
 
 
 def test_make_plan__near_square_tiles_of_enough_lattice_cells():
-    plan = make_plan(parse_spec(tomllib.loads(refined_text((400, 400), 8))))
+    plan = make_plan(Spec.parse(tomllib.loads(refined_text((400, 400), 8))))
     assert plan.block[1] == plan.block[2]
     assert plan.block[1] % 8 == 0
     assert plan.cells_in(0) >= 0.9 * 64 * 8**2
@@ -372,8 +372,8 @@ def test_identity__refinement_counts():
     text = refined_text((32, 32), 8)
     found = {}
     for change in ("refine = 8\n", "refine = 4\n", ""):
-        spec = parse_spec(tomllib.loads(text.replace("refine = 8\n", change)))
-        assert parse_spec(spec.as_dict()) == spec
+        spec = Spec.parse(tomllib.loads(text.replace("refine = 8\n", change)))
+        assert Spec.parse(spec.as_dict()) == spec
         found[change] = identity_of(spec, make_plan(spec))
     assert found["refine = 8\n"]["refinement"] == REFINEMENT
     assert "refinement" not in found[""]
@@ -406,7 +406,7 @@ def test_parse_spec__refine_problems(change, path, remedy):
     if any(word in text for word in ('"list"', '"random"', "fixed")):
         text = "\n".join(line for line in text.splitlines() if not line.startswith("psi"))
     with pytest.raises(SpecError) as caught:
-        parse_spec(tomllib.loads(text))
+        Spec.parse(tomllib.loads(text))
     (problem,) = caught.value.problems
     assert problem.startswith(path)
     assert remedy in problem

@@ -9,8 +9,8 @@ from matplotlib.text import Text
 from magpend_core import load_preset, run_branches
 from pipeline.compute.simulate import simulate
 from pipeline.plots import plot_trajectory
-from pipeline.specification.drive_files import load_drive
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import load_drive
 
 HZ, START = 2.2, (0.3, -0.1, 0.0, 0.0)
 DUTY = load_preset().as_dict()["duty_cycle"]

@@ -13,7 +13,7 @@ from pipeline import open_run
 from pipeline.layout.plan import make_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import marker_key
 
 DUFFING = """
@@ -224,7 +224,7 @@ def test_walk__needs_the_task_before(write_spec, tmp_path):
 @pytest.mark.parametrize("axes", [FREQUENCIES, f"amplitude = {{ values = [0.2, 0.3] }}\n{FREQUENCIES}"])
 @pytest.mark.parametrize("cut", [1, 2, 3, 7])
 def test_predecessor__walks_from_end_to_end(direction, axes, cut):
-    plan = make_plan(parse_spec(tomllib.loads(duffing(axes, direction=direction, cut=cut))))
+    plan = make_plan(Spec.parse(tomllib.loads(duffing(axes, direction=direction, cut=cut))))
     path, n_chains = plan.path, 0
     for index in range(plan.n_tasks):
         block, before = plan.task(index), plan.predecessor(index)
@@ -248,7 +248,7 @@ SEEDS = [1, 2, 7, 16, 17, 24, 32, 37, 48, 100, 101, 640]
 @pytest.mark.parametrize("n", SEEDS)
 def test_make_plan__directions_apart(n):
     text = duffing().replace("n = 4", f"n = {n}").replace("trajectories_per_task = 4", "")
-    plan = make_plan(parse_spec(tomllib.loads(text)))
+    plan = make_plan(Spec.parse(tomllib.loads(text)))
     for index in range(plan.n_tasks):
         branches = plan.task(index)[-1]
         assert branches.stop <= n or branches.start >= n
@@ -262,7 +262,7 @@ def test_make_plan__tasks_of_some_seconds(axis, n, n_keep):
     axes = f"frequency_hz = {{ {axis} }}"
     text = duffing(axes).replace("n = 4", f"n = {n}").replace("trajectories_per_task = 4", "")
     text = text.replace("n_keep = 5", f"n_keep = {n_keep}").replace("n_transient = 12", "n_transient = 300")
-    spec = parse_spec(tomllib.loads(text))
+    spec = Spec.parse(tomllib.loads(text))
     plan = make_plan(spec)
     seconds = [plan.seconds(index) for index in range(plan.n_tasks)]
     # a single point of so many branches may take longer

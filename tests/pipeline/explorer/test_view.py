@@ -14,25 +14,25 @@ from scipy.integrate import solve_ivp
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
 from pipeline.analysis.ragged import dense
+from pipeline.explorer import RequestError
 from pipeline.explorer.data import diagram as diagrams
 from pipeline.explorer.data import tables
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import cell_of, linearise, orbit
 from pipeline.explorer.data.colours import NONE
 from pipeline.explorer.data.diagram import diagram
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import SAMPLES, cell_of, linearise, orbit
 from pipeline.explorer.data.overlays import attractors, branches, curves
-from pipeline.explorer.data.plain_text import plain
 from pipeline.explorer.data.planes import plane
-from pipeline.explorer.data.series import SAMPLES
 from pipeline.explorer.data.tables import table
+from pipeline.explorer.data.verticals import plain
 from pipeline.explorer.data.view import describe_view
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import load_spec
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create
 from tests.pipeline.explorer.small_runs import FLOW, finished
 
@@ -140,7 +140,7 @@ def test_describe_view__reads_what_is_computed_later(walk):
     derive(walk, "settling")
     assert explored.refreshed() is not explored
     # whoever holds an opened run may hand it over; an explored one is taken as it is
-    opened = Run.open(walk)
+    opened = RunDirectory.open(walk)
     assert ExploredRun.of(ExploredRun.of(opened)).digest == opened.digest
     assert ExploredRun.of(explored) is explored
 
@@ -220,7 +220,7 @@ def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkey
     own = whole["y"][whole["first"][k] : whole["first"][k + 1]]
     np.testing.assert_array_equal(part["y"][part["first"][k] : part["first"][k + 1]], own[-5:])
     monkeypatch.setattr(diagrams, "MOST_POINTS", 71)
-    with pytest.raises(ExplorerError, match="71 cells at most"):
+    with pytest.raises(RequestError, match="71 cells at most"):
         diagram(explored, "amplitude", "x", {"frequency": 0})
 
 
@@ -369,7 +369,7 @@ def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
 
 
 def test_orbit__of_a_pending_cell_is_refused(made_run):
-    with pytest.raises(ExplorerError, match="not computed yet"):
+    with pytest.raises(RequestError, match="not computed yet"):
         orbit(ExploredRun.of(made_run.directory), 0, 0)
 
 
@@ -383,7 +383,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
         "[integration]\nn_transient = 5\nn_keep = 3\n"
     )
     (tmp_path / "spec.toml").write_text(text, "utf-8")
-    spec = load_spec(tmp_path / "spec.toml")
+    spec = Spec.read(tmp_path / "spec.toml")
     plan = make_plan(spec)
     create(tmp_path / "run", spec, plan, identity_of(spec, plan), text)
     explored = ExploredRun.of(tmp_path / "run")
@@ -392,7 +392,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
     assert [v["name"] for v in view["verticals"]] == list(explored.model.state_names)
     arrays, _ = unpack_arrays(diagram(explored, "q", view["verticals"][0]["name"], {}))
     assert len(arrays["cell"]) == 2
-    with pytest.raises(ExplorerError, match="recording"):
+    with pytest.raises(RequestError, match="recording"):
         orbit(explored, 0, 0)
 
 

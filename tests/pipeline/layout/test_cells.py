@@ -11,7 +11,7 @@ import pytest
 from magpend_core import load_preset
 from pipeline.layout.cells import CellMap, coordinates, initial_states
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 
 NAMES = load_preset().names
 
@@ -21,7 +21,7 @@ def whole(shape):
 
 
 def test_inputs__sweep_cell_by_cell(sweep_text):
-    spec = parse_spec(tomllib.loads(sweep_text))
+    spec = Spec.parse(tomllib.loads(sweep_text))
     cells = CellMap(spec)
     assert cells.dims == ("frequency", "q", "psi1_0", "psi2_0")
     coords = {c.name: c.values for c in coordinates(spec)}
@@ -38,7 +38,7 @@ def test_inputs__sweep_cell_by_cell(sweep_text):
 
 
 def test_inputs__branches_walk_up_and_down(walk_text):
-    spec = parse_spec(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
+    spec = Spec.parse(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
     cells = CellMap(spec)
     assert cells.dims == ("q", "frequency", "branch")
     assert cells.shape == (2, 6, 10)
@@ -55,7 +55,7 @@ def test_inputs__branches_walk_up_and_down(walk_text):
 def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
     axis = "frequency_hz = { start = 2.0, stop = 2.5, num = 6 }"
     axes = f"{axis}\n{extra}" if first else f"{extra}\n{axis}"
-    spec = parse_spec(tomllib.loads(walk_text.replace(axis, axes)))
+    spec = Spec.parse(tomllib.loads(walk_text.replace(axis, axes)))
     cells = CellMap(spec)
     coords = {c.name: c.values for c in coordinates(spec)}
     q = coords.get("q", np.array([load_preset()["q"]]))
@@ -70,8 +70,8 @@ def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
 
 
 def test_initial_states__samples_do_not_depend_on_what_is_fixed(walk_text):
-    free = parse_spec(tomllib.loads(walk_text)).initial_conditions
-    fixed = parse_spec(tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))).initial_conditions
+    free = Spec.parse(tomllib.loads(walk_text)).initial_conditions
+    fixed = Spec.parse(tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))).initial_conditions
     rows = np.arange(5)
     assert (initial_states(free).at(rows)[:, 1] == initial_states(fixed).at(rows)[:, 1]).all()
     assert (np.abs(initial_states(free).at(rows)[:, :2]) <= np.deg2rad(40)).all()
@@ -86,7 +86,7 @@ def test_coordinates__fixed_frequency_and_single_cell():
     kind = "grid"
     psi1 = 0.1
     """
-    spec = parse_spec(tomllib.loads(text))
+    spec = Spec.parse(tomllib.loads(text))
     cells = CellMap(spec)
     assert cells.shape == ()
     inputs = cells.inputs(())

@@ -7,11 +7,10 @@ from collections import namedtuple
 
 import pytest
 
-from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space
-from pipeline.layout.plan import MOST_TASKS, make_plan
+from pipeline.layout.plan import MOST_CHUNK_BYTES, MOST_TASKS, check_plan, check_space, make_plan
 from pipeline.runs.preview import describe_plan
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import read_commits
 from pipeline.store.runfile import read_run
 from tests.pipeline.factories import duffing, quietly
@@ -25,7 +24,7 @@ def text_of(points=3, starts=2, keep=3, execution=""):
 
 
 def plan_of(**sizes):
-    return make_plan(parse_spec(tomllib.loads(text_of(**sizes))))
+    return make_plan(Spec.parse(tomllib.loads(text_of(**sizes))))
 
 
 def refused(call):
@@ -107,7 +106,7 @@ def test_check_plan__branches_whose_starts_fill_the_memory():
         "axes": {"frequency_hz": {"values": [0.1, 0.2]}},
         "initial_conditions": {"kind": "grid", **{s: {"start": 0.0, "stop": 1.0, "num": 100_000} for s in ("x", "v")}},
     }
-    assert "the limit is 10000000" in refused(lambda: check_plan(make_plan(parse_spec(data))))
+    assert "the limit is 10000000" in refused(lambda: check_plan(make_plan(Spec.parse(data))))
 
 
 Usage = namedtuple("Usage", "total used free")

@@ -17,7 +17,7 @@ from pipeline.layout import plan as planning
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import base_variables, sizes_of
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 
 VARIABLES = base_variables(load_model())
 
@@ -68,7 +68,7 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
 @pytest.mark.parametrize("wanted", [1, 2, 4, 5, 8, 24])
 def test_make_plan__no_task_walks_both_ways(walk_text, n_seeds, wanted):
     text = walk_text.replace("n = 5", f"n = {n_seeds}").replace("task = 2", f"task = {wanted}")
-    plan = make_plan(parse_spec(tomllib.loads(text)))
+    plan = make_plan(Spec.parse(tomllib.loads(text)))
     assert plan.shape[-1] == 2 * n_seeds
     for block in plan.tasks():
         assert block[-1].start // n_seeds == (block[-1].stop - 1) // n_seeds
@@ -77,7 +77,7 @@ def test_make_plan__no_task_walks_both_ways(walk_text, n_seeds, wanted):
 def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
     import os
 
-    spec = parse_spec(tomllib.loads(sweep_text))
+    spec = Spec.parse(tomllib.loads(sweep_text))
     plan = make_plan(spec)
     monkeypatch.setattr(os, "cpu_count", lambda: 97)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(97)), raising=False)
@@ -85,14 +85,14 @@ def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
 
 
 def test_task__out_of_range(sweep_text):
-    plan = make_plan(parse_spec(tomllib.loads(sweep_text)))
+    plan = make_plan(Spec.parse(tomllib.loads(sweep_text)))
     with pytest.raises(IndexError, match="does not exist"):
         plan.task(plan.n_tasks)
 
 
 def test_identity__what_counts(sweep_text):
     def digest(text):
-        spec = parse_spec(tomllib.loads(text))
+        spec = Spec.parse(tomllib.loads(text))
         return digest_of(identity_of(spec, make_plan(spec)))
 
     same = digest(sweep_text)
@@ -114,7 +114,7 @@ def test_digest_of__numbers_without_loss():
 
 def test_identity__other_starts_under_the_same_specification(sweep_text, monkeypatch):
     """Another version of what makes numbers of a specification is another run."""
-    spec = parse_spec(tomllib.loads(sweep_text))
+    spec = Spec.parse(tomllib.loads(sweep_text))
     before = identity_of(spec, make_plan(spec))
     original = identity.coordinates
 
@@ -131,8 +131,8 @@ def test_identity__other_starts_under_the_same_specification(sweep_text, monkeyp
 
 def test_identity__versions_of_what_is_computed(sweep_text):
     """A product that a run does not ask for bars nobody from completing it."""
-    plain = parse_spec(tomllib.loads(sweep_text))
-    spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
+    plain = Spec.parse(tomllib.loads(sweep_text))
+    spectra = Spec.parse(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
     assert set(identity.versions_of(plain)) == {"engine", "cells"}
     assert set(identity.versions_of(spectra)) == {"engine", "cells", "lyapunov"}
     lines = differences(*(identity_of(s, make_plan(s)) for s in (plain, spectra)))

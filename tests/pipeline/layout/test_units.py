@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from magpend_core import load_model, model_names
-from pipeline.layout.units import readable_unit, unit_remarks
+from pipeline.layout.conventions import readable_unit, unit_remarks
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.slow

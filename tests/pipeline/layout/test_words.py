@@ -8,12 +8,19 @@ import xarray as xr
 from magpend_core import load_model
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
-from pipeline.layout.conventions import conventional
-from pipeline.layout.period_names import once, period_of, section_name
-from pipeline.layout.units import readable_unit, shown_unit, unit_remarks
-from pipeline.layout.vocabulary import frequency_of, model_attribute, model_of, section_attributes, told_by
+from pipeline.layout.conventions import conventional, readable_unit, shown_unit, unit_remarks
+from pipeline.layout.vocabulary import (
+    frequency_of,
+    model_attribute,
+    model_of,
+    once,
+    period_of,
+    section_attributes,
+    section_name,
+    told_by,
+)
 from pipeline.plots.section import section_pair
-from pipeline.specification.inputs import load_model as load_given
+from pipeline.specification.models import load_model as load_given
 from tests.core.flows import ROSSLER, VAN_DER_POL, flow
 
 

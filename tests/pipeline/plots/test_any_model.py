@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pipeline.plots
-from pipeline.layout.attractor_letters import letter
+from pipeline.layout.vocabulary import letter
 from pipeline.plots import Frame, plot_basins, plot_coexisting, plot_fractions, plot_gallery
 from pipeline.plots.labels import with_unit
 from tests.pipeline.analysis.dense_sets import rows_of

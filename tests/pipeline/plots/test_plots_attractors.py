@@ -25,8 +25,7 @@ from pipeline.analysis.branches.table import curves_table
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.layout import vocabulary
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS, letter
 from pipeline.plots import palette, plot_basins, plot_coexisting, plot_curves, plot_fractions, plot_gallery, save_figure
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import (

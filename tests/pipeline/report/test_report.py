@@ -13,10 +13,10 @@ import pytest
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS
-from pipeline.report.stored import stored_options
+from pipeline.report.report import stored_options
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 pytestmark = pytest.mark.slow
 
@@ -77,7 +77,7 @@ def test_report__of_a_sweep(folder, command):
     html = written(command, folder, "run")
     assert "<script" not in html
     assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; friends" in html
-    run = Run.open(folder / "run")
+    run = RunDirectory.open(folder / "run")
     assert run.digest in html
     found = dense(derive(run, "attractors"), points=True)
     rows = re.findall(r"<tr><td>([A-Z])</td>(.*?)</tr>", html)
@@ -128,7 +128,7 @@ def test_report__its_commands_work(folder, command):
 
 
 def test_stored_options__of_these_cells(folder):
-    run = Run.open(folder / "run")
+    run = RunDirectory.open(folder / "run")
     derive(run, "attractors")
     derive(run, "attractors", {"n_points": 8})
     assert stored_options(run, "attractors") == [{}, {"n_points": 8}]
@@ -137,4 +137,4 @@ def test_stored_options__of_these_cells(folder):
     (folder / "other.toml").write_text(SWEEP.replace("n_transient = 200", "n_transient = 210"))
     run_spec(folder / "other.toml", folder / "other", workers=0, echo=lambda _: None)
     shutil.copytree(folder / "run" / "derived", folder / "other" / "derived")
-    assert stored_options(Run.open(folder / "other"), "attractors") == []
+    assert stored_options(RunDirectory.open(folder / "other"), "attractors") == []

@@ -10,8 +10,8 @@ from magpend_core.models import load_model
 from pipeline.compute.simulate import simulate
 from pipeline.rig.drive_file import drive_file
 from pipeline.rig.recordings import read_recording
-from pipeline.specification.drive_files import load_drive, parse_drive
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import load_drive, parse_drive
 
 RIG = """
 model = "pendulum"

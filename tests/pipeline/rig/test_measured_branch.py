@@ -11,7 +11,7 @@ from pipeline.rig.measured.branch import CyclesError, branch_table, compare, cyc
 from pipeline.rig.measured.branch_computed import amplitudes
 from pipeline.rig.measured.branch_figure import plot_branch
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from pipeline.specification.problems import SpecError
 
 LINEAR = """

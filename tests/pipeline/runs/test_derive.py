@@ -20,7 +20,7 @@ from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
 from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 QUICK = {"polish": False, "extend": False}
 
@@ -85,7 +85,7 @@ def products(made, name="mean"):
 @pytest.mark.slow
 def test_derive__returns_what_was_computed_and_keeps_it_as_plain_zarr(whole, compute):
     said = []
-    expected = compute(Run.open(whole.info.directory), MeanOptions())
+    expected = compute(RunDirectory.open(whole.info.directory), MeanOptions())
     first = derive(whole.info.directory, "mean", {"a": 1}, echo=said.append)
     second = derive(whole.info.directory, "mean", echo=said.append)
     assert compute.calls == 2  # the first of them here
@@ -158,7 +158,7 @@ def test_run__does_not_see_later_commits(made):
     run = AnalysedRun.of(made.info.directory)
     made.commit(1)
     assert int((run.cube()["status"] > 0).sum()) == made.plan.cells_in(0)
-    assert int((Run.open(made.info.directory).cube()["status"] > 0).sum()) > made.plan.cells_in(0)
+    assert int((RunDirectory.open(made.info.directory).cube()["status"] > 0).sum()) > made.plan.cells_in(0)
 
 
 def flip(path: Path):

@@ -19,7 +19,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.runs import estimate as estimates
 from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
 from pipeline.runs.preview import describe_plan
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits
 from tests.pipeline.factories import duffing, quietly
 
@@ -34,7 +34,7 @@ CLOSING = duffing(
 
 
 def read(text):
-    spec = parse_spec(tomllib.loads(text))
+    spec = Spec.parse(tomllib.loads(text))
     return spec, make_plan(spec)
 
 

@@ -16,7 +16,7 @@ from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import duffing, quietly, silent
 
 sections = import_module("magpend_core.sections")  # `magpend_core.sections` is a function
@@ -324,7 +324,7 @@ def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
     assert open_run(mine).section.equals(open_run(fresh).section)
     # the text that was written is a specification like any other
     text = tmp_path / "again.toml"
-    text.write_text(Run.open(mine).info.spec_text)
+    text.write_text(RunDirectory.open(mine).info.spec_text)
     quietly(text, tmp_path / "again")
     assert bytes_of(tmp_path / "again") == bytes_of(mine)
 

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.runs.versions import version_of
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import silent
 
 STORED = Path(__file__).with_name("golden_bits.json")
@@ -122,7 +122,7 @@ def made(name, folder):
 
 def of_run(name, folder):
     directory = made(name, folder)
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     return {"versions": numbered(opened.info.identity)["versions"], "values": told(opened.cube(), name not in SUMS)}
 
 

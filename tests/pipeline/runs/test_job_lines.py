@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.compute.jobqueue import settings
-from pipeline.runs.batch import coordinator_script
+from pipeline.runs.jobs import coordinator_script
 from pipeline.runs.submit import prepare
 from pipeline.specification.clusters import QUEUES, cluster_of
 from pipeline.specification.problems import SpecError

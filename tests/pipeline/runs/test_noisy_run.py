@@ -17,9 +17,9 @@ from pipeline.runs.derive import derive
 from pipeline.runs.extend import extend
 from pipeline.runs.noise import warn_of_steps
 from pipeline.runs.run import run
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
-from pipeline.store.local import open_files
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import WELL, finished, quietly
 
 S = (0.45, 0.55, 0.7)
@@ -167,7 +167,7 @@ def test_run__refuses_steps_that_are_too_long(tmp_path: Path) -> None:
 def test_warn_of_steps__counts_the_cells_above_the_tolerance(directory: Path) -> None:
     lines: list[str] = []
     for tolerance in (0.01, 1e-9):
-        warn_of_steps(parse_spec(spec(noise={"tolerance": tolerance})), open_files(directory), lines.append)
+        warn_of_steps(Spec.parse(spec(noise={"tolerance": tolerance})), RunDirectory.open(directory), lines.append)
     assert len(lines) == 1
     assert lines[0].startswith("warning: in 600 of 600 cells the last period changes by more than noise.tolerance")
 
@@ -189,21 +189,21 @@ PROBLEMS = [
 def test_parse_spec__noise_problems() -> None:
     for changes, problem in PROBLEMS:
         with pytest.raises(SpecError, match=problem) as caught:
-            parse_spec(spec(**changes))
+            Spec.parse(spec(**changes))
         if "noise" in changes:  # what only follows from it is not said
             assert not any("axes." in p for p in caught.value.problems)
 
 
 def test_parse_spec__reads_back_what_it_writes() -> None:
-    parsed = parse_spec(spec(noise={"strengths": {"x": "0.1*a*x"}, "interpretation": "ito"}))
-    again = parse_spec(parsed.as_dict(), None)
+    parsed = Spec.parse(spec(noise={"strengths": {"x": "0.1*a*x"}, "interpretation": "ito"}))
+    again = Spec.parse(parsed.as_dict(), None)
     assert again.noise == parsed.noise
     assert again.model.digest == parsed.model.digest
-    assert again.model.digest != parse_spec(spec()).model.digest
+    assert again.model.digest != Spec.parse(spec()).model.digest
     assert parsed.values["noise_x"] == 1.0
 
 
 def test_steps_at__divides_the_period() -> None:
-    noise = parse_spec(spec(noise={"steps_per_period": None, "step": 0.01})).noise
+    noise = Spec.parse(spec(noise={"steps_per_period": None, "step": 0.01})).noise
     assert noise is not None
     assert noise.steps_at(np.array([5.0, 4.9, 100.0, 1000.0])).tolist() == [20, 21, 1, 1]

@@ -26,11 +26,11 @@ model = magpend.model(
 )
 spec = (
     magpend.Spec("sweep", model)
-    .parameters(frequency_hz=0.2)
-    .axis("A", 0.1, 0.4, 16)
-    .start_grid(x=(-1, 1, 16))
-    .integration(n_transient=3000, n_keep=4)
-    .execution(trajectories_per_task=16)
+    .with_parameters(frequency_hz=0.2)
+    .with_axis("A", 0.1, 0.4, 16)
+    .with_start_grid(x=(-1, 1, 16))
+    .with_integration(n_transient=3000, n_keep=4)
+    .with_execution(trajectories_per_task=16)
 )
 """
 COMPUTE = 'run = magpend.run(spec, "run", workers=2)\n'

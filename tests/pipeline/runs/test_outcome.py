@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs.outcome import outcomes_of, warning
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 AMPLIFIED = """
 kind = "sweep"
@@ -45,7 +45,7 @@ def test_run__says_how_its_cells_ended_and_what_to_do_next(main, tmp_path):
     gains = np.linspace(-0.5, 0.5, 11)
     gone = [a for a in gains if 0.1 * math.exp(a / 2 * at_end) > 1e8]
     stay = [a for a in gains if math.exp(a / 2 * at_end) < 1e5]
-    found = {o.status: o for o in outcomes_of(Run.open(tmp_path / "runs" / "spec"))}
+    found = {o.status: o for o in outcomes_of(RunDirectory.open(tmp_path / "runs" / "spec"))}
     ((name, low, high, unit),) = found[DIVERGED].where
     assert (name, high, unit) == ("a", 0.5, "1/s")
     assert max(stay) < low <= min(gone)
@@ -72,4 +72,4 @@ def test_run__says_how_its_cells_ended_and_what_to_do_next(main, tmp_path):
 def test_warning__nothing_is_said_of_a_run_that_lost_none(made):
     for index in range(made.plan.n_tasks):
         made.commit(index)
-    assert warning(Run.open(made.info.files)) == ""
+    assert warning(RunDirectory.open(made.info.files)) == ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.products.reporting import is_heard
-from pipeline.runs import notebook
+from pipeline.runs import progress as notebook
 from pipeline.runs.progress import LINE_EVERY_S, Progress
 
 
@@ -29,7 +29,7 @@ def test_progress__bar(capsys):
 
 def test_progress__outside_a_notebook_does_nothing(capsys):
     assert not notebook.is_notebook()
-    with notebook.progress():
+    with notebook.bar_in_notebook():
         assert not is_heard()
     assert capsys.readouterr() == ("", "")
 

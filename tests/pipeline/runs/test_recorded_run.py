@@ -18,8 +18,8 @@ from pipeline.runs.drawing import figure
 from pipeline.runs.extend import extend
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.runfile import read_run
 from tests.pipeline.factories import finished, quietly, silent
@@ -134,7 +134,7 @@ def path(once, tmp_path):
 def test_run__explains_itself_when_the_file_is_gone(path, tmp_path):
     text = (tmp_path / "drive.csv").read_text("utf-8")
     (tmp_path / "drive.csv").unlink()
-    spec = parse_spec(read_run(tmp_path / "run").spec)
+    spec = Spec.parse(read_run(tmp_path / "run").spec)
     assert spec.drive.text == text
     assert open_run(tmp_path / "run").section.notnull().all()
     assert figure(tmp_path / "run", "bifurcation").axes

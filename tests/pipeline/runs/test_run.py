@@ -14,7 +14,6 @@ import numpy as np
 import psutil
 import pytest
 
-from magpend import Spec
 from magpend_core import load_preset, run_branches
 from pipeline import open_run
 from pipeline.compute import task
@@ -24,7 +23,7 @@ from pipeline.runs.preview import describe_plan
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import LockedError, RefusedError
 from pipeline.store.runfile import read_run
 from tests.pipeline.factories import FOLD, WELL, silent
@@ -41,7 +40,7 @@ n_transient = 100
 n_keep = 4
 """
 EIGHT = "[execution]\ntrajectories_per_task = 8"
-DRIFT = Spec(**FOLD).integration(n_keep=8).execution(trajectories_per_task=2).toml()
+DRIFT = Spec(**FOLD).with_integration(n_keep=8).with_execution(trajectories_per_task=2).toml()
 NOISE = WELL.replace("[0.45, 0.55, 0.7]", "[0.45, 0.7]").replace("stop = 199", "stop = 7")
 NOISE = NOISE.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 8")
 NOISE = f"{NOISE}\n[execution]\ntrajectories_per_task = 4"
@@ -57,7 +56,7 @@ def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
     assert ds.section.dims == ("frequency", "branch", "period_index", "state")
     assert ds.direction.values.tolist() == ["up"] * 5 + ["down"] * 5
     assert ds.attrs["path"] == "frequency"
-    spec = parse_spec(tomllib.loads(walk_text))
+    spec = Spec.parse(tomllib.loads(walk_text))
     path = spec.axes["frequency_hz"].array()
     starts = np.column_stack([ds[f"{s}_0"] for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")])
     frequency = np.array([path] * 5 + [path[::-1]] * 5)
@@ -76,7 +75,7 @@ def test_run__sweep_is_what_the_kernel_says(write_spec, sweep_text, tmp_path):
     cell = ds.isel(frequency=3, q=1, psi1_0=2, psi2_0=1)
     start = [float(cell[f"{s}_0"]) for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")]
     packed = load_preset(q=1.6).pack().reshape(1, 1, -1)
-    options = parse_spec(tomllib.loads(sweep_text)).integration.model_dump()
+    options = Spec.parse(tomllib.loads(sweep_text)).integration.model_dump()
     expected = run_branches(packed, np.array([[2.75]]), np.array([start]), **options)
     assert np.array_equal(cell.section.values, expected.section[0, 0])
     assert int(cell.n_steps) == expected.n_steps[0, 0]

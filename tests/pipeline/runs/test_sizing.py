@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.runs.sizing import Work, complete, remarks
+from pipeline.runs.jobs import Work, complete, remarks
 from pipeline.specification.clusters import cluster_of, seconds_of
 
 HOUR = 3600.0

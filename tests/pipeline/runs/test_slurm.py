@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.runs.status import state
 from tests.pipeline.factories import duffing, quietly
-from tests.pipeline.runs import slurm
+from tests.test_tutorials import slurm
 
 SQUARE = "x = {{ start = -1, stop = 1, num = {n} }}\nv = {{ start = -1, stop = 1, num = {n} }}"
 SPEC = duffing(

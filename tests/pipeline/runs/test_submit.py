@@ -9,10 +9,9 @@ import sys
 
 import pytest
 
-from pipeline.runs.batch import coordinator_script
-from pipeline.runs.workflows import find_spec
-from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import load_cluster
+from pipeline.runs.jobs import coordinator_script
+from pipeline.specification.clusters import SYSTEMS, load_cluster
+from pipeline.specification.files import find_spec
 from tests.pipeline.factories import duffing, quietly
 
 CLUSTER = """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.runs.systems import find_systems
+from pipeline.runs.batch_systems import find_systems
 
 
 def kinds():

@@ -11,9 +11,9 @@ import pytest
 
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.specification.drive_files import load_drive, parse_drive, rising_edges
-from pipeline.specification.parsing import load_spec, parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import load_drive, parse_drive, rising_edges
+from pipeline.specification.spec import Spec
 
 EDGES = "# measured\nrising_s,falling_s\n1.0,1.2\n1.5,1.7\n2.1,2.3\n2.5,\n"
 TORQUE = "time_s,drive\n" + "".join(f"{0.1 * k!r},{1.0 if k % 4 in (1, 2) else -1.0}\n" for k in range(41))
@@ -116,7 +116,7 @@ def parsed(folder, spec=SPEC, text=EDGES):
     """A specification, which finds the drive's file beside it."""
     write(folder, text)
     write(folder, spec, "spec.toml")
-    return load_spec(folder / "spec.toml")
+    return Spec.read(folder / "spec.toml")
 
 
 def test_parse_spec__keeps_the_drive_and_reads_back_without_its_file(tmp_path):
@@ -124,7 +124,7 @@ def test_parse_spec__keeps_the_drive_and_reads_back_without_its_file(tmp_path):
     plain = spec.as_dict()
     assert plain["drive"]["sha256"] == hashlib.sha256(EDGES.encode()).hexdigest()
     (tmp_path / "drive.csv").unlink()
-    again = parse_spec(plain)
+    again = Spec.parse(plain)
     assert again == spec
     assert again.frequency_hz == pytest.approx(2.0)
     assert again.recorded.sections_s.tolist() == [1.5, 2.1, 2.5]
@@ -136,7 +136,7 @@ def test_identity__is_of_the_values_and_not_of_the_name(tmp_path):
 
     first = parsed(tmp_path)
     write(tmp_path, EDGES, "other.csv")
-    renamed = parse_spec(tomllib.loads(SPEC.replace("drive.csv", "other.csv")), tmp_path)
+    renamed = Spec.parse(tomllib.loads(SPEC.replace("drive.csv", "other.csv")), tmp_path)
     changed = parsed(tmp_path, text=EDGES.replace("2.3", "2.31"))
     assert digest(renamed) == digest(first) != digest(changed)
 
@@ -145,7 +145,7 @@ def test_parse_spec__drive_that_is_not_the_one_of_its_digest(tmp_path):
     plain = parsed(tmp_path).as_dict()
     plain["drive"]["text"] = EDGES.replace("2.3", "2.31")
     with pytest.raises(SpecError, match=r"drive\.sha256 = .* is not the digest of drive\.csv"):
-        parse_spec(plain)
+        Spec.parse(plain)
 
 
 def test_parse_spec__all_that_makes_no_sense_at_once(tmp_path):

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, import_extra
 
 
 def test_import_extra():

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runs.workflows import find_spec
+from pipeline.specification.files import find_spec
 
 DOCKERFILE = Path(__file__).parents[3] / "Dockerfile"
 pytestmark = pytest.mark.slow

@@ -5,12 +5,12 @@ import pytest
 
 from pipeline.compute.task import compute
 from pipeline.layout.cells import CellMap
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 
 
 def spec_of(method, **more):
-    return parse_spec(
+    return Spec.parse(
         {
             "kind": "sweep",
             "model": "duffing",

@@ -10,8 +10,8 @@ from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.run import identity_here
 from pipeline.runs.zoom import Changes, to_toml, zoom
-from pipeline.specification.parsing import load_spec, parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 
 FIT, SOURCES = {"c1": 0.068, "alpha1": 1.75}, {"c1": "fit of curve 3", "alpha1": "fit"}
 HEAD = "model = 'pendulum'\nbase = 'wojna2018'"
@@ -43,10 +43,10 @@ def digest(spec):
 
 def test_load_spec__reads_the_preset_beside_it_and_keeps_it_whole(tmp_path):
     path = write(tmp_path)
-    spec = load_spec(path)
+    spec = Spec.read(path)
     (tmp_path / "rig.toml").unlink()
     assert spec.values == load_model("pendulum").load("wojna2018", **FIT, q=1.5)
-    again = parse_spec(spec.as_dict())
+    again = Spec.parse(spec.as_dict())
     assert again == spec
     assert again.parameters.chosen.provenance["c1"] == "fit of curve 3"
     assert identity_here(spec, make_plan(spec))["spec"]["parameters"]["preset"]["title"] == "test rig"
@@ -55,22 +55,22 @@ def test_load_spec__reads_the_preset_beside_it_and_keeps_it_whole(tmp_path):
 def test_load_spec__smoke_may_choose_another_preset(tmp_path):
     path = write(tmp_path, preset="wojna2018")
     path.write_text(path.read_text() + '\n[smoke]\n"parameters.preset" = "rig.toml"')
-    assert load_spec(path).values["c1"] == 0.05338
-    assert load_spec(path, smoke=True).values["c1"] == FIT["c1"]
+    assert Spec.read(path).values["c1"] == 0.05338
+    assert Spec.read(path, smoke=True).values["c1"] == FIT["c1"]
 
 
 def test_identity__covers_values_and_provenance_of_the_file(tmp_path):
-    first = digest(load_spec(write(tmp_path)))
-    assert digest(load_spec(write(tmp_path))) == first
-    assert digest(load_spec(write(tmp_path, c1=0.069))) != first
+    first = digest(Spec.read(write(tmp_path)))
+    assert digest(Spec.read(write(tmp_path))) == first
+    assert digest(Spec.read(write(tmp_path, c1=0.069))) != first
     path = write(tmp_path)
     rig = tmp_path / "rig.toml"
     rig.write_text(rig.read_text().replace("fit of curve 3", "fit of curve 4"))
-    assert digest(load_spec(path)) != first
+    assert digest(Spec.read(path)) != first
 
 
 def test_zoom__carries_the_preset_along(tmp_path):
-    spec = load_spec(write(tmp_path))
+    spec = Spec.read(write(tmp_path))
     (tmp_path / "rig.toml").unlink()
     narrower, _ = zoom(spec, Changes(ranges={"q": (1.5, 1.6)}, num=3))
     assert narrower.values["c1"] == FIT["c1"]
@@ -98,7 +98,7 @@ def test_load_spec__says_what_is_wrong_with_the_file_beside_all_else(tmp_path, c
     else:
         rig.write_text(content)
     with pytest.raises(SpecError) as caught:
-        load_spec(path)
+        Spec.read(path)
     own = [p for p in caught.value.problems if p.startswith("parameters.preset")]
     assert len(own) == 1
     assert words in own[0]

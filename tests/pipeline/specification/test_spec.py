@@ -11,20 +11,21 @@ import pytest
 import magpend
 from magpend_core.models import load_model
 from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
-from pipeline.specification.parsing import Range, load_spec, parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
+from pipeline.specification.tables import Range
 
 
 def problems_of(text: str) -> list[str]:
     with pytest.raises(SpecError) as caught:
-        parse_spec(tomllib.loads(text))
+        Spec.parse(tomllib.loads(text))
     return caught.value.problems
 
 
 def test_parse_spec__reads_back_what_as_dict_says(sweep_text, walk_text):
     for text in (sweep_text, walk_text):
-        spec = parse_spec(tomllib.loads(text))
-        assert parse_spec(spec.as_dict()) == spec
+        spec = Spec.parse(tomllib.loads(text))
+        assert Spec.parse(spec.as_dict()) == spec
 
 
 def test_parse_spec__all_errors_at_once():
@@ -116,19 +117,19 @@ def test_parse_spec__what_must_be_there(sweep_text, walk_text):
 def test_load_spec__unreadable(tmp_path, write_spec):
     for path, words in [(tmp_path / "absent.toml", "cannot be read"), (write_spec("kind = \n"), "not valid TOML")]:
         with pytest.raises(SpecError) as caught:
-            load_spec(path)
+            Spec.read(path)
         assert len(caught.value.problems) == 1
         assert words in str(caught.value)
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe")
     with pytest.raises(SpecError, match="UTF-8"):
-        load_spec(binary)
+        Spec.read(binary)
 
 
 @pytest.mark.parametrize("form", ["axes.frequency_hz.num = 2", '"axes.frequency_hz.num" = 2'])
 def test_load_spec__smoke_replaces_leaves(write_spec, sweep_text, form):
     path = write_spec(f"{sweep_text}\n[smoke]\n{form}\nintegration.n_transient = 0\n")
-    full, small = load_spec(path), load_spec(path, smoke=True)
+    full, small = Spec.read(path), Spec.read(path, smoke=True)
     assert len(full.axes["frequency_hz"].array()) == 5
     assert small.axes["frequency_hz"].array().tolist() == [2.0, 3.0]
     assert (small.integration.n_transient, small.integration.n_keep) == (0, 3)
@@ -137,7 +138,7 @@ def test_load_spec__smoke_replaces_leaves(write_spec, sweep_text, form):
 def test_load_spec__bad_smoke(write_spec, sweep_text):
     path = write_spec(f"{sweep_text}\n[smoke]\nintegration.n_kep = 0\n")
     with pytest.raises(SpecError, match=r"with \[smoke\]: integration.n_kep.*n_keep"):
-        load_spec(path)
+        Spec.read(path)
 
 
 def test_range__values_are_the_decimals_a_person_would_write():
@@ -158,7 +159,7 @@ def test_spec__degrees_convert_once():
     kind = "list"
     points_deg = [[90, -45], [180, 0, 360, -180]]
     """
-    states = initial_states(parse_spec(tomllib.loads(text)).initial_conditions).at(np.arange(2))
+    states = initial_states(Spec.parse(tomllib.loads(text)).initial_conditions).at(np.arange(2))
     expected = [[math.pi / 2, -math.pi / 4, 0, 0], [math.pi, 0, 2 * math.pi, -math.pi]]
     assert np.allclose(states, expected, rtol=1e-15)
 
@@ -169,7 +170,7 @@ def test_model__as_lines_of_equations():
         f'kind = "sweep"\nmodel = """\n{text}\n"""\nparameters.frequency_hz = 0.2\n'
         'initial_conditions = { kind = "list", points = [[0.1, 0.0]] }\nintegration.n_keep = 2\n'
     )
-    assert parse_spec(tables).model is load_model(magpend.model(text).reference)
+    assert Spec.parse(tables).model is load_model(magpend.model(text).reference)
 
 
 @pytest.mark.parametrize(("given", "used"), [(150, 160), (160, 160), (3, 16)])

@@ -12,7 +12,7 @@ import xarray as xr
 
 from pipeline.store import consolidate
 from pipeline.store.errors import DamagedError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 
 def _open(folder):
@@ -26,7 +26,7 @@ def _open(folder):
 def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
-    run = Run.open(made.info.directory)
+    run = RunDirectory.open(made.info.directory)
     layer = np.arange(made.plan.n_cells, dtype=np.uint16).reshape(made.plan.shape)
     consolidate.write_cube(
         run, tmp_path / "out", "frequency", {"colour": consolidate.Layer(layer, {"title": "of cells"})}
@@ -44,7 +44,7 @@ def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
 
 def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
     made.commit(0)
-    entries = consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "q", {})
+    entries = consolidate.write_cube(RunDirectory.open(made.info.directory), tmp_path / "out", "q", {})
     files = {
         p.relative_to(tmp_path / "out").as_posix(): p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()
     }
@@ -63,7 +63,7 @@ def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(made, tmp_p
     monkeypatch.setattr(consolidate, "SLAB_BYTES", 1)
     for index in range(made.plan.n_tasks):
         made.commit(index)
-    run = Run.open(made.info.directory)
+    run = RunDirectory.open(made.info.directory)
     consolidate.write_cube(run, tmp_path / "out", along, {})
     metadata = json.loads((tmp_path / "out" / "cube.zarr" / "section" / "zarr.json").read_text())
     assert run.plan.dims == ("frequency", "q", "psi1_0", "psi2_0")
@@ -77,4 +77,4 @@ def test_write_cube__refuses_a_damaged_source(made, tmp_path):
     chunk = next((made.info.directory / "cube.zarr" / "section").glob("c.*"))
     chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
     with pytest.raises(DamagedError, match="section"):
-        consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "frequency", {})
+        consolidate.write_cube(RunDirectory.open(made.info.directory), tmp_path / "out", "frequency", {})

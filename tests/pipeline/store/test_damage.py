@@ -24,7 +24,7 @@ from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits, records
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.products import write_product
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import duffing, finished, quietly, silent
 
@@ -422,7 +422,7 @@ def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(wh
     """The record's digest, and the checksum in the chunk, for readers that know no records."""
     directory = whole()
 
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     chunk = next(path for path in chunks(directory) if path.parent.name == name)
     content = chunk.read_bytes()
     for i in range(20):

@@ -21,7 +21,7 @@ import pytest
 
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits, records
 from pipeline.store.errors import StoreError
 from pipeline.store.stored_json import fits, unseal
@@ -319,7 +319,7 @@ def test_power_cut__order_of_syncs_and_renames(finished):
         for file in vouched:
             assert kept.get(file) == file.read_bytes(), (target.name, file)
     # each on its own, then in a pack
-    assert n_records == 2 * make_plan(load_spec(finished.folder / "spec.toml")).n_tasks
+    assert n_records == 2 * make_plan(Spec.read(finished.folder / "spec.toml")).n_tasks
     assert disk.after_a_cut(top, lambda path: False).keys() >= {top / key for key in finished.files}
 
 

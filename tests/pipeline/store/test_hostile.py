@@ -14,13 +14,14 @@ import pytest
 
 from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store import products
 from pipeline.store.arrays import Declared, declared_bytes
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import DamagedError
 from pipeline.store.local import open_files
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import SQUARE, duffing, finished
@@ -51,7 +52,7 @@ def hostile(sound, tmp_path):
 
 
 def plan_of(directory):
-    return make_plan(kept_spec(read_run(directory).spec))
+    return make_plan(Spec.parse(read_run(directory).spec, KEPT))
 
 
 def bomb(n_bytes):
@@ -117,7 +118,7 @@ def test_declared__metadata_of_other_shapes_and_codecs(sound, change, words):
 
 def committed(directory, key, content):
     """Put a chunk in place with a record that vouches for it, as who made the directory could."""
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     commits = dict(read_commits(opened.info, opened.plan))
     for commit in commits.values():
         if key in commit.objects:
@@ -125,7 +126,7 @@ def committed(directory, key, content):
             objects[key] = {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
             object.__setattr__(commit, "objects", objects)
     (directory / "cube.zarr" / key).write_bytes(content)
-    return Run(opened.info, opened.spec, opened.plan, commits)
+    return RunDirectory(opened.info, opened.spec, opened.plan, commits)
 
 
 @pytest.mark.parametrize("key", ["section/c.0.0.0.0.0", "n_steps/c.0.0.0"])
@@ -233,7 +234,7 @@ def test_open__a_run_file_that_is_nested_too_deep(hostile):
     text = json.dumps(unseal((hostile / "run.json").read_bytes()))
     (hostile / "run.json").write_text(seal(text.replace('"small"', "[" * 100_000 + "]" * 100_000, 1)))
     with pytest.raises((DamagedError, ValueError)):
-        Run.open(hostile)
+        RunDirectory.open(hostile)
 
 
 # ---- folders that cannot be written to -----------------------------------------------------------------

@@ -23,14 +23,14 @@ from magpend_core.status import Status
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits, records
 from pipeline.store.commits import Packer, pack_block, read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
 from tests.pipeline.factories import duffing, finished, silent
 
@@ -63,7 +63,7 @@ def computed(n: int) -> tuple[dict[str, bytes], xr.Dataset]:
     """Bytes and cube of a run that nothing happens to."""
     with tempfile.TemporaryDirectory(prefix="life-") as folder:
         directory = finished(Path(folder), spec_of(n))
-        return bytes_of(directory), Run.open(directory).cube().load()
+        return bytes_of(directory), RunDirectory.open(directory).cube().load()
 
 
 class Directory:
@@ -73,7 +73,7 @@ class Directory:
         self.path = folder / "run"
         text = spec_of(N_TASKS)
         (folder / "spec.toml").write_text(text)
-        self.spec = load_spec(folder / "spec.toml")
+        self.spec = Spec.read(folder / "spec.toml")
         self.plan = make_plan(self.spec)
         self.identity = identity_of(self.spec, self.plan)
         self.info = create(self.path, self.spec, self.plan, self.identity, text)
@@ -227,7 +227,7 @@ class Life(RuleBasedStateMachine):
     @invariant()
     def is_read_as_written_or_not_at_all(self):
         try:
-            opened = Run.open(self.run.path)
+            opened = RunDirectory.open(self.run.path)
             cube = opened.cube().load()
         except StoreError:
             return

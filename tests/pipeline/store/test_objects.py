@@ -27,7 +27,7 @@ from pipeline.store.files import RECORD_COPY
 from pipeline.store.local import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
 from pipeline.store.record_copy import write_copy
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
 from tests.pipeline.factories import SQUARE, duffing, quietly, silent
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server, in_turn, once
@@ -436,11 +436,13 @@ def test_open_run__record_that_is_damaged_is_found_by_verify(copied, made):
     content = bytearray(copied.read("commits/000001.json"))
     content[50] ^= 1
     copied.write("commits/000001.json", bytes(content))
-    assert len(Run.open(PLACE).commits) == 3  # the copy has the record as it was written, with its own checksum
+    assert (
+        len(RunDirectory.open(PLACE).commits) == 3
+    )  # the copy has the record as it was written, with its own checksum
     found = verify_run(PLACE, repair=True)
     assert list(found.damaged) == ["000001.json"]
     assert not copied.is_there(RECORD_COPY)
-    run = Run.open(PLACE)
+    run = RunDirectory.open(PLACE)
     assert set(run.commits) == {0, 2}
     assert (run.cube().status.values[made.plan.task(1)] == 0).all()
 

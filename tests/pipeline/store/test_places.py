@@ -16,7 +16,7 @@ from pipeline.store import commits, local
 from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import RECORD_COPY
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import check, establish
 from pipeline.store.skeleton import skeleton_files
 from pipeline.store.stored_json import seal, unseal
@@ -122,7 +122,7 @@ def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch
         return original(path, mode, **options)
 
     monkeypatch.setattr(local, "open_plain", open_plain)
-    for use in (Run.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
+    for use in (RunDirectory.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
         with pytest.raises(UnreadableError, match=r"000001\.json: cannot be read .* Nothing was removed"):
             use(place)
     assert everything(place) == before
@@ -130,7 +130,7 @@ def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch
 
 def test_scan__commits_that_never_stay_the_same_stop(place, monkeypatch):
     """Somebody packs and unpacks for ever: reading ends all the same."""
-    opened, calls = Run.open(place), []
+    opened, calls = RunDirectory.open(place), []
 
     def names(folder):
         calls.append(folder)
@@ -274,7 +274,7 @@ def test_rebuild__files_worded_by_another_version(whole):
     assert "another version" in describe(found, directory, repaired=True)[-1]
     establish_again(whole)
     assert verify_run(directory).sound
-    assert len(Run.open(directory).commits) == whole.plan.n_tasks
+    assert len(RunDirectory.open(directory).commits) == whole.plan.n_tasks
 
 
 def test_skeleton_files__hold_nothing_of_this_machine_or_moment(made):

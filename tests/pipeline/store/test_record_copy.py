@@ -7,7 +7,7 @@ import json
 import pytest
 
 from pipeline import open_run
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.verify import verify_run
 from pipeline.store.arrays import METADATA
 from pipeline.store.commits import read_commits, scan, withdraw

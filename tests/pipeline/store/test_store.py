@@ -11,16 +11,16 @@ import pytest
 from pipeline import open_run
 from pipeline.layout.identity import digest_of, identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.specification.parsing import load_spec, parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store import commits, records
 from pipeline.store.commits import Packer, marker_key, pack_block, read_commits, sweep, withdraw, write_task
 from pipeline.store.errors import DamagedError
 from pipeline.store.keys import Owners, keys_of
 from pipeline.store.records import block_of_pack
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import create
 from tests.pipeline.factories import silent
@@ -106,10 +106,10 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
     text = 'kind = "sweep"\n[axes]\n' + "".join(
         f"{name} = {{ values = [1.5, 1.6] }}\n" for name in ("q", "frequency_hz", "eps_drive")
     )
-    spec = load_spec(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
+    spec = Spec.read(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
     identity = identity_of(spec, make_plan(spec))
     create(tmp_path / "run", spec, make_plan(spec), identity, text)
-    again = parse_spec(read_run(tmp_path / "run").spec)
+    again = Spec.parse(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
     assert digest_of(identity_of(again, make_plan(again))) == digest_of(identity)
 
@@ -119,11 +119,11 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
 
 @pytest.mark.slow
 def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
-    alone = Run.open(whole.info.directory)
+    alone = RunDirectory.open(whole.info.directory)
     digest, cells, first = alone.digest, alone.commits.cells(), dict(alone.commits)
     assert go_on(whole) == []
     assert names_in(whole) == PACKED
-    together = Run.open(whole.info.directory)
+    together = RunDirectory.open(whole.info.directory)
     assert (together.digest, together.commits.cells()) == (digest, cells)
     found = together.commits
     assert dict(found) == first

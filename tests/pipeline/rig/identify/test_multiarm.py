@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.rig.identify import identification
 from pipeline.rig.identify import validation as checking
-from pipeline.runs.workflows import find_spec, shipped_identifications, shipped_workflows
+from pipeline.specification.files import find_spec, shipped_identifications, shipped_workflows
 
 RECORDING = "recordings/multiarm/multiarm_free_swings.mat"
 

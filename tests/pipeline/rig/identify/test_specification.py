@@ -137,7 +137,7 @@ def test_load_identification__a_file_that_is_not_there(tmp_path):
 def test_load__slopes_are_one_of_two_kinds(tmp_path):
     """What the fit takes them by goes into the problem; another word is refused by name."""
     from pipeline.rig.identify.build import build, read_all
-    from pipeline.runs.workflows import find_spec
+    from pipeline.specification.files import find_spec
 
     path = find_spec("multiarm")
     text = path.read_text("utf-8").replace("recordings/", f"{path.parent}/recordings/")
