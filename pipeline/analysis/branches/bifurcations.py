@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
-from pipeline.analysis.branches.equilibria import OneParameter, hopf_test
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import Problem, doubling_test, torus_test
+from pipeline.analysis.branches.problems import OneParameter, Problem, doubling_test, hopf_test, torus_test
 
 FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
 HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"

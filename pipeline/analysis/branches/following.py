@@ -11,9 +11,8 @@ from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch, settle_sides
-from pipeline.analysis.branches.equilibria import EquilibriumProblem, OneParameter
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem
 
 ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section")
 """Reasons why a branch ends: ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as

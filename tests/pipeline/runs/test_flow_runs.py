@@ -7,9 +7,9 @@ import pytest
 
 from magpend_core.status import Status
 from pipeline import open_run
-from pipeline.analysis.attractors.table import attractors_table
-from pipeline.analysis.branches.table import branches_table
-from pipeline.analysis.chaos.table import chaos_table
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.branches.analysis import branches_table
+from pipeline.analysis.chaos.analysis import chaos_table
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive

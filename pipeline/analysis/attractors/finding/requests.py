@@ -31,7 +31,6 @@ FINDING, EXTENDING = "finding attractors", "extending cells"
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
 
-
 MOST_SLOPES = 16_384
 """Most derivatives of the section map in one call of the engine."""
 

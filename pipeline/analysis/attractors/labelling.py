@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magpend_core.multipliers import orbit_exponents
-from pipeline.analysis.attractors.describing import features as feature
-from pipeline.analysis.attractors.describing.features import Cells, Features
+from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
 from pipeline.analysis.attractors.extension.courses import AT_REST as RESTS
 from pipeline.analysis.attractors.extension.courses import DIVERGED, ON_SET, rest_number
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
-from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.features import Cells, Features
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
@@ -27,6 +26,7 @@ from pipeline.analysis.attractors.finding.probing import is_approaching, probe_e
 from pipeline.analysis.attractors.finding.requests import Slopes, Work
 from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.finding.spirals import keys_of
+from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.sets import Geometry, looked_up, order_by_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
