@@ -50,27 +50,13 @@ MOST_PROBES = 8
 
 @dataclass
 class Found:
-    """Result of `analyse` at one parameter point: the sets on which its cells end, and the set of each cell.
+    """Result of `analyse` at one parameter point: the sets on which its cells end, and the set of each cell."""
 
-    Attributes
-    ----------
-    label : ndarray of int32, (cell,)
-        Index into `features`, -1 for none.
-    decision : ndarray of int8, (cell,)
-        Codes of `vocabulary.DECISIONS`.
-    features : list of Features
-        Features of each set.
-    counts : list of int
-        Number of cells on each set.
-    ran_out : bool
-        Whether the budget of the extension ended before all cells were decided.
-    """
-
-    label: np.ndarray
-    decision: np.ndarray
-    features: list[Features]
-    counts: list[int]
-    ran_out: bool = False
+    label: np.ndarray  # int32, (cell,): index into `features`, -1 for none
+    decision: np.ndarray  # int8, (cell,): codes of `vocabulary.DECISIONS`
+    features: list[Features]  # features of each set
+    counts: list[int]  # number of cells on each set
+    ran_out: bool = False  # whether the budget of the extension ended before all cells were decided
 
 
 @dataclass

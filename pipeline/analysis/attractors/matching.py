@@ -385,23 +385,13 @@ def _distance(rule: Rule, first: Appearances, second: Appearances) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Which attractors of different parameter points lie on one branch, found by following their orbits.
+    """Which attractors of different parameter points lie on one branch, found by following their orbits."""
 
-    Attributes
-    ----------
-    group : ndarray
-        Least number among the appearances that are connected with each.
-    branch : ndarray
-        Least number among those that are connected without a period doubling.
-    followed : ndarray of bool
-        Whether each was followed.
-    is_open : ndarray of bool, (appearance, dim, 2)
-        Whether following its branch ended somewhere for an unknown reason, or was not needed, up and down each dim.
-    """
-
-    group: np.ndarray
-    branch: np.ndarray
-    followed: np.ndarray
+    group: np.ndarray  # least number among the appearances that are connected with each
+    branch: np.ndarray  # least number among those that are connected without a period doubling
+    followed: np.ndarray  # whether each was followed
+    # bool, (appearance, dim, 2): whether following its branch ended somewhere for an unknown reason, or was not
+    # needed, up and down each dim
     is_open: np.ndarray
 
     @classmethod

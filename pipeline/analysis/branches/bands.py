@@ -56,21 +56,11 @@ DRAWS_FILE = "posterior.nc"
 
 @dataclass(frozen=True)
 class Place:
-    """Place of a carried orbit in a diagram.
+    """Place of a carried orbit in a diagram."""
 
-    Attributes
-    ----------
-    branch : int
-        Index of the branch.
-    run : int
-        Number of the stretch of the branch in which the parameter keeps rising or falling.
-    step : int
-        Index of the value of the parameter, of `GRID` ones.
-    """
-
-    branch: int
-    run: int
-    step: int
+    branch: int  # index of the branch
+    run: int  # number of the stretch of the branch in which the parameter keeps rising or falling
+    step: int  # index of the value of the parameter, of `GRID` ones
 
 
 def bifurcation_data(branches: xr.Dataset) -> tuple[list[Datum], list[np.ndarray], list[int]]:

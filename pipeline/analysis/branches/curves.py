@@ -66,33 +66,15 @@ AMPLITUDES = (0.02, 0.05, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Curve of bifurcations in the plane of two parameters, with its orbits and the reasons for its two ends.
+    """Curve of bifurcations in the plane of two parameters, with its orbits and the reasons for its two ends."""
 
-    Attributes
-    ----------
-    family : Family
-        Family of the curve's orbits, with two free parameters.
-    kind : str
-        Kind of bifurcation.
-    points : list of Point
-        Orbits in order.
-    ends : tuple of str
-        Reasons for both ends, of `CURVE_ENDS`.
-    start : int
-        Number of the located bifurcation it started from; -1 if it springs from a point of codimension two.
-    special : list of SpecialPoint
-        Points of codimension two on it.
-    n_missed : int
-        Sign changes of their test functions that could not be located.
-    """
-
-    family: Family
-    kind: str
-    points: list[Point]
-    ends: tuple[str, str]
-    start: int
-    special: list[SpecialPoint] = field(default_factory=list)
-    n_missed: int = 0
+    family: Family  # family of the curve's orbits, with two free parameters
+    kind: str  # kind of bifurcation
+    points: list[Point]  # orbits in order
+    ends: tuple[str, str]  # reasons for both ends, of `CURVE_ENDS`
+    start: int  # number of the located bifurcation it started from; -1 if it springs from a point of codimension two
+    special: list[SpecialPoint] = field(default_factory=list)  # points of codimension two on it
+    n_missed: int = 0  # sign changes of their test functions that could not be located
 
     @property
     def values(self) -> np.ndarray:

@@ -71,25 +71,14 @@ BESIDE = 3
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """Limits within which branches are explored: parameter interval, longest period, number of generations.
+    """Limits within which branches are explored: parameter interval, longest period, number of generations."""
 
-    Attributes
-    ----------
-    low, high : float
-        Interval of the parameter.
-    max_period : int
-        Longest period of a branch [drive periods].
-    max_generations : int
-        Most generations of branches that bifurcate from branches.
-    settings : Settings
-        Settings of the traces.
-    """
-
+    # interval of the parameter
     low: float
     high: float
-    max_period: int = 8
-    max_generations: int = 3
-    settings: Settings = field(default_factory=Settings)
+    max_period: int = 8  # longest period of a branch [drive periods]
+    max_generations: int = 3  # most generations of branches that bifurcate from branches
+    settings: Settings = field(default_factory=Settings)  # settings of the traces
 
 
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:

@@ -33,27 +33,14 @@ def problem_of(family: Family) -> OneParameter:
 
 @dataclass(eq=False)
 class Branch:
-    """A branch: orbits of one period, or equilibria, along one parameter.
+    """A branch: orbits of one period, or equilibria, along one parameter."""
 
-    Attributes
-    ----------
-    family : Family
-        Period, system and parameters of the orbits.
-    points : list of Point
-        Orbits in order.
-    bifurcations : list of Bifurcation
-        Located bifurcations in the order of the points.
-    ends : tuple of str
-        Reasons for the first and the last end, of `ENDS`; ``start`` stands for the bifurcation at its origin.
-    origin : Bifurcation or None
-        Bifurcation from which it branches.
-    """
-
-    family: Family
-    points: list[Point]
-    bifurcations: list[Bifurcation]
+    family: Family  # period, system and parameters of the orbits
+    points: list[Point]  # orbits in order
+    bifurcations: list[Bifurcation]  # located bifurcations in the order of the points
+    # reasons for the first and the last end, of `ENDS`; ``start`` stands for the bifurcation at its origin
     ends: tuple[str, str]
-    origin: Bifurcation | None = None
+    origin: Bifurcation | None = None  # bifurcation from which it branches
 
     def __post_init__(self) -> None:
         settle_sides(self.points, self.bifurcations)

@@ -51,24 +51,12 @@ WIDEST_GAP, MOST_TRIES = 0.05, 6
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """End points of integrated trajectories, with their derivatives and durations.
+    """End points of integrated trajectories, with their derivatives and durations."""
 
-    Attributes
-    ----------
-    starts : ndarray, (m, n_states)
-        Start states of the trajectories.
-    images : ndarray, (m, period, n_states)
-        Sections after 1, 2, ... drive periods or returns.
-    monodromy : ndarray, (m, n_states, n_states)
-        Derivative of the last image by the start.
-    times : ndarray, (m, period)
-        Duration of each drive period or return [s].
-    """
-
-    starts: np.ndarray
-    images: np.ndarray
-    monodromy: np.ndarray
-    times: np.ndarray
+    starts: np.ndarray  # (m, n_states): start states of the trajectories
+    images: np.ndarray  # (m, period, n_states): sections after 1, 2, ... drive periods or returns.
+    monodromy: np.ndarray  # (m, n_states, n_states): derivative of the last image by the start
+    times: np.ndarray  # (m, period): duration of each drive period or return [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,29 +113,14 @@ class Problem(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Periodic orbits of one period, or equilibria, of a system with one or two free parameters.
-
-    Attributes
-    ----------
-    system : System
-    period : int
-        In drive periods or returns; 0 for equilibria.
-    frequency_hz : float
-        Used unless it is free.
-    parameters : ndarray
-        Packed vector; entries that are free do not matter.
-    free : tuple of str
-        Names of the free parameters.
-    scales : tuple of float
-        Change of each free parameter that counts as 1.
-    """
+    """Periodic orbits of one period, or equilibria, of a system with one or two free parameters."""
 
     system: System
-    period: int
-    frequency_hz: float
-    parameters: np.ndarray
-    free: tuple[str, ...]
-    scales: tuple[float, ...]
+    period: int  # in drive periods or returns; 0 for equilibria
+    frequency_hz: float  # used unless it is free
+    parameters: np.ndarray  # packed vector; entries that are free do not matter
+    free: tuple[str, ...]  # names of the free parameters
+    scales: tuple[float, ...]  # change of each free parameter that counts as 1
 
     @property
     def unit(self) -> np.ndarray:

@@ -62,23 +62,12 @@ ACCURACY = 10.0 * BRANCH_RTOL
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Cells along one parameter, with their rotation numbers, orbit periods (0: not closed) and section points.
+    """Cells along one parameter, with their rotation numbers, orbit periods (0: not closed) and section points."""
 
-    Attributes
-    ----------
-    values : ndarray, (value,)
-        Rising values of the parameter.
-    rotation : ndarray, (value, start)
-        NaN where unknown.
-    orbit_period : ndarray, (value, start)
-    section : ndarray, (value, start, state)
-        A section point of each.
-    """
-
-    values: np.ndarray
-    rotation: np.ndarray
-    orbit_period: np.ndarray
-    section: np.ndarray
+    values: np.ndarray  # (value,): rising values of the parameter
+    rotation: np.ndarray  # (value, start): NaN where unknown
+    orbit_period: np.ndarray  # (value, start)
+    section: np.ndarray  # (value, start, state): a section point of each
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,36 +29,18 @@ Labels = Callable[[np.ndarray, Mapping[str, float]], np.ndarray]
 
 @dataclass(frozen=True)
 class Exits:
-    """Exits of the cells of a parameter point, seen in intervals of time of equal length.
+    """Exits of the cells of a parameter point, seen in intervals of time of equal length."""
 
-    Attributes
-    ----------
-    counted : ndarray of bool, (cell,)
-        Cells that are in a set at the first counted section.
-    begin : ndarray of int, (cell,)
-        Code of the set in which a cell begins.
-    first_out : ndarray of int, (cell,)
-        Number of the first section after the exit, counted from the first counted one; `NOT_LEFT`.
-    end : ndarray of int, (cell,)
-        Code of the set to which a cell goes; `NOT_LEFT` where a cell did not leave, or diverged.
-    place : ndarray, (cell, state)
-        State after the exit; NaN if there is none.
-    at_risk : ndarray of int, (cell,)
-        Intervals at whose begin a cell was in its set.
-    n_intervals : int
-        Intervals in the record.
-    interval : float
-        Length of an interval [s].
-    """
-
-    counted: np.ndarray
-    begin: np.ndarray
+    counted: np.ndarray  # bool, (cell,): cells that are in a set at the first counted section
+    begin: np.ndarray  # int, (cell,): code of the set in which a cell begins
+    # int, (cell,): number of the first section after the exit, counted from the first counted one; `NOT_LEFT`
     first_out: np.ndarray
+    # int, (cell,): code of the set to which a cell goes; `NOT_LEFT` where a cell did not leave, or diverged
     end: np.ndarray
-    place: np.ndarray
-    at_risk: np.ndarray
-    n_intervals: int
-    interval: float
+    place: np.ndarray  # (cell, state): state after the exit; NaN if there is none
+    at_risk: np.ndarray  # int, (cell,): intervals at whose begin a cell was in its set
+    n_intervals: int  # intervals in the record
+    interval: float  # length of an interval [s]
 
 
 def find_exits(codes: np.ndarray, cells: PointCells, skip: int, n_transient: int, period: float) -> Exits:
@@ -222,22 +204,12 @@ def _inputs_at(run: OpenRun, cells: PointCells) -> Inputs:
 
 @dataclass(frozen=True)
 class PointCells:
-    """Cells of one parameter point, realizations and initial states in one dim.
+    """Cells of one parameter point, realizations and initial states in one dim."""
 
-    Attributes
-    ----------
-    at : dict of int
-        Index of the point by dim.
-    values : dict of float
-        Parameter values of the point by dim.
-    section : ndarray, (cell, section, state)
-        NaN in cells that diverged.
-    status, n_periods : ndarray, (cell,)
-    """
-
-    at: dict[str, int]
-    values: dict[str, float]
-    section: np.ndarray
+    at: dict[str, int]  # index of the point by dim
+    values: dict[str, float]  # parameter values of the point by dim
+    section: np.ndarray  # (cell, section, state): NaN in cells that diverged
+    # (cell,)
     status: np.ndarray
     n_periods: np.ndarray
 

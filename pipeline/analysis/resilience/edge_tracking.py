@@ -72,47 +72,25 @@ NEAREST = len(SHIFTS) // 2
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the tracking.
+    """Limits of the tracking."""
 
-    Attributes
-    ----------
-    closest, farthest : float
-        Scaled distance to which a pair is bisected, and beyond which it is bisected again.
-    returns : int
-        Most sections of a path.
-    longest : int
-        Longest period of an edge orbit.
-    """
-
+    # scaled distance to which a pair is bisected, and beyond which it is bisected again
     closest: float
     farthest: float
-    returns: int
-    longest: int
+    returns: int  # most sections of a path
+    longest: int  # longest period of an edge orbit
 
 
 @dataclass
 class Pair:
-    """A pair of states, one in each basin, and its path along the boundary.
+    """A pair of states, one in each basin, and its path along the boundary."""
 
-    Attributes
-    ----------
-    start : ndarray, (2, state)
-        The two initial states.
-    ends : ndarray, (2, state)
-        The two states now.
-    path : list of ndarray
-        Middle of the pair at each section after the first bisection.
-    found : Orbit, Equilibrium, ndarray or None
-        Edge state: an orbit, an equilibrium, or section points (n, state) of a bounded set.
-    reason : int
-        Index into `REASONS`.
-    """
-
-    start: np.ndarray
-    ends: np.ndarray
-    path: list[np.ndarray] = field(default_factory=list)
+    start: np.ndarray  # (2, state): the two initial states
+    ends: np.ndarray  # (2, state): the two states now
+    path: list[np.ndarray] = field(default_factory=list)  # middle of the pair at each section after the first bisection
+    # edge state: an orbit, an equilibrium, or section points (n, state) of a bounded set
     found: Orbit | Equilibrium | np.ndarray | None = None
-    reason: int = NONE
+    reason: int = NONE  # index into `REASONS`
 
     @property
     def goes_on(self) -> bool:

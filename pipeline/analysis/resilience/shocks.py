@@ -73,18 +73,10 @@ MOST_POINTS = 8
 
 @dataclass(frozen=True)
 class Trials:
-    """Shocks whose ends are wanted.
+    """Shocks whose ends are wanted."""
 
-    Attributes
-    ----------
-    base : ndarray of int64, (n,)
-        Number of the base state.
-    shock : ndarray, (n, dim)
-        Scaled jump of each of the shocked states.
-    """
-
-    base: np.ndarray
-    shock: np.ndarray
+    base: np.ndarray  # int64, (n,): number of the base state
+    shock: np.ndarray  # (n, dim): scaled jump of each of the shocked states
 
 
 Search = Generator[Trials, np.ndarray, "Found"]
@@ -93,30 +85,14 @@ Search = Generator[Trials, np.ndarray, "Found"]
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a search.
+    """Settings of a search."""
 
-    Attributes
-    ----------
-    largest : float
-        Largest scaled size of a shock.
-    directions : int
-        Number of directions of a shell, if more than one state is shocked.
-    norm : str
-        ``"euclidean"`` or ``"largest"``, of the scaled jumps.
-    precision : float
-        Relative length to which the last ray is divided.
-    confirmations : int
-        Random smaller shocks that are tried in a round of confirmation.
-    seed : int
-        Seed of directions and random shocks.
-    """
-
-    largest: float
-    directions: int
-    norm: Norm
-    precision: float
-    confirmations: int
-    seed: int
+    largest: float  # largest scaled size of a shock
+    directions: int  # number of directions of a shell, if more than one state is shocked
+    norm: Norm  # ``"euclidean"`` or ``"largest"``, of the scaled jumps
+    precision: float  # relative length to which the last ray is divided
+    confirmations: int  # random smaller shocks that are tried in a round of confirmation
+    seed: int  # seed of directions and random shocks
 
     def size(self, shocks: np.ndarray) -> np.ndarray:
         """Return the scaled sizes of shocks (..., dim)."""
@@ -140,35 +116,18 @@ class Settings:
 
 @dataclass(frozen=True)
 class Found:
-    """The smallest shock that leads away from an attractor.
+    """The smallest shock that leads away from an attractor."""
 
-    Attributes
-    ----------
-    low, high : float
-        Scaled sizes. Every shock smaller than `low` that was tried stayed. The shock of size `high` leads away;
-        infinite if none was found. The ends of some shocks between them are not known.
-    shock : ndarray, (dim,)
-        The shock of size `high`; NaN if none was found.
-    base : int
-        Number of its base state, -1 if none was found.
-    leads_to : int
-        Label of the end, `UNDECIDED` if none was found.
-    safe : float
-        Size of the largest shell below `low` of which all shocks stayed; 0 if there is none.
-    n_below : int
-        Number of shocks smaller than `low` that were tried; all of them stayed.
-    n_undecided : int
-        Number of shocks smaller than `high` whose end is not known.
-    """
-
+    # scaled sizes. Every shock smaller than `low` that was tried stayed. The shock of size `high` leads away;
+    # infinite if none was found. The ends of some shocks between them are not known.
     low: float
     high: float
-    shock: np.ndarray
-    base: int
-    leads_to: int
-    safe: float
-    n_below: int
-    n_undecided: int
+    shock: np.ndarray  # (dim,): the shock of size `high`; NaN if none was found
+    base: int  # number of its base state, -1 if none was found
+    leads_to: int  # label of the end, `UNDECIDED` if none was found
+    safe: float  # size of the largest shell below `low` of which all shocks stayed; 0 if there is none
+    n_below: int  # number of shocks smaller than `low` that were tried; all of them stayed
+    n_undecided: int  # number of shocks smaller than `high` whose end is not known
 
 
 @dataclass
@@ -417,21 +376,13 @@ class ShockSearch:
 
 @dataclass(frozen=True)
 class Bases:
-    """States on an attractor from which shocks start.
+    """States on an attractor from which shocks start."""
 
-    Attributes
-    ----------
-    states : ndarray, (n, state)
-        Neighbours in time next to each other.
-    phase : ndarray, (n,)
-        Time since the section before each state, as a share of the drive period, or of the period of an orbit of
-        a flow.
-    at_section : ndarray of bool, (n,)
-        Whether each state lies on the section, so that its grid of initial states applies.
-    """
-
-    states: np.ndarray
+    states: np.ndarray  # (n, state): neighbours in time next to each other
+    # (n,): time since the section before each state, as a share of the drive period, or of the period of an orbit of
+    # a flow
     phase: np.ndarray
+    # bool, (n,): whether each state lies on the section, so that its grid of initial states applies
     at_section: np.ndarray
 
     @property
@@ -535,20 +486,11 @@ class Shocked:
 
 @dataclass(frozen=True)
 class Asked:
-    """A search for shocks, with the base states and the states that are shocked.
+    """A search for shocks, with the base states and the states that are shocked."""
 
-    Attributes
-    ----------
-    search : generator
-        See `shocks.ShockSearch.run`.
-    bases : Bases
-    which : ndarray of int
-        Numbers of the shocked states.
-    """
-
-    search: Search
+    search: Search  # see `shocks.ShockSearch.run`
     bases: Bases
-    which: np.ndarray
+    which: np.ndarray  # numbers of the shocked states
 
 
 def search_together(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, Found]:

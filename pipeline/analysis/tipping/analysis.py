@@ -282,32 +282,18 @@ def _counts(ds: xr.Dataset) -> list[str]:
 
 @dataclass(frozen=True)
 class Bracket:
-    """An interval of a swept number, at whose ends a trajectory ends on different attractors.
+    """An interval of a swept number, at whose ends a trajectory ends on different attractors."""
 
-    Attributes
-    ----------
-    start : int
-        Number of the initial condition.
-    point : tuple of float
-        Values of the other axes.
-    low, high : float
-        Ends of the interval.
-    outcome_low, outcome_high : int
-        Attractors at the ends, or `DIVERGED`.
-    n_evaluated : int
-        Trajectories integrated by the bisection.
-    is_decided : bool
-        False if the bisection met a trajectory whose attractor could not be found.
-    """
-
-    start: int
-    point: tuple[float, ...]
+    start: int  # number of the initial condition
+    point: tuple[float, ...]  # values of the other axes
+    # ends of the interval
     low: float
     high: float
+    # attractors at the ends, or `DIVERGED`
     outcome_low: int
     outcome_high: int
-    n_evaluated: int = 0
-    is_decided: bool = True
+    n_evaluated: int = 0  # trajectories integrated by the bisection
+    is_decided: bool = True  # false if the bisection met a trajectory whose attractor could not be found
 
     def halved(self, middle: float, outcome: int) -> Bracket:
         """Return the half at whose ends the outcomes differ, the lower one if both do."""

@@ -60,46 +60,24 @@ LINKS, HALVINGS, TOGETHER = 16, 6, 0.1
 
 @dataclass(frozen=True, eq=False)
 class BoundedSet:
-    """A non-periodic set: its kind (chaotic, torus or other bounded set), its stability and the evidence for it.
+    """A non-periodic set: its kind (chaotic, torus or other bounded set), its stability and the evidence for it."""
 
-    Attributes
-    ----------
-    cells : ndarray of int64
-        Sampled cells that are on it at the end.
-    cloud : Cloud or None
-        Section points to compare other cells with.
-    points : ndarray, (n, state)
-        Some of its section points.
-    kind, stability, evidence : int
-        Codes of `vocabulary.KINDS`, `STABILITIES` and `EVIDENCE`.
-    growth : Growth or None
-        None if there are not enough sections.
-    n_sampled, n_left, n_leaving : int
-        Numbers of cells that were extended, that left it, and that were near their end from the start.
-    time_at_risk : float
-        Sum over all sampled cells [drive periods or returns].
-    ended : dict
-        Numbers of cells that left it, by `Course.end`.
-    closes_above : int
-        Period with which it may close, longer than the search allows; 0 if none is seen.
-    dimension : int
-        Dimension of a torus; 0 of any other set.
-    """
-
-    cells: np.ndarray
-    cloud: Cloud | None
-    points: np.ndarray
+    cells: np.ndarray  # sampled cells that are on it at the end
+    cloud: Cloud | None  # section points to compare other cells with
+    points: np.ndarray  # (n, state): some of its section points
+    # codes of `vocabulary.KINDS`, `STABILITIES` and `EVIDENCE`
     kind: int
     stability: int
     evidence: int
-    growth: Growth | None
+    growth: Growth | None  # None if there are not enough sections
+    # numbers of cells that were extended, that left it, and that were near their end from the start
     n_sampled: int
     n_left: int
     n_leaving: int
-    time_at_risk: float
-    ended: dict[int, int]
-    closes_above: int = 0
-    dimension: int = 0
+    time_at_risk: float  # sum over all sampled cells [drive periods or returns]
+    ended: dict[int, int]  # numbers of cells that left it, by `Course.end`
+    closes_above: int = 0  # period with which it may close, longer than the search allows; 0 if none is seen
+    dimension: int = 0  # dimension of a torus; 0 of any other set
 
     @classmethod
     def neutral(cls) -> BoundedSet:

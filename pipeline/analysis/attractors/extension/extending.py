@@ -67,27 +67,13 @@ LOOK_BACK = 4
 
 @dataclass
 class Outcome:
-    """Result of the further integration of the trajectories of one parameter point.
+    """Result of the further integration of the trajectories of one parameter point."""
 
-    Attributes
-    ----------
-    orbits : list of Orbit
-        Known orbits, old and new.
-    courses : list of Course
-        Sampled cells.
-    sets : list of BoundedSet
-        Sets that do not close.
-    spent : int
-        Periods integrated.
-    ran_out : bool
-        Whether the budget ended the work.
-    """
-
-    orbits: list[Orbit]
-    courses: list[Course]
-    sets: list[BoundedSet]
-    spent: int = 0
-    ran_out: bool = False
+    orbits: list[Orbit]  # known orbits, old and new
+    courses: list[Course]  # sampled cells
+    sets: list[BoundedSet]  # sets that do not close
+    spent: int = 0  # periods integrated
+    ran_out: bool = False  # whether the budget ended the work
 
 
 def extend(
