@@ -139,7 +139,7 @@ def compare(found, wanted):
     assert found["versions"] == wanted["versions"], "a version was raised: store the new numbers"
     assert found["values"].keys() == wanted["values"].keys()
     for name, value in wanted["values"].items():
-        expected = value if isinstance(value, str) else pytest.approx(value, rel=1e-7, abs=1e-12)
+        expected = value if isinstance(value, str) else pytest.approx(value, rel=1e-7, abs=1e-8)
         assert found["values"][name] == expected, name
 
 
