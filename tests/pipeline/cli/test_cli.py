@@ -15,9 +15,9 @@ from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.plots import bifurcation
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
-from pipeline.runs import workflows
 from pipeline.runs.derive import derive
 from pipeline.runs.preview import figure_command
+from pipeline.specification import files as workflows
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
 
