@@ -11,7 +11,7 @@ import re
 import pytest
 
 from pipeline.products.registry import ANALYSES, FIGURES
-from pipeline.report.runs import command_of
+from pipeline.report.report import command_of
 from pipeline.report.study import load_study
 from pipeline.specification.files import find_spec, shipped_workflows
 from pipeline.specification.problems import validated

@@ -69,8 +69,8 @@ def animate(
     --frequency, --preset and --set choose. Give a start by the model's names: --NAME VALUE, or --NAME-deg VALUE
     for an angle or its rate; other states are 0. A periodic motion gives a film without a jump. MP4 needs ffmpeg.
     """
-    from pipeline.plots.files import save_data
-    from pipeline.plots.films import film_problems, save_animation
+    from pipeline.plots.animation import film_problems, save_animation
+    from pipeline.plots.figure import save_data
     from pipeline.runs.filming import animation
     from pipeline.specification.problems import SpecError
     from pipeline.store.files import FIGURES

@@ -36,8 +36,7 @@ def export(
     The files hold the diagram, its overlays and the orbits of attractors, but no live integration. Parts that
     do not fit into one file are left out, and the page names them.
     """
-    from pipeline.explorer.copies.export import export_page
-    from pipeline.explorer.copies.folder import export_folder
+    from pipeline.explorer.copies.export import export_folder, export_page
     from pipeline.specification.problems import SpecError
     from pipeline.store.run import RunDirectory
 

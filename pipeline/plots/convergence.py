@@ -15,8 +15,8 @@ from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import model_of, period_of, periods_of, split_dims
 from pipeline.plots import labels, style
-from pipeline.plots.exponents import UNITS, left_out
 from pipeline.plots.figure import frame_of, noted, values_of
+from pipeline.plots.lyapunov import UNITS, left_out
 from pipeline.products.figures import ConvergenceOptions
 
 MOST_LINES = 24

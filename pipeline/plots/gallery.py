@@ -1,6 +1,4 @@
-"""Draw all attractors of one parameter point, with their phase portraits and the path of a point of the model's
-drawing.
-"""
+"""Draw all attractors of one parameter point: phase portraits, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ from pipeline.analysis.selection import place
 from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, once, parameters_of, told_by
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
-from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
+from pipeline.plots.trajectory import Motion, draw_path, draw_portrait, equalise, fixed_handles
 from pipeline.products.product import FigureOptions
 
 MAX_ROWS = 8

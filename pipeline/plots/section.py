@@ -16,12 +16,10 @@ from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
 from pipeline.layout.vocabulary import model_of, section_name, split_dims
 from pipeline.plots import labels, palette, pixels, style
-from pipeline.plots.bifurcation import fixed_of
-from pipeline.plots.figure import frame_of, noted, values_of
-from pipeline.plots.missing_cells import absent_handles, say_empty
-from pipeline.plots.motions import Motions
+from pipeline.plots.bifurcation import absent_handles, fixed_of, say_empty
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
+from pipeline.plots.palette import Motions
 from pipeline.plots.points import View, make_view, survey
-from pipeline.plots.selection import at_points
 from pipeline.products.figures import SectionOptions
 
 _MOST_PT, _LEAST_PT = 1.7, 0.45

@@ -33,10 +33,9 @@ from pipeline.products.reporting import report
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.versions import current, key_of
 from pipeline.specification.spec import Spec
-from pipeline.store.blocks import read_block, write_block
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files
-from pipeline.store.products import BLOCKS
+from pipeline.store.products import BLOCKS, read_block, write_block
 
 WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 8192
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""

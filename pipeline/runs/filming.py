@@ -93,7 +93,7 @@ def animation(
     Returns
     -------
     Animation
-        Animation that `pipeline.plots.films.save_animation` draws and writes.
+        Animation that `pipeline.plots.animation.save_animation` draws and writes.
 
     Raises
     ------
@@ -103,8 +103,7 @@ def animation(
         If a trajectory diverges.
     """
     from pipeline.plots.animation import plot_animation, portraits_of
-    from pipeline.plots.figure import run_provenance
-    from pipeline.plots.files import with_provenance
+    from pipeline.plots.figure import run_provenance, with_provenance
 
     if isinstance(options, AnimationOptions):
         wanted = options

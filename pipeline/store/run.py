@@ -33,26 +33,13 @@ def _short(text: str) -> str:
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """An opened run directory with the commit records found when it was opened, so that all results use the same cells.
+    """An opened run directory with the commit records found when it was opened: all results use the same cells."""
 
-    Attributes
-    ----------
-    info : RunInfo
-        Content of ``run.json``.
-    spec : Spec
-        Specification of the run.
-    plan : Plan
-        Plan that follows from `spec`.
-    commits : Records
-        Valid commit records by task.
-    known : dict
-        Contents of small files of the set-up by key, which were compared with their digests in ``run.json``.
-    """
-
-    info: RunInfo
-    spec: Spec
-    plan: Plan
-    commits: Records
+    info: RunInfo  # content of ``run.json``
+    spec: Spec  # specification of the run
+    plan: Plan  # plan that follows from `spec`
+    commits: Records  # valid commit records by task
+    # contents of small files of the set-up by key, which were compared with their digests in ``run.json``
     known: Mapping[str, bytes] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod

@@ -107,6 +107,7 @@ def quietly(spec: Any, out: str | Path, **options: Any) -> Any:
 
 def finished(folder: Path, text: str) -> Path:
     """Write a specification into a folder, run it there, and return the run directory."""
+    folder.mkdir(exist_ok=True)
     (folder / "spec.toml").write_text(text, "utf-8")
     quietly(folder / "spec.toml", folder / "run")
     return folder / "run"

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, polish
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.sets import nearest_distances
@@ -53,7 +53,7 @@ def orbits_on(
     max_period
         Longest period [drive periods or returns].
     """
-    point, settings = there.point, there.settings
+    point = there.point
     if not paths or not max_period or (point.can_rest and not point.is_flow):
         return []
     starts = [_starts(paths, period, there) for period in range(1, max_period + 1)]
@@ -61,15 +61,9 @@ def orbits_on(
     found = search_orbits(
         np.concatenate(starts), periods, point.frequency, point.packed, point.integrates, rounds=ROUNDS
     )
-    n = len(found)
-    polished = polish(
-        np.tile(point.packed, (n, 1)),
-        np.full(n, point.frequency),
-        np.array([one.points[0] for one in found]).reshape(n, -1),
+    polished = there.polished(
+        np.array([one.points[0] for one in found]).reshape(len(found), point.n_states),
         np.array([one.period for one in found], np.int64),
-        geometry=there.geometry,
-        system=point.integrates,
-        tolerance=settings.residual,
     )
     every = np.concatenate(paths)
     near = [

@@ -19,7 +19,7 @@ from magpend_core.sampling import sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.attractors.extension.clouds import is_stationary
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.equilibria import equilibria_near
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
@@ -166,21 +166,21 @@ class Tracking:
 
     def _advance(self, pairs: Sequence[Pair]) -> None:
         """Integrate pairs to the next section."""
-        found = self._there.advance(np.concatenate([pair.ends for pair in pairs]), 1)
-        states = found.section[:, 0, -1].reshape(len(pairs), 2, -1)
-        last = found.final_state[:, 0].reshape(len(pairs), 2, -1)
-        status = found.status[:, 0].reshape(len(pairs), 2)
-        for i, (pair, own, end, codes) in enumerate(zip(pairs, states, last, status, strict=True)):
+        flight = self._there.fly(np.concatenate([pair.ends for pair in pairs]))
+        found = flight.advance(1)
+        states = found.state.reshape(len(pairs), 2, -1)
+        status = found.status.reshape(len(pairs), 2)
+        for i, (pair, own, codes) in enumerate(zip(pairs, states, status, strict=True)):
             if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all() and (own[0] != own[1]).any():
                 before, pair.ends = pair.ends[0], own
                 if self._width(pair) > WIDEST * self._limits.farthest:
                     pair.reason = PARTED
-                    if self._there.point.can_rest and found.return_time is not None:
-                        self._pass(pair, before, float(found.return_time[2 * i, 0, -1]))
+                    if self._there.point.is_flow:
+                        self._pass(pair, before, float(flight.seconds[2 * i, 0]))
                 continue
             pair.reason = LOST
             if self._there.point.can_rest and (codes == Status.NO_RETURN).any():
-                self._rest(pair, end[codes == Status.NO_RETURN])
+                self._rest(pair, own[codes == Status.NO_RETURN])
 
     # ---- bisection -----------------------------------------------------------------------------
 
@@ -240,16 +240,7 @@ class Tracking:
         period = int(np.argmax(np.array(lags) <= near)) + 1
         if self._there.point.can_rest and self._rest(pair, path[-1:]):
             return
-        point = self._there.point
-        orbit = polish(
-            point.packed[None],
-            np.array([point.frequency]),
-            path[-1:],
-            np.array([period]),
-            geometry=self._geometry,
-            system=point.integrates,
-            tolerance=self._there.settings.residual,
-        )[0]
+        (orbit,) = self._there.polished(path[-1:], np.array([period]))
         if orbit is None or n_unstable(orbit) != 1:
             return
         if self._geometry.distance(orbit.points, path[-1]).min() <= near:

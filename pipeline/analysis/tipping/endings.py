@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core import Status, run_branches
+from magpend_core import Status
 from magpend_core.models.drift.ramps import motions_of
 from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.attractors import identify
@@ -17,6 +17,7 @@ from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
+from pipeline.motion.steady import Inputs, Steady
 from pipeline.products.tipping import TippingOptions
 from pipeline.specification.spec import Spec
 
@@ -141,31 +142,19 @@ def endings(
 
 def _going_on(run: OpenRun, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
     """Return a cube of trajectories that go on from given states at constant parameters, as of a sweep."""
-    integration, model = run.spec.integration, final.parameters.model
-    n = len(states)
-    found = run_branches(
-        np.tile(final.parameters.pack(), (n, 1, 1)),
-        np.full((n, 1), final.frequency_hz),
-        states,
-        n_transient=options.settle,
-        n_keep=options.keep,
-        rtol=integration.rtol,
-        atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period,
-        closure_tolerance=integration.closure_tolerance,
-        max_orbit_period=integration.max_orbit_period,
-        system=model.system,
-        method=integration.method,
-    )
+    model, n = final.parameters.model, len(states)
+    length = {"n_transient": options.settle, "n_keep": options.keep}
+    motion = Steady(model, run.spec.integration.model_copy(update={**length, "stop_when_closed": False}))
+    inputs = Inputs(np.tile(final.parameters.pack(), (n, 1, 1)), np.full((n, 1), final.frequency_hz), states)
+    found, _ = motion.integrate(inputs, None)
     names = ("status", "orbit_period", "n_periods", "n_steps", "n_rejected", "step_size")
     data: dict[str, Any] = {name: ((START,), getattr(found, name)[:, 0]) for name in names}
     data["section"] = ((START, "period_index", "state"), found.section[:, 0])
     if model.angles:
         data["turns"] = ((START, model.angle_dim), found.turns[:, 0])
     attrs = {
-        **integration.model_dump(),
-        "n_transient": options.settle,
-        "n_keep": options.keep,
+        **run.spec.integration.model_dump(),
+        **length,
         "kind": "sweep",
         "model": model_attribute(model),
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in final.parameters.items()),

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import KEY
+from pipeline.explorer import RequestError
 from pipeline.explorer.live.jobs import PATIENCE_S, Job
-from pipeline.explorer.live.messages import Region, RequestError, RunRequest
+from pipeline.explorer.live.messages import Region, RunRequest
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.identity import canonical
 from pipeline.layout.plan import check_plan, make_plan
@@ -45,13 +46,7 @@ _PACKAGES = Path(__file__).parents[3]
 
 
 def zoomed(run: RunDirectory, region: Region) -> tuple[Spec, list[str]]:
-    """Return the specification for a selected region, and notes on the parts of it that lie outside the run.
-
-    Raises
-    ------
-    SpecError, RequestError
-        If the region is none of this run's.
-    """
+    """Return the specification for a selected region, and notes on the parts of it that lie outside the run."""
     return zoom(run.spec, changes_of(run, region))
 
 
@@ -130,13 +125,7 @@ def region_name(run: RunDirectory, spec: Spec) -> str:
 
 
 class RegionRunner:
-    """Computes the runs of selected regions, one at a time for all users.
-
-    Parameters
-    ----------
-    live
-        The run.
-    """
+    """Computes the runs of selected regions, one at a time for all users."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._busy = live, live.region_lock

@@ -34,7 +34,7 @@ from pipeline.analysis.chaos.dimensions import kaplan_yorke_dimension as kaplan_
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
 from pipeline.compute.simulate import simulate as simulate
-from pipeline.explorer.notebook.showing import explorer as explorer
+from pipeline.explorer.notebook import explorer as explorer
 from pipeline.plots import DataFigure as DataFigure
 from pipeline.plots import Frame as Frame
 from pipeline.plots import draw_figure as draw_figure
@@ -56,7 +56,7 @@ from pipeline.plots import plot_section as plot_section
 from pipeline.plots import plot_trajectory as plot_trajectory
 from pipeline.plots import save_data as save_data
 from pipeline.plots import save_figure as save_figure
-from pipeline.plots.films import save_animation as save_animation
+from pipeline.plots.animation import save_animation as save_animation
 from pipeline.rig.identify.identification import identify as identify
 from pipeline.rig.recordings import findings_of as findings_of
 from pipeline.rig.recordings import load_mapping as load_mapping

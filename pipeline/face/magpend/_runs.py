@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from magpend._plots import Plots
-    from pipeline.explorer.notebook.widget import Explorer
+    from pipeline.explorer.widget import Explorer
     from pipeline.runs.status import State
     from pipeline.store.checking import Verification
     from pipeline.store.files import Files
@@ -183,7 +183,7 @@ class Run(RunDirectory):
         >>> widget = run.explore()                                           # doctest: +SKIP
         >>> widget.selected["state"]                                         # doctest: +SKIP
         """
-        from pipeline.explorer.notebook.showing import explorer
+        from pipeline.explorer.notebook import explorer
 
         return explorer(self, curves=curves, height=height)
 

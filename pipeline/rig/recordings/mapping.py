@@ -173,21 +173,10 @@ def load_mapping(path: str | Path) -> Mapping:
 
 
 def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT) -> Mapping:
-    """Validate a recording's mapping, given as tables or as the text of a TOML file.
+    """Validate a recording's mapping, given as tables or as the text of a TOML file; `source` names it in messages.
 
-    Parameters
-    ----------
-    data
-        Tables, or their text.
-    source
-        Name of the data in messages.
-    folder
-        Folder that a model's file is relative to; None for kept data: no file is read, nothing is imported.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
+    A model's file is relative to `folder`; None is for kept data: no file is read, nothing is imported. Raise
+    `SpecError` with all problems at once.
     """
     tables = tomllib.loads(data) if isinstance(data, str) else dict(data)
     problems: list[str] = []

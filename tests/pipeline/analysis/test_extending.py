@@ -19,7 +19,7 @@ from pipeline.analysis.attractors.extension.extending import Outcome, _Extension
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Slopes
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
@@ -73,8 +73,9 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0) -> Outcome:
                 section[:, i] = state
             n = len(state)
             status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
-            answer = Extended(
-                section, status, np.zeros(n, int), np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG))
+            none = np.zeros(n, int)
+            answer = Block(
+                slice(0, n), section, status, none, np.zeros((n, 0), int), seconds=np.ones((n, LEG)), step=np.zeros(n)
             )
         elif isinstance(asked, Slopes):
             point.rtols.append(asked.rtol)

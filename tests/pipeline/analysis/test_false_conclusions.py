@@ -19,7 +19,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.extending import extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Settings, Slopes
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Settings, Slopes
 from pipeline.analysis.attractors.finding.stability import BY_ONE_SIDE
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.sets import Geometry
@@ -331,7 +331,9 @@ def extended(point, budget):
                 state = section[:, i] = point.step(state)
             status = np.full(n, Status.BOUNDED)
             none = np.zeros(n, int)
-            answer = Extended(section, status, none, np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG)))
+            answer = Block(
+                slice(0, n), section, status, none, np.zeros((n, 0), int), seconds=np.ones((n, LEG)), step=np.zeros(n)
+            )
         elif isinstance(asked, Slopes):
             slopes = np.where(asked.point < 0.5, point.slope, -point.slope)
             answer = point.step(asked.point), slopes[:, :, None]

@@ -17,7 +17,7 @@ from pipeline.analysis.resilience.edge_table import edge_table
 from pipeline.analysis.resilience.shocks import Settings, ShockSearch
 from pipeline.analysis.resilience.table import resilience_table
 from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
-from pipeline.plots.edge import plot_edge
+from pipeline.plots.basins import plot_edge
 from pipeline.plots.resilience import plot_resilience
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError

@@ -16,7 +16,7 @@ import time
 
 import pytest
 
-from pipeline.compute import addresses, clients, probe
+from pipeline.compute import addresses, clients
 from pipeline.compute.addresses import Address, SchedulerError, ask, read_address
 from pipeline.compute.clients import Where, connected
 from pipeline.compute.jobqueue import settings
@@ -25,6 +25,7 @@ from pipeline.runs.run import run
 from pipeline.specification.clusters import SYSTEMS, load_cluster
 from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import LOOPBACK, duffing, quietly, silent
+from tests.pipeline.runs.test_own_systems import probe
 
 SPEC = duffing(
     "frequency_hz = { start = 0.15, stop = 0.25, num = 12 }",

@@ -12,8 +12,7 @@ import pytest
 import xarray as xr
 
 from magpend_core import load_preset, run_branches, trajectory
-from pipeline.compute.closing import TOLERANCE, closing_of
-from pipeline.compute.simulate import simulate, write_series
+from pipeline.compute.simulate import TOLERANCE, closing_of, simulate, write_series
 from pipeline.specification.problems import SpecError
 from pipeline.specification.recorded_drive import load_drive
 from tests.pipeline.factories import edges

@@ -16,14 +16,15 @@ from functools import partial
 import psutil
 import pytest
 
-from pipeline.compute import dispatch, limits
+from pipeline.compute import dispatch
 from pipeline.compute import order as ordering
 from pipeline.compute.addresses import SchedulerError
+from pipeline.compute.dispatch import Limits
 from pipeline.compute.execute import run_tasks
-from pipeline.compute.limits import Limits
 from pipeline.compute.order import Order, TaskFailedError
 from pipeline.compute.processes import Processes
 from pipeline.compute.threads import in_threads, writing_results
+from pipeline.plots.style import limits
 from pipeline.runs import blocks
 from pipeline.runs.derive import AnalysedRun, derive
 from tests.pipeline.factories import wait_for

@@ -10,13 +10,15 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
+from pipeline.analysis.attractors.destinations import destinations_at
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
-from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.live import Legend, LiveRun
 from pipeline.explorer.live.messages import MOST_BYTES, Region
+from pipeline.explorer.live.orbit_following import _period_of_attractor
 from pipeline.explorer.live.regions import zoom_toml, zoomed
 from pipeline.explorer.live.settling import settle_cells
 from pipeline.layout.vocabulary import (
@@ -28,15 +30,15 @@ from pipeline.layout.vocabulary import (
     NOT_SETTLED,
     PERIODIC_ORBIT,
     UNSTABLE,
+    split_dims,
 )
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.status import state
 from pipeline.specification.spec import Spec
 from pipeline.store.run import RunDirectory
-from tests.pipeline.explorer.small_runs import FLOW, finished
-
-HZ = 0.15915494309189535
+from tests.pipeline.explorer.small_runs import FLOW, HZ
+from tests.pipeline.factories import finished
 
 DRIVEN = """
 kind = "sweep"
@@ -48,6 +50,15 @@ initial_conditions.x = { start = -0.9375, stop = 0.9375, num = 16 }
 initial_conditions.v = { start = -0.5, stop = 1.0, num = 7 }
 integration = { rtol = 1e-7, atol = 1e-7, n_transient = %d, n_keep = 12, stop_when_closed = %s }
 """
+
+
+def test_follow__period_of_a_cell_is_that_of_its_attractor(little):
+    live = LiveRun(RunDirectory.open(little))
+    periods = live.cube["orbit_period"].values
+    found = [_period_of_attractor(live, {"x_0": i}) for i in range(periods.size)]
+    live.close()
+    assert np.all((periods == 0) | (periods % np.array(found) == 0))
+    assert min(found) > 0
 
 
 @pytest.fixture(scope="module")
@@ -437,3 +448,25 @@ def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
     ):
         assert word in watcher.ask(**wrong)["error"]
     assert watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})["kind"] == "done"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["whole", "closing", "flow"])
+def test_settle_cells__ends_where_the_analysis_follows(directories, name):
+    """The live page and the analyses name the same attractor for the same initial states."""
+    opened = RunDirectory.open(directories[name])
+    live, cube, attractors = LiveRun(opened), opened.cube(), derive(directories[name], "attractors")
+    rng, n_named = np.random.default_rng(3), 0
+    for points in slabs(cube, Dynamics.of(cube), BUDGET):
+        for index, there in destinations_at(cube, attractors, points):
+            (axis,) = split_dims(cube["status"])[0]
+            place = live.place({axis: float(cube[axis][index[0]])}, None)
+            catalog = live.catalog(place)
+            starts = rng.uniform(-0.9, 0.9, (64, 2))
+            numbers = settle_cells(place, live.integration, catalog, starts, lambda: None)
+            labels = there.follow(starts).label
+            ends = [catalog.entry(number) for number in numbers.tolist()]
+            named = [i for i, end in enumerate(ends) if end.attractor is not None and end.stability == ATTRACTS]
+            assert [ends[i].attractor for i in named] == labels[named].tolist()
+            n_named += len(named)
+    assert n_named > 64

@@ -9,8 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pipeline.analysis.ragged import dense
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.view import describe_view
 from pipeline.runs.derive import derive
@@ -83,9 +84,9 @@ def test_curve_orbit__by_another_integrator(bent):
 
 def test_curve_orbit__what_is_not_there(bent):
     line, plane = bent
-    with pytest.raises(ExplorerError, match="curve = 99"):
+    with pytest.raises(RequestError, match="curve = 99"):
         curve_orbit(RunDirectory.open(line), 99, 0)
-    with pytest.raises(ExplorerError, match="point = 99999"):
+    with pytest.raises(RequestError, match="point = 99999"):
         curve_orbit(RunDirectory.open(line), 0, 99999)
-    with pytest.raises(ExplorerError, match="there are 0 curves"):
+    with pytest.raises(RequestError, match="there are 0 curves"):
         curve_orbit(RunDirectory.open(plane), 0, 0)

@@ -10,16 +10,15 @@ from urllib.parse import urlencode
 
 import pytest
 
+from pipeline.explorer import server as sockets
+from pipeline.explorer.answers import ANSWERS, Answering
+from pipeline.explorer.connection import MOST_PAGES, Connection
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import orbit
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import orbit
 from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live.messages import MOST_BYTES
-from pipeline.explorer.notebook.connection import MOST_PAGES, Connection
-from pipeline.explorer.serving import socket as sockets
-from pipeline.explorer.serving.answering import Answering
-from pipeline.explorer.serving.answers import ANSWERS
 from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import PATIENCE_S
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import magpend
-from pipeline.explorer.notebook.showing import explorer
+from pipeline.explorer.notebook import explorer
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import PATIENCE_S
@@ -99,7 +99,7 @@ def test_explore__is_a_method_of_a_run(little, widget):
 
 def test_explorer__says_what_is_missing(little, monkeypatch):
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    monkeypatch.delitem(sys.modules, "pipeline.explorer.notebook.widget", raising=False)
+    monkeypatch.delitem(sys.modules, "pipeline.explorer.widget", raising=False)
     with pytest.raises(SpecError, match=r"pip install '\.\[notebook\]'"):
         explorer(little)
     with pytest.raises(SpecError, match="height = 100: must be 320 pixels or more"):

@@ -11,11 +11,11 @@ from pydantic import ValidationError
 from scipy.stats import norm
 
 from pipeline.products.product import Table
-from pipeline.report import result_measures
+from pipeline.report import measures
+from pipeline.report.estimates import Verdict
 from pipeline.report.measures import MEASURES
 from pipeline.report.reproduce import judge, spelled
 from pipeline.report.study import ClaimTable
-from pipeline.report.verdicts import Verdict
 from pipeline.specification.problems import SpecError
 
 ORBIT = {"kind": "orbit", "rate": math.nan}
@@ -42,7 +42,7 @@ class Analysed:
 
 @pytest.fixture
 def analysed(monkeypatch):
-    monkeypatch.setattr(result_measures, "function_of", lambda name: lambda ds: Table(ROWS, []))
+    monkeypatch.setattr(measures, "function_of", lambda name: lambda ds: Table(ROWS, []))
     return Analysed()
 
 

@@ -17,8 +17,8 @@ from pipeline.products.registry import ANALYSES
 from pipeline.runs import derive as deriving
 from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
+from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError
-from pipeline.store.packing import withdraw
 from pipeline.store.run import RunDirectory
 
 QUICK = {"polish": False, "extend": False}

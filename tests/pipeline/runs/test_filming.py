@@ -15,7 +15,7 @@ from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import TRANSIENT
 from pipeline.plots import palette
-from pipeline.plots.films import durations
+from pipeline.plots.animation import durations
 from pipeline.products.animation import AnimationOptions
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun

@@ -25,8 +25,8 @@ from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.runfile import read_run
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.factories import finished, quietly
 

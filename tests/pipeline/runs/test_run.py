@@ -27,11 +27,11 @@ from pipeline.runs.progress import Progress
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
 from pipeline.specification.spec import Spec
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import entry_of
 from pipeline.store.runfile import read_run
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.conftest import SWEEP, WALK
 from tests.pipeline.factories import FOLD, LOOPBACK, WELL, duffing, edges, n_committed, quietly, silent, wait_for
 

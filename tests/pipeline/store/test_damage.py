@@ -23,12 +23,12 @@ from pipeline.layout.identity import digest_of
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
-from pipeline.store import commits, packing, products, records
-from pipeline.store.checksums import seal, unseal
+from pipeline.store import commits, products, records
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.products import write_product
 from pipeline.store.run import RunDirectory
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import contents, duffing, finished, quietly, silent
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
@@ -47,7 +47,7 @@ def values_of(directory):
 def sound(tmp_path_factory):
     """A finished run of two packs, a record of its own and the copy of that, with a product beside it."""
     folder, patch = tmp_path_factory.mktemp("damage"), pytest.MonkeyPatch()
-    for module in (records, commits, packing):
+    for module in (records, commits):
         patch.setattr(module, "BLOCK", 2)
     directory = finished(folder, SPEC)
     names = sorted(f.name for f in (directory / "commits").iterdir())

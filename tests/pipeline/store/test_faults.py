@@ -22,9 +22,9 @@ import pytest
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
 from pipeline.specification.spec import Spec
-from pipeline.store import commits, packing, records
-from pipeline.store.checksums import fits, unseal
+from pipeline.store import commits, records
 from pipeline.store.errors import StoreError
+from pipeline.store.stored_json import fits, unseal
 from tests.pipeline.factories import RESULT, duffing, quietly, result_of
 from tests.pipeline.store import faults
 from tests.pipeline.store.faults import CHANGES, MKDIR, OPEN, READ, RENAME, SYNC, WRITE, Disk, Steps
@@ -50,7 +50,7 @@ def go(folder):
 def finished(tmp_path_factory):
     """An uninterrupted run: its files, its numbers, and all that it did."""
     folder, patch = tmp_path_factory.mktemp("faults"), pytest.MonkeyPatch()
-    for module in (records, commits, packing):  # two records make a pack, so that packing is a step too
+    for module in (records, commits):  # two records make a pack, so that packing is a step too
         patch.setattr(module, "BLOCK", 2)
     (folder / "spec.toml").write_text(SPEC)
     go(folder)  # compiled, and imported

@@ -17,10 +17,10 @@ from pipeline.runs.derive import derive
 from pipeline.specification.models import KEPT
 from pipeline.specification.spec import Spec
 from pipeline.store import products
+from pipeline.store.arrays import Declared
 from pipeline.store.commits import read_commits
-from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from tests.pipeline.store.conftest import QUICK

@@ -27,10 +27,9 @@ from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
-from pipeline.store import commits, packing, records
-from pipeline.store.commits import read_commits, write_task
+from pipeline.store import commits, records
+from pipeline.store.commits import Packer, pack_block, read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
-from pipeline.store.packing import Packer, pack_block
 from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
 from tests.pipeline.factories import RESULT, duffing, finished, result_of, silent
@@ -100,7 +99,7 @@ class Life(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.patches = [patch.object(module, "BLOCK", 2) for module in (records, commits, packing)]
+        self.patches = [patch.object(module, "BLOCK", 2) for module in (records, commits)]
         for block in self.patches:
             block.start()
         self.folder = Path(tempfile.mkdtemp(prefix="life-"))

@@ -20,11 +20,11 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.runs.zoom import read_source
-from pipeline.store import lease, objects
+from pipeline.store import local, objects
 from pipeline.store.commits import read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError
 from pipeline.store.files import RECORD_COPY
-from pipeline.store.places import open_files
+from pipeline.store.local import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
 from pipeline.store.record_copy import write_copy
 from pipeline.store.run import RunDirectory
@@ -185,11 +185,11 @@ def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec,
         quietly(spec, PLACE)
     assert KEY_ID not in str(caught.value)
     s3.reset()
-    lease.LEASE_S, before = 0.0, lease.LEASE_S  # nobody could take the lock away
+    objects.LEASE_S, before = 0.0, objects.LEASE_S  # nobody could take the lock away
     try:
         assert quietly(spec, PLACE).complete
     finally:
-        lease.LEASE_S = before
+        objects.LEASE_S = before
     assert stored() == bytes_of(tmp_path / "run")
 
 
@@ -265,7 +265,7 @@ def test_write_product__the_seal_comes_last(remote, s3):
 
 
 def held_by(remote, **changes):
-    content = json.dumps({**lease.holder(), **changes}).encode()
+    content = json.dumps({**local.holder(), **changes}).encode()
     remote.info.files.write("lock", content)
     return content
 
@@ -288,16 +288,16 @@ def test_lease__lapses_when_it_is_not_renewed_and_at_once_when_its_process_was_k
     held_by(remote, host="elsewhere")
     with pytest.raises(LockedError, match=r"on elsewhere since .*lapses 150 s after"), remote.info.files.lock():
         pass
-    monkeypatch.setattr(lease, "LEASE_S", -1.0)
+    monkeypatch.setattr(objects, "LEASE_S", -1.0)
     with remote.info.files.lock():
         pass
 
 
 def test_lease__somebody_elses_is_left(remote, monkeypatch):
-    monkeypatch.setattr(lease, "RENEW_S", 0.05)
+    monkeypatch.setattr(objects, "RENEW_S", 0.05)
     with remote.info.files.lock():
         theirs = held_by(remote, host="elsewhere")
-        lease.threading.Event().wait(0.3)
+        objects.threading.Event().wait(0.3)
     assert remote.info.files.read("lock") == theirs
 
 

@@ -21,7 +21,6 @@ from pipeline.runs.derive import prune
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits, local
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import IncompleteError, LockedError, RefusedError, StoreError, UnreadableError
 from pipeline.store.files import RECORD_COPY
@@ -29,6 +28,7 @@ from pipeline.store.local import writer_lock
 from pipeline.store.products import open_product
 from pipeline.store.run import RunDirectory, open_run
 from pipeline.store.setup import check, establish
+from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import contents, duffing, quietly, silent
 
 # ---- places that no run may take ---------------------------------------------------------------

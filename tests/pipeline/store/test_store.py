@@ -25,19 +25,18 @@ from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
-from pipeline.store import commits, consolidate, packing, parallel_reads, products, records
-from pipeline.store.checksums import seal, unseal
-from pipeline.store.commits import marker_key, read_commits, scan, write_task
-from pipeline.store.declared import METADATA
+from pipeline.store import commits, consolidate, products, reading, records
+from pipeline.store.arrays import METADATA
+from pipeline.store.commits import Packer, marker_key, pack_block, read_commits, scan, withdraw, write_task
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.keys import keys_of
-from pipeline.store.packing import Packer, pack_block, withdraw
 from pipeline.store.record_copy import copied_records, write_copy
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run, write_run
 from pipeline.store.setup import create
 from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
+from pipeline.store.stored_json import seal, unseal
 from pipeline.store.view import CommittedStore
 from tests.pipeline.factories import contents, silent
 
@@ -47,7 +46,7 @@ PACKED = ["000000-000001.jsonl", "000002-000003.jsonl", "000004.json"]
 @pytest.fixture(autouse=True)
 def pairs(monkeypatch):
     """Two tasks a pack: of the five tasks one stays alone."""
-    for module in (records, commits, packing):
+    for module in (records, commits):
         monkeypatch.setattr(module, "BLOCK", 2)
 
 
@@ -369,7 +368,7 @@ def test_open_run__reads_no_chunk_before_it_is_used(whole, monkeypatch):
 
 def test_quick__builds_on_what_zarr_makes_public():
     """No module of `zarr.core`: what is there may change with any version."""
-    tree = ast.parse(Path(parallel_reads.__file__).read_text("utf-8"))
+    tree = ast.parse(Path(reading.__file__).read_text("utf-8"))
     modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert not {name for name in modules if name and name.startswith("zarr.core")}
 

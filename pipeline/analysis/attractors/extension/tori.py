@@ -11,6 +11,8 @@ it lies in one basin, since nothing grows, and are torn apart at the boundary of
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from magpend_core.models.sectioned import of_flow
@@ -19,7 +21,7 @@ from magpend_core.status import Status
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.extension.courses import Course
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Work
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Work
 from pipeline.analysis.sets import TWO_PI, Geometry
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 
@@ -101,7 +103,7 @@ def is_one_torus(a: Course, b: Course, geometry: Geometry) -> Work[bool]:
     return False
 
 
-def _leg(states: np.ndarray) -> Work[Extended | None]:
-    """Integrate states over a leg; None if one of them does not return."""
-    leg: Extended = yield Leg(states, np.zeros(len(states)))
+def _leg(states: np.ndarray) -> Work[Any]:
+    """Integrate states over a leg; return its `Block`, None if one of them does not return."""
+    leg = yield Leg(states, np.zeros(len(states)))
     return leg if np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED)).all() else None

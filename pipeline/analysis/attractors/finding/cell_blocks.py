@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -42,13 +42,19 @@ class Block:
     step: np.ndarray | None = None
     known_marks: np.ndarray | None = None
 
-    def take(self, rows: np.ndarray) -> Block:
+    def take(self, rows: np.ndarray | slice) -> Block:
         """Return a block of the cells at the given indices. Its attribute `cells` is still the range of the whole
         block.
         """
-        marks = None if self.known_marks is None else self.known_marks[rows]
-        section, status, period = self.section[rows], self.status[rows], self.orbit_period[rows]
-        return Block(self.cells, section, status, period, self.turns[rows], known_marks=marks)
+        arrays = {f.name: value for f in fields(self)[1:] if (value := getattr(self, f.name)) is not None}
+        return Block(self.cells, **{name: array[rows] for name, array in arrays.items()})
+
+    @property
+    def state(self) -> np.ndarray:
+        """State with which each cell goes on, (cell, state); NaN if it cannot."""
+        if self.rest is None:
+            return self.section[:, -1]
+        return np.where((self.status == Status.NO_RETURN)[:, None], self.rest, self.section[:, -1])
 
     @cached_property
     def marks(self) -> np.ndarray:

@@ -19,7 +19,7 @@ from pipeline.analysis.attractors.extension.growth import volumes_of
 from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
+from pipeline.layout.vocabulary import FREQUENCY_DIM, START, frequency_of, model_of, parameters_of, split_dims
 from pipeline.products.reporting import UNTOLD, report
 
 _READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
@@ -190,6 +190,23 @@ class Point:
     def n_states(self) -> int:
         """Number of state variables."""
         return int(self.cube.sizes["state"])
+
+    def holding(self, block: Block, n_periods: int = 0) -> Point:
+        """Return this parameter point with the trajectories of a block as its cells."""
+        n, n_kept = block.section.shape[:2]
+        seconds = np.full((n, n_kept), 1.0 / self.frequency) if block.seconds is None else block.seconds
+        return replace(
+            self,
+            cube=xr.Dataset({"section": ((START, "period_index", "state"), block.section)}),
+            at={},
+            arrays={},
+            start_dims=(START,),
+            block_cells=n,
+            at_rest=None,
+            on_cycle=None,
+            n_periods=n_periods,
+            _whole=replace(block, cells=slice(0, n), seconds=seconds),
+        )
 
     def blocks(self) -> Iterator[Block]:
         """Yield all cells in blocks, in the order of their initial conditions (or branches, in a continuation).

@@ -16,10 +16,10 @@ import xarray as xr
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
-from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.finding.cell_blocks import Guesses
+from pipeline.analysis.attractors.finding.cell_blocks import Block, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.flight import Flight
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.analysis.together import run_together
 from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
@@ -38,38 +38,15 @@ MOST_SLOPES = 16_384
 
 @dataclass(frozen=True)
 class Leg:
-    """Request to integrate trajectories over some more sections, from states (n, state) with step sizes (n,).
+    """Request to integrate trajectories over `LEG` more sections, from states (n, state) with step sizes (n,).
 
-    With a step size of 0 the engine chooses the step. `spent` is the part of the point's budget that is spent.
+    With a step size of 0 the engine chooses the step. `spent` is the part of the point's budget that is spent. The
+    answer is a `Block` of the new sections; its `state` and `step` continue the trajectories bit for bit.
     """
 
     state: np.ndarray
     step: np.ndarray
     spent: float = 0.0
-
-
-@dataclass(frozen=True)
-class Extended:
-    """Answer to a `Leg` request: section points, status and final states of the trajectories.
-
-    Attributes
-    ----------
-    section : ndarray, (n, LEG, state)
-    status, orbit_period : ndarray, (n,)
-    turns : ndarray, (n, angle)
-    state, step : ndarray
-        State (n, state) and step size (n,) that continue the trajectory bit for bit.
-    seconds : ndarray, (n, LEG)
-        Time from the previous section to each [s].
-    """
-
-    section: np.ndarray
-    status: np.ndarray
-    orbit_period: np.ndarray
-    turns: np.ndarray
-    state: np.ndarray
-    step: np.ndarray
-    seconds: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -156,6 +133,30 @@ class Settings:
             **asked,
         )
 
+    def fly(
+        self,
+        packed: np.ndarray,
+        frequency: np.ndarray | float,
+        states: np.ndarray,
+        most: int = LEG,
+        step: np.ndarray | None = None,
+    ) -> Flight:
+        """Return trajectories that are integrated as those of the run; see `Flight`."""
+        assert self.system is not None
+        return Flight(
+            replace(self.system, method=self.method),
+            packed,
+            frequency,
+            states,
+            rtol=self.rtol,
+            atol=self.atol,
+            max_steps=self.max_steps,
+            closure=self.closure,
+            longest=self.longest,
+            most=most,
+            step=step,
+        )
+
 
 def answer_all(
     works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings
@@ -198,39 +199,12 @@ def _gathered(
 
 def _legs(
     asked: Mapping[tuple[int, ...], Leg], points: Mapping[tuple[int, ...], Point], settings: Settings
-) -> dict[tuple[int, ...], Extended]:
-    assert settings.system is not None
+) -> dict[tuple[int, ...], Block]:
     sizes = [len(leg.state) for leg in asked.values()]
     packed, frequency, ends = _gathered(sizes, asked, points)
-    found = run_branches(
-        packed[:, None],
-        frequency[:, None],
-        np.concatenate([leg.state for leg in asked.values()]),
-        n_transient=0,
-        n_keep=LEG,
-        rtol=settings.rtol,
-        atol=settings.atol,
-        max_steps_per_period=settings.max_steps,
-        closure_tolerance=settings.closure,
-        max_orbit_period=settings.longest,
-        system=replace(settings.system, method=settings.method),
-        step_size=np.concatenate([leg.step for leg in asked.values()]),
-    )
-    seconds = np.broadcast_to(1.0 / frequency[:, None], (len(frequency), LEG))
-    if found.return_time is not None:
-        seconds = found.return_time[:, 0]
-    return {
-        index: Extended(
-            found.section[own, 0],
-            found.status[own, 0],
-            found.orbit_period[own, 0],
-            found.turns[own, 0],
-            found.final_state[own, 0],
-            np.nan_to_num(found.step_size[own, 0]),
-            seconds[own],
-        )
-        for index, own in _slices(asked, sizes, ends)
-    }
+    state, step = (np.concatenate([getattr(leg, name) for leg in asked.values()]) for name in ("state", "step"))
+    found = settings.fly(packed, frequency, state, step=step).advance(LEG)
+    return {index: found.take(own) for index, own in _slices(asked, sizes, ends)}
 
 
 def _slices(

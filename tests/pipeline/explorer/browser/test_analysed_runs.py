@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.ragged import dense
-from pipeline.explorer.data.disturbances import disturbances
+from pipeline.explorer.data.overlays import disturbances
 from pipeline.explorer.data.parameter_plane import parameter_plane
 from pipeline.runs.derive import stored
 from pipeline.store.run import RunDirectory

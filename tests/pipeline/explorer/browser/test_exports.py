@@ -12,8 +12,7 @@ import threading
 import numpy as np
 import pytest
 
-from pipeline.explorer.copies.export import export_page
-from pipeline.explorer.copies.folder import export_folder
+from pipeline.explorer.copies.export import export_folder, export_page
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.tables import table
