@@ -24,7 +24,7 @@ from pipeline.specification.clusters import QUEUES, Cluster, clock, load_cluster
 from pipeline.specification.problems import SpecError, import_extra
 from pipeline.store.errors import StoreError
 from pipeline.store.files import COMMITS
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 
 # ---- checks of workers -----------------------------------------------------------------------------
 

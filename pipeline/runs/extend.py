@@ -30,7 +30,7 @@ from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import is_run
 

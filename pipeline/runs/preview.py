@@ -18,7 +18,7 @@ from pipeline.runs.run import identity_here, ready
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.setup import check
 

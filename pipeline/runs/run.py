@@ -25,7 +25,7 @@ from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import Packer, log_timing, scan, sweep, withdraw
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError
 from pipeline.store.files import Files
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
 from pipeline.store.run import RunDirectory

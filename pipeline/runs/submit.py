@@ -25,7 +25,7 @@ from pipeline.specification.files import find_spec, specification_toml, toml_val
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.store.errors import LockedError
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 
 SCRIPT, SENT, TABLE = "job.sh", "job.json", "cluster.toml"
 _ANSWER_S = 60.0

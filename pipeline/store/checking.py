@@ -28,7 +28,7 @@ class Verification:
     # tasks of the run, and those that are committed and intact
     n_tasks: int
     n_committed: int
-    damaged: dict[str, str]  # problem by the file name of the commit record; see `packing.withdraw`
+    damaged: dict[str, str]  # problem by the file name of the commit record; see `commits.withdraw`
     skeleton: list[str]  # problems of metadata and coordinates
     leftovers: list[str]  # files without a valid commit record. They are harmless; the next run removes them.
     derived: dict[str, str] = field(default_factory=dict)  # problem by product name: products whose content has changed

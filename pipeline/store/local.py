@@ -22,19 +22,7 @@ from zarr.storage import LocalStore
 
 from pipeline.layout.writing import open_plain, sync_folder, write_atomically, writing
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
-from pipeline.store.files import (
-    ASIDE,
-    COMMITS,
-    CUBE,
-    HOLDER,
-    LOCK,
-    OWN_FILES,
-    OWN_NAMES,
-    RUN_FILE,
-    Files,
-    is_url,
-    local_path,
-)
+from pipeline.store.files import ASIDE, COMMITS, CUBE, HOLDER, LOCK, OWN_FILES, OWN_NAMES, RUN_FILE
 
 
 @dataclass(frozen=True)
@@ -412,21 +400,3 @@ def has_ended(content: bytes) -> bool:
 def is_note(content: bytes) -> bool:
     """Return whether a file's content is a note that names the holder of a lock."""
     return _holder_in(content) is not None
-
-
-# ---- folders and object stores ---------------------------------------------------------------------
-
-
-def open_files(place: str | Path | Files) -> Files:
-    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``; `Files` are returned
-    unchanged.
-
-    Raise `RefusedError` if it is another URL, or the object store cannot be used.
-    """
-    if not isinstance(place, (str, Path)):
-        return place
-    if is_url(place):
-        from pipeline.store.objects import parse_url  # an optional dependency
-
-        return parse_url(str(place))
-    return LocalFiles(local_path(place))

@@ -1,4 +1,4 @@
-"""Read and write a run's files in an object store, by a URL such as ``s3://bucket/prefix``.
+"""Open a run's files by path or URL, and read and write those in an object store, such as ``s3://bucket/prefix``.
 
 Objects are put whole, and commit records only once. Credentials come from the environment alone
 (``AWS_ACCESS_KEY_ID`` and the other names that S3 clients read). They are never kept, written or printed.
@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from itertools import islice
+from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
@@ -32,8 +33,8 @@ from zarr.storage import ObjectStore
 
 from pipeline.specification.problems import INSTALL
 from pipeline.store.errors import DamagedError, LockedError, RefusedError, StoreError, UnreadableError
-from pipeline.store.files import LOCK
-from pipeline.store.local import has_ended, holder, in_words
+from pipeline.store.files import LOCK, Files, is_url, local_path
+from pipeline.store.local import LocalFiles, has_ended, holder, in_words
 
 T = TypeVar("T")
 
@@ -83,6 +84,19 @@ _CREDENTIALS_HELP = (
     "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY in the environment of magpend and of its workers "
     "(AWS_SKIP_SIGNATURE=true for a bucket that is open to all)."
 )
+
+
+def open_files(place: str | Path | Files) -> Files:
+    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``; `Files` are returned
+    unchanged.
+
+    Raise `RefusedError` if it is another URL, or the object store cannot be used.
+    """
+    if not isinstance(place, (str, Path)):
+        return place
+    if is_url(place):
+        return parse_url(str(place))
+    return LocalFiles(local_path(place))
 
 
 class ObjectFiles:

@@ -28,7 +28,8 @@ from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, wr
 from pipeline.store.arrays import create_array, disagreements, product_problem
 from pipeline.store.errors import DamagedError, UnreadableError
 from pipeline.store.files import Files
-from pipeline.store.local import files_below, open_files, refuse_links, remove_tree, sync
+from pipeline.store.local import files_below, refuse_links, remove_tree, sync
+from pipeline.store.objects import open_files
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -31,7 +31,6 @@ from pipeline.store.arrays import METADATA, consolidated_metadata
 from pipeline.store.commits import read_commit
 from pipeline.store.errors import IncompleteError
 from pipeline.store.records import Commit
-from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import RunInfo
 from pipeline.store.view import CommittedStore, committed_view
 
@@ -187,7 +186,7 @@ def read_cells(
     return _read(info, plan, index, commit, region, names)
 
 
-def read_block(run: RunDirectory, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
+def read_block(run: OpenedRun, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read variables of one committed task of an open run. The dims of the task's block come first, then the
     variable's.
 

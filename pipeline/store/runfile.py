@@ -18,7 +18,7 @@ from pipeline.specification.recorded_drive import is_whole
 from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.provenance import provenance, versions
 from pipeline.store.stored_json import CHECKSUM, StoredRun, fits, has_seal, parsed, seal
 

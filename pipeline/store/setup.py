@@ -15,7 +15,8 @@ from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
-from pipeline.store.local import is_note, open_files, run_around
+from pipeline.store.local import is_note, run_around
+from pipeline.store.objects import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
 from pipeline.store.skeleton import entries_of, skeleton_files, skeleton_keys, skeleton_problems, write_skeleton
 from pipeline.store.stored_json import fits

@@ -34,7 +34,8 @@ from pipeline.rig.recordings import load_mapping
 from pipeline.specification.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import HOLDER, LOCK, RUN_FILE, entry_of, is_temporary, local_path, problems_of
-from pipeline.store.local import is_there, open_files, refuse_place, unreadable
+from pipeline.store.local import is_there, refuse_place, unreadable
+from pipeline.store.objects import open_files
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")

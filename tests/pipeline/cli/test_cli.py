@@ -17,7 +17,7 @@ from pipeline.plots import bifurcation
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs.derive import derive
 from pipeline.runs.preview import figure_command
-from pipeline.specification import files as workflows
+from pipeline.specification import files
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
 
@@ -212,13 +212,13 @@ def test_simulate__series_figure_and_data_with_provenance(main, tmp_path):
 def test_find_spec__of_the_gallery_by_its_folder_and_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = "gallery/ueda-attractor"
-    assert workflows.find_spec(name) == workflows.shipped_workflows()[name]
-    assert workflows.default_directory(workflows.find_spec(name), smoke=False) == Path("runs/ueda-attractor")
+    assert files.find_spec(name) == files.shipped_workflows()[name]
+    assert files.default_directory(files.find_spec(name), smoke=False) == Path("runs/ueda-attractor")
     with pytest.raises(SpecError, match="did you mean gallery/ueda-attractor"):
-        workflows.find_spec("gallery/ueda-atractor")
+        files.find_spec("gallery/ueda-atractor")
     (tmp_path / "gallery").mkdir()
     (tmp_path / name).write_text("", "utf-8")  # a file of one's own comes first
-    assert workflows.find_spec(name) == Path(name)
+    assert files.find_spec(name) == Path(name)
 
 
 # ---- magpend analyse -------------------------------------------------------------------------------------

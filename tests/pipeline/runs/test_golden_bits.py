@@ -107,6 +107,8 @@ def told(ds, exact):
     """Hash of each variable of a dataset, or its digits."""
     found = {}
     for name in sorted(map(str, ds.data_vars)):
+        if name == "normal_form_error":
+            continue  # an estimate from rounding errors, which differ between CPUs
         values = np.ascontiguousarray(ds[name].values)
         is_exact = exact or values.dtype.kind not in "fc"
         found[name] = hashlib.sha256(values.tobytes()).hexdigest()[:16] if is_exact else digits(values)

@@ -20,7 +20,7 @@ from pipeline.store import products
 from pipeline.store.arrays import Declared
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import DamagedError
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
 from tests.pipeline.store.conftest import QUICK

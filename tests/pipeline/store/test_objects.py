@@ -24,7 +24,7 @@ from pipeline.store import local, objects
 from pipeline.store.commits import read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError
 from pipeline.store.files import RECORD_COPY
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
 from pipeline.store.record_copy import write_copy
 from pipeline.store.run import RunDirectory
