@@ -9,8 +9,7 @@ from scipy.integrate import solve_ivp
 from magpend_core import lyapunov_exponents, run_branches
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import of_flow, sectioned
-from magpend_core.multipliers import orbit_exponents
-from magpend_core.orbits import polish_orbits, section_map
+from magpend_core.orbits import orbit_exponents, polish_orbits, section_map
 from tests.core.flows import HOPF, LORENZ, PAIR, ROSSLER, VAN_DER_POL, flow
 
 VAN_DER_POL_PERIOD = 6.663286859323130

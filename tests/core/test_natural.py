@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from magpend_core.natural import natural_size
+from magpend_core.sizes import natural_size
 
 
 @pytest.mark.parametrize(

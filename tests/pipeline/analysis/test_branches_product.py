@@ -10,7 +10,7 @@ from pipeline.analysis.branches.analysis import branches_table, curves_table
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
 from pipeline.analysis.ragged import dense
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
 from pipeline.products.branches import BranchOptions
 from pipeline.products.registry import ANALYSES, FIGURES

@@ -15,7 +15,7 @@ from pipeline.analysis.chaos.analysis import chaos_of, chaos_table, chaotic_cell
 from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean
 from pipeline.analysis.chaos.per_attractor import Nature
 from pipeline.analysis.ragged import dense
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import (
     ABSENT,
     ATTRACTS,
