@@ -165,25 +165,21 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 # ---- reading -----------------------------------------------------------------------------------
 
 
-def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
+def read_commits(info: RunInfo, plan: Plan) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
     If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this check
     would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of
-    chunks. `echo` prints a line for every record that does not count, with the reason.
+    chunks.
 
     Raise `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending,
     since a failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
-    records, rejected = scan(info, plan, copies=info.files.local is None)
-    problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
+    records, _ = scan(info, plan, copies=info.files.local is None)
     if not records.packs:  # a small run: listing its files takes little time
         absent = absent_objects(info, records)
         whole = {index: commit for index, commit in records.items() if index not in absent}
         records = Records(info.files, info.digest, whole)
-        problems = [f"task {i}: {problem}; it is computed again" for i, problem in absent.items()] + problems
-    for problem in problems if echo else ():
-        echo(problem)  # type: ignore[misc]
     return records
 
 

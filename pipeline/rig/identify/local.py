@@ -285,11 +285,6 @@ class _Point(NamedTuple):
 Echo = Callable[[Array, float], None]
 
 
-class _Ending(NamedTuple):
-    max_evaluations: int
-    tolerance: float
-
-
 def fit_local(
     problem: Problem,
     theta0: Array,
@@ -328,9 +323,9 @@ def fit_local(
     -----
     A robust loss takes residuals in units of their scale, which a first least-squares fit gives.
     """
+    ending = max_evaluations, tolerance
     if fixed:
-        return _fit_others(problem, theta0, starts, fixed, _Ending(max_evaluations, tolerance))
-    ending = _Ending(max_evaluations, tolerance)
+        return _fit_others(problem, theta0, starts, fixed, ending)
     first = problem.starts if starts is None else starts
     plain = replace(problem, loss="linear") if problem.loss != "linear" else problem
     fit = _solve(plain, theta0, first, ending, echo)
@@ -343,7 +338,7 @@ def fit_local(
     return replace(robust, n_evaluations=fit.n_evaluations + robust.n_evaluations)
 
 
-def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo: Echo | None) -> Fit:
+def _solve(problem: Problem, theta0: Array, starts: Array, ending: tuple[int, float], echo: Echo | None) -> Fit:
     from threadpoolctl import threadpool_limits
 
     walk = _Search(problem, starts, echo)
@@ -358,7 +353,7 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo
     return _outcome(point, walk.count, ended, message)
 
 
-def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, bool, str]:
+def _least_squares(walk: _Search, x: Array, ending: tuple[int, float]) -> tuple[Array, bool, str]:
     """Run `scipy.optimize.least_squares`; return its final point, whether it converged, and its message."""
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
@@ -374,11 +369,11 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
         bounds=(lower / sizes, upper / sizes),
         method="trf",
         x_scale="jac",
-        xtol=ending.tolerance,
-        ftol=0.1 * ending.tolerance,
+        xtol=ending[1],
+        ftol=0.1 * ending[1],
         gtol=None,
         tr_solver="lsmr" if sparse else "exact",
-        max_nfev=ending.max_evaluations,
+        max_nfev=ending[0],
     )
     return found.x, bool(found.status > 0), found.message
 
@@ -414,16 +409,12 @@ def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
 
 
 def _fit_others(
-    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], ending: _Ending
+    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], ending: tuple[int, float]
 ) -> Fit:
     """Fit with some unknowns fixed at given values; the returned fit contains all unknowns."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
-        problem.without(fixed),
-        np.asarray(theta0)[~held],
-        starts=starts,
-        max_evaluations=ending.max_evaluations,
-        tolerance=ending.tolerance,
+        problem.without(fixed), np.asarray(theta0)[~held], starts=starts, max_evaluations=ending[0], tolerance=ending[1]
     )
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
     theta[~held] = part.theta

@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -318,11 +318,11 @@ def _same(a: Regime, b: Regime, with_side: bool) -> bool:
 # ---- comparison ------------------------------------------------------------------------------------
 
 NOBODY = -1
+SEED = 0
+"""Seed of the samples drawn from sets that do not close."""
 
 
-def compare(
-    measured: xr.Dataset, run: AnalysedRun, *, at: Mapping[str, float] | None = None, seed: int = 0
-) -> xr.Dataset:
+def compare(measured: xr.Dataset, run: AnalysedRun) -> xr.Dataset:
     """Compare a measured bifurcation diagram with the attractors of a run of the same model over the drive frequency.
 
     Return `measured` with further variables. By step: ``noise_floor``, Wasserstein-1 between the halves of the step's
@@ -335,11 +335,11 @@ def compare(
     Raise `SpecError` if the run is of another model, has no frequency axis, or reaches none of the measured
     frequencies.
     """
-    computed = Computed.of(run, model_of(measured), at)
-    return compare_with(with_sides(measured, computed.parameters), computed, seed=seed)
+    computed = Computed.of(run, model_of(measured))
+    return compare_with(with_sides(measured, computed.parameters), computed)
 
 
-def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> xr.Dataset:
+def compare_with(measured: xr.Dataset, computed: Computed) -> xr.Dataset:
     """Compare a measured diagram with computed attractors. The measured frequency steps must already have their class
     of motion (``side``).
     """
@@ -352,7 +352,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
         )
     ids = computed.attractors["attractor"].values
     distances = np.full((f.size, ids.size), np.nan)
-    rows = [_step(measured, i, computed, distances[i], seed) for i in range(f.size)]
+    rows = [_step(measured, i, computed, distances[i]) for i in range(f.size)]
     names = {
         "noise_floor": ("1", "distance of the halves of the sections"),
         "winner": ("1", "nearest attractor"),
@@ -381,7 +381,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
     )
 
 
-def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int) -> dict[str, float]:
+def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray) -> dict[str, float]:
     """Compare the measurement with the model at one frequency step. Write the distance from each attractor into
     `distances`, and return the other results by name.
     """
@@ -389,11 +389,11 @@ def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.nda
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]
     cloud = cloud_of(points, noise, int(measured["orbit_period"].values[step]))
-    floor = floor_of(cloud, geometry, np.random.default_rng(seed))
+    floor = floor_of(cloud, geometry, np.random.default_rng(SEED))
     candidates = computed.candidates(float(measured["frequency"].values[step]), states)
     ids = computed.attractors["attractor"].values.tolist()
     for c in candidates:
-        rng = np.random.default_rng([seed, c.attractor])
+        rng = np.random.default_rng([SEED, c.attractor])
         distances[ids.index(c.attractor)] = distance_to(c, cloud, geometry, rng)
     row = {"noise_floor": floor, "winner": NOBODY, "distance": np.nan, "runner_up": np.nan}
     row |= {"distance_in_noise": np.nan, "computed_period": NOBODY, "computed_side": 0}

@@ -56,14 +56,11 @@ class Regime:
     max_period: int
 
 
-def find_period(
-    points: Floats, noise: Floats, *, limit: float = LIMIT, max_period: int = MAX_PERIOD, seed: int = 0
-) -> Regime:
+def find_period(points: Floats, noise: Floats, *, max_period: int = MAX_PERIOD) -> Regime:
     """Estimate the period of a motion from consecutive noisy section points, (n, component), angles not wrapped.
 
-    A full turn per period is a trend, which cancels in second differences. `limit` is the largest closure of a closed
-    motion, in units of noise. A period k needs 2 k + 6 sections; with fewer than 8 sections, the period is 0 with
-    confidence 0.
+    A full turn per period is a trend, which cancels in second differences. A period k needs 2 k + 6 sections; with
+    fewer than 8 sections, the period is 0 with confidence 0.
     """
     n = len(points)
     periods = [k for k in range(1, max_period + 1) if n - 2 * k >= _LEAST]
@@ -73,13 +70,13 @@ def find_period(
     for row, k in enumerate(periods):
         squares[row, : n - 2 * k] = _second(points, noise, k)
     closure = _closure(squares)
-    found = _least(closure, limit)
-    share = _share(squares, found, limit, np.random.default_rng(seed))
+    found = _least(closure, LIMIT)
+    share = _share(squares, found)
     if found < 0:
         best = float(closure.min())
-        return Regime(0, share, best, best / limit, periods[-1])
-    rivals = closure[:found] / limit
-    margin = min(limit / float(closure[found]), float(rivals.min()) if found else np.inf)
+        return Regime(0, share, best, best / LIMIT, periods[-1])
+    rivals = closure[:found] / LIMIT
+    margin = min(LIMIT / float(closure[found]), float(rivals.min()) if found else np.inf)
     return Regime(periods[found], share, float(closure[found]), margin, periods[-1])
 
 
@@ -115,14 +112,14 @@ def _least(closure: Floats, limit: float) -> int:
     return int(closed[0]) if closed.size else -1
 
 
-def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) -> float:
+def _share(squares: Floats, found: int) -> float:
     """Return the fraction of bootstrap resamples of the section points that give the same period as all points do.
 
     Sections are drawn in blocks as long as second differences overlap, for all lags together. The limit is
     drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor
     of two.
     """
-    n = squares.shape[1]
+    n, rng = squares.shape[1], np.random.default_rng(0)
     block = min(max(4, squares.shape[0]), n)
     number = -(-n // block)
     same = 0
@@ -130,7 +127,7 @@ def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) 
         begins = rng.integers(0, n, number)
         chosen = (begins[:, None] + np.arange(block)).ravel() % n
         closure = _closure(squares[:, np.sort(chosen)])
-        same += _least(closure, limit * 2.0 ** rng.uniform(-1, 1)) == found
+        same += _least(closure, LIMIT * 2.0 ** rng.uniform(-1, 1)) == found
     return same / _RESAMPLES
 
 

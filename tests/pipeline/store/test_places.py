@@ -253,11 +253,8 @@ def test_sweep__removes_and_names_what_no_record_vouches_for_and_nothing_else(wh
     (directory / marker_key(1)).write_text("{")
     chunk = next((directory / "cube.zarr/section").glob("c.0.*"))
     chunk.unlink()
-    said.clear()
-    commits_left = read_commits(whole.info, whole.plan, said.append)
+    commits_left = read_commits(whole.info, whole.plan)
     assert set(commits_left) == set(range(whole.plan.n_tasks)) - {0, 1}
-    assert "commits/000001.json: torn or damaged; it does not count" in said
-    assert any("is missing or has another size; it is computed again" in line for line in said)
     assert sweep(whole.info, whole.plan, commits_left) > 0
     assert sweep(whole.info, whole.plan, commits_left) == 0
 
