@@ -15,12 +15,11 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib import pyplot as plt
-from matplotlib.legend import Legend
 
 import magpend
 from magpend._plots import Plots
 from pipeline.cli import reference
-from pipeline.plots import pixels, style
+from pipeline.plots import pixels
 from pipeline.plots.style import TARGET, Target
 from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
@@ -308,6 +307,19 @@ def test_plot__refuses_a_place_that_does_not_fit(run):
 
 
 @pytest.mark.slow
+def test_plot__shows_absent_cells_below_the_given_axes(run):
+    cube = run.cube().load()
+    cube["status"][0] = 0
+    _, ax = plt.subplots()
+    assert cube.magpend.plot.bifurcation(ax=ax) is ax
+    (strip,) = ax.child_axes
+    assert strip.get_xlim() == ax.get_xlim()
+    assert cube.magpend.counts()["pending"] == 4
+    whole = cube.magpend.plot.bifurcation()  # a strip is no panel
+    assert len(whole.figure.axes) == 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bifurcation", "lyapunov", "convergence", "gallery", "attractors"])
 def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
     """What is not passed on to the caller's figure would not be seen."""
@@ -324,34 +336,12 @@ def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
 
 
 @pytest.mark.slow
-def test_plot__shows_absent_cells_below_the_given_axes(run):
-    cube = run.cube().load()
-    cube["status"][0] = 0
-    _, ax = plt.subplots()
-    assert cube.magpend.plot.bifurcation(ax=ax) is ax
-    (strip,) = ax.child_axes
-    assert strip.get_xlim() == ax.get_xlim()
-    assert cube.magpend.counts()["pending"] == 4
-    whole = cube.magpend.plot.bifurcation()  # a strip is no panel
-    assert len(whole.figure.axes) == 2
-
-
-@pytest.mark.slow
 def test_plot__counts_points_on_pixels_as_fine_as_in_files(run, monkeypatch):
     """The image of many points does not depend on the resolution of the screen."""
     monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     monkeypatch.setitem(plt.rcParams, "figure.dpi", 72.0)
     (shown,), (kept,) = run.plot.bifurcation().images, magpend.figure(run, "bifurcation").axes[0].images
     np.testing.assert_allclose(shown.get_array().shape, kept.get_array().shape, rtol=0.02)  # texts differ by pixels
-
-
-def test_legend_inside__keeps_the_first():
-    ax = style.new_figure(3.0, xr.Dataset()).add_subplot()
-    line = ax.plot([0, 1], [0, 1], label="a")
-    style.legend_inside(ax, [*line, *ax.plot([1], [1], label="b")])
-    style.legend_inside(ax, line)
-    legends = [artist for artist in ax.get_children() if isinstance(artist, Legend)]
-    assert sorted(len(legend.get_texts()) for legend in legends) == [1, 2]
 
 
 # ---- Datasets -----------------------------------------------------------------------------------

@@ -23,7 +23,8 @@ from pipeline.explorer.security import Guard, Rate, new_token
 from pipeline.explorer.server import Service, application, listening
 from pipeline.runs.derive import derive
 from pipeline.store.run import RunDirectory
-from tests.pipeline.explorer.small_runs import LITTLE, bent_resonance, finished, shocked_wells
+from tests.pipeline.explorer.small_runs import LITTLE, bent_resonance, shocked_wells
+from tests.pipeline.factories import finished
 
 PATIENCE_S = 120.0
 """How long a test waits for what must come, on the busiest machine [s]."""

@@ -15,7 +15,8 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.overlays import attractors, disturbances
 from pipeline.explorer.live import starting
 from pipeline.store.run import RunDirectory
-from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
+from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH
+from tests.pipeline.factories import finished
 
 DAMPING, AMPLITUDES = 0.15, (0.1, 0.2)
 

@@ -37,9 +37,8 @@ from pipeline.runs.derive import derive
 from pipeline.runs.status import state
 from pipeline.specification.spec import Spec
 from pipeline.store.run import RunDirectory
-from tests.pipeline.explorer.small_runs import FLOW, finished
-
-HZ = 0.15915494309189535
+from tests.pipeline.explorer.small_runs import FLOW, HZ
+from tests.pipeline.factories import finished
 
 DRIVEN = """
 kind = "sweep"

@@ -13,27 +13,16 @@ from pipeline.rig.measured.branch_figure import plot_branch
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.files import shipped_workflows
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import duffing
 
-LINEAR = """
-kind = "sweep"
-model = "duffing"
-[parameters.overrides]
-damping = 0.3
-linear = 1.0
-cubic = 0.0
-amplitude = 0.2
-[axes]
-frequency_hz = { start = 0.1, stop = 0.3, num = 5 }
-[initial_conditions]
-kind = "list"
-points = [[0.1, 0.0]]
-[integration]
-rtol = 1e-10
-atol = 1e-10
-n_transient = 300
-n_keep = 4
-"""
-
+LINEAR = duffing(
+    "frequency_hz = { start = 0.1, stop = 0.3, num = 5 }",
+    'kind = "list"\npoints = [[0.1, 0.0]]',
+    n_transient=300,
+    n_keep=4,
+    tolerance=1e-10,
+    more="[parameters]\noverrides = { damping = 0.3, linear = 1.0, cubic = 0.0, amplitude = 0.2 }",
+)
 FLUTTER = shipped_workflows()["flutter"]
 
 PUBLISHED = {

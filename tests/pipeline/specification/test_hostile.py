@@ -4,14 +4,13 @@ import os
 import time
 import tomllib
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.layout.plan import make_plan
 from pipeline.specification.files import toml_key, toml_value
-from pipeline.specification.problems import SpecError, shown
+from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import Range
 from tests.pipeline.factories import duffing
@@ -177,10 +176,6 @@ def held(refused, path, content):
             refused(content, *options, ways=[["--dry-run"]])
 
 
-def test_outcome__what_is_mutated_can_be_planned(write_spec):
-    assert all(outcome(write_spec(BASE), smoke) for smoke in (False, True))
-
-
 @pytest.mark.slow
 @FUZZ
 @given(mutations())
@@ -280,11 +275,3 @@ def test_parse_spec__corners_of_related_parameters_are_looked_at():
         Spec.parse(data)
     del data["axes"]["l2"]
     Spec.parse(data)
-
-
-def test_shown__is_short_whatever_is_given():
-    endless = []
-    endless.append(endless)
-    for value in ("x" * 1000, 10**5000, endless, np.zeros(10_000), {"a": 10**5000}):
-        assert len(shown(value)) <= 130
-    assert shown("no") == "'no'"

@@ -10,7 +10,11 @@ import pytest
 
 import magpend
 from magpend_core.models import load_model
+from pipeline.compute.task import compute
+from pipeline.layout.cells import CellMap
+from pipeline.layout.plan import make_plan
 from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
+from pipeline.runs.zoom import Changes, read_source, write_zoom
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import Range
@@ -176,3 +180,79 @@ def test_model__as_lines_of_equations():
 @pytest.mark.parametrize(("given", "used"), [(150, 160), (160, 160), (3, 16)])
 def test_lyapunov__rounds_up_to_whole_blocks(given, used):
     assert LYAPUNOV.settle(LyapunovOptions(n_periods=given), load_model("duffing")).n_periods == used
+
+
+# ---- small runs ------------------------------------------------------------------------------------------
+
+
+def test_smoke__fewest_points_and_starts(write_spec, sweep_text, walk_text):
+    small = Spec.read(write_spec(sweep_text), smoke=True)
+    assert [axis.array().tolist() for axis in small.axes.values()] == [[2.0, 3.0], [1.5, 1.6]]
+    assert make_plan(small).shape == (2, 2, 2, 2)
+    assert small.integration == Spec.read(write_spec(sweep_text)).integration
+    walk = Spec.read(write_spec(walk_text), smoke=True)
+    assert make_plan(walk).n_cells == 2 * 2 * 2  # frequencies, starts, directions
+    rows = sweep_text.replace('kind = "grid"', 'kind = "list"\npoints = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0]]')
+    rows = "\n".join(line for line in rows.splitlines() if not line.startswith("psi"))
+    assert make_plan(Spec.read(write_spec(rows), smoke=True)).shape == (2, 2, 2)
+
+
+def test_smoke__a_refined_grid_and_a_fixed_axis(write_spec, sweep_text):
+    text = sweep_text.replace('kind = "grid"', 'kind = "grid"\nrefine = 2').replace("[1.5, 1.6]", "[1.5]")
+    small = Spec.read(write_spec(text), smoke=True)
+    assert small.refine is None
+    assert make_plan(small).shape == (2, 1, 2, 2)
+
+
+def test_zoom__keeps_the_smoke_table(write_spec, sweep_text, tmp_path):
+    smoke = "[smoke]\naxes.frequency_hz.num = 3\ninitial_conditions.psi1_deg.num = 2\n"
+    source = read_source(write_spec(sweep_text + smoke))
+    assert write_zoom(source, Changes({"frequency_hz": (2.2, 2.4)}), tmp_path / "a.toml") == []
+    assert make_plan(Spec.read(tmp_path / "a.toml", smoke=True)).shape == (3, 2, 2, 4)
+    assert make_plan(Spec.read(tmp_path / "a.toml")).shape == (5, 2, 3, 4)
+    notes = write_zoom(source, Changes({"q": (1.5, 1.55)}, {"frequency_hz": 2.2}), tmp_path / "b.toml")
+    assert any("[smoke]" in note for note in notes)
+    Spec.read(tmp_path / "b.toml", smoke=True)
+
+
+# ---- methods of integration ------------------------------------------------------------------------------
+
+
+def spec_of(method, **more):
+    return Spec.parse(
+        {
+            "kind": "sweep",
+            "model": "duffing",
+            "parameters": {"preset": "hardening", "frequency_hz": 0.2},
+            "initial_conditions": {"kind": "list", "points": [[0.3, 0.1], [-0.2, 0.5]]},
+            "integration": {"method": method, "n_transient": 20, "n_keep": 4, "rtol": 1e-10, "atol": 1e-10},
+            **more,
+        }
+    )
+
+
+def cells_of(spec):
+    cells = CellMap(spec)
+    return compute(spec, cells, tuple(slice(0, n) for n in cells.shape))
+
+
+@pytest.mark.slow
+def test_method__of_order_8_gives_the_same_motion_in_fewer_steps():
+    fifth, eighth = (cells_of(spec_of(m, products={"lyapunov": {}})) for m in ("dopri5", "dop853"))
+    np.testing.assert_allclose(eighth["section"], fifth["section"], atol=1e-6)
+    np.testing.assert_allclose(eighth["lyapunov"], fifth["lyapunov"], atol=1e-3)
+    assert (3 * eighth["n_steps"] < fifth["n_steps"]).all()
+
+
+def test_method__is_one_of_two_and_order_8_goes_with_nothing_that_looks_into_steps():
+    with pytest.raises(SpecError, match=r"integration.method = 'rk4'"):
+        spec_of("rk4")
+    extremes = {"extremes": {"quantities": ["energy"]}}
+    assert spec_of("dopri5", products=extremes).products
+    with pytest.raises(SpecError) as caught:
+        spec_of("dop853", products=extremes)
+    (problem,) = caught.value.problems
+    assert problem == (
+        'integration.method = "dop853": products.extremes looks within steps; drop one of the two, or set '
+        'method = "dopri5".'
+    )

@@ -82,11 +82,3 @@ def test_draw_all__writes_figures_and_their_data(ds, tmp_path):
     first = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     figures.draw_all(tmp_path, ds, RESULT)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == first
-
-
-@pytest.mark.slow
-def test_plot_residuals__says_units_and_what_is_simulated(ds):
-    for simulated in (0, 1):
-        fig = figures.plot_residuals(ds.assign_attrs(simulated=simulated))
-        assert any("simulated" in t.get_text() for t in fig.texts) == bool(simulated)
-        assert "rms [mm]" in [ax.get_ylabel() for ax in fig.axes]

@@ -80,14 +80,6 @@ def test_evaluate__residuals_and_slopes_are_those_of_the_closed_form(data, tmp_p
 
 
 @pytest.mark.slow
-def test_fit_local__finds_the_parameters_from_stable_and_unstable_cycles(data, tmp_path):
-    problem = built(data, tmp_path).problem
-    fit = fit_local(problem, problem.start)
-    assert fit.converged
-    np.testing.assert_allclose(fit.theta, list(TRUTH.values()), rtol=1e-6)
-
-
-@pytest.mark.slow
 def test_bifurcations__are_data(data, tmp_path):
     g, h = TRUTH["g"], TRUTH["h"]
     fold = h - 1.0 / (4.0 * g)
