@@ -273,9 +273,7 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Return whether a file with one commit record must be read because no valid pack (file of many records) holds
-        its record.
-        """
+        """Return whether a file with one commit record must be read because no valid pack holds its record."""
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
             return self._blocks is None  # not the name of a record: read it in a full scan, to report it
@@ -363,9 +361,7 @@ def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None)
 
 
 class Packer:
-    """Merger of commit records: it counts committed tasks, and packs the records of each complete block of tasks in one
-    file.
-    """
+    """Counter of committed tasks that packs the records of each complete block of tasks in one file."""
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
         self._info = info
@@ -377,9 +373,7 @@ class Packer:
             self._pack_if_whole(block)
 
     def add(self, index: int) -> None:
-        """Count a newly committed task; if its block of tasks is complete, merge the block's commit records into one
-        file.
-        """
+        """Count a newly committed task; pack the records of its block if that is complete."""
         self._counts[index // BLOCK] += 1
         self._pack_if_whole(index // BLOCK)
 

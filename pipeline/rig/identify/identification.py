@@ -144,9 +144,7 @@ def _write(
 
 
 def refuse_invisible(problem: Problem) -> None:
-    """Evaluate the residuals once; raise `SpecError` if they do not depend on some unknowns, or if trajectories
-    diverge.
-    """
+    """Evaluate once; raise `SpecError` if residuals do not depend on some unknowns, or trajectories diverge."""
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
         raise SpecError(
@@ -173,9 +171,7 @@ def refuse_invisible(problem: Problem) -> None:
 
 
 def _is_driven(problem: Problem) -> bool:
-    """Return whether the model's own drive acts on a piece without a recorded drive. The drive acts if the trajectory
-    changes with the drive period.
-    """
+    """Return whether the model's own drive acts on a piece without a recorded one, as its period then matters."""
     if not problem.pieces or problem.pieces[0].drive is not None:
         return False
     piece = problem.pieces[0]
@@ -312,8 +308,6 @@ def _unpack_profile(name: str, data: Mapping[str, np.ndarray]) -> Profile:
 
 
 def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
-    """Return the standard errors of the estimates under the assumption that the residuals are independent and have the
-    assumed noise.
-    """
+    """Return the standard errors of the estimates if residuals were independent and had the assumed noise."""
     inverse = np.linalg.pinv(linear.information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
     return np.asarray(np.sqrt(np.diag(inverse)) * scale)

@@ -87,9 +87,7 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
 
 
 def choose_phases(problem: Problem, theta: Array) -> Array:
-    """Return the unknowns with the phase of each recording's known drive moved to the best of phases all round the
-    circle, with initial states fitted for each.
-    """
+    """Return the unknowns with the phase of each known drive moved to the best of phases all round the circle."""
     if not problem.phases:
         return theta
     shifts = np.arange(N_PHASES) / N_PHASES
@@ -112,9 +110,7 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Residuals of one piece of a recording and their derivatives by its initial state, compressed to few rows by a QR
-    decomposition.
-    """
+    """Residuals of one piece and their derivatives by its initial state, compressed by a QR decomposition."""
 
     jacobian: Array
     rows: Array
@@ -231,18 +227,14 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Split a scaled vector into the unknowns and the initial states. If it contains no initial states, return
-        their first guesses.
-        """
+        """Split a scaled vector into the unknowns and the initial states, by default their first guesses."""
         full = x * self.sizes
         if not self.joint:
             return full, self.starts
         return full[: self.n_free], full[self.n_free :].reshape(self.starts.shape)
 
     def at(self, x: Array) -> _Point:
-        """Evaluate residuals and Jacobian at a scaled vector of unknowns; reuse the last evaluation if the vector is
-        the same.
-        """
+        """Evaluate residuals and Jacobian at a scaled vector; reuse the last evaluation if it is the same."""
         key = x.tobytes()
         if self._last is None or key != self._key:
             theta, starts = self.split(x)
@@ -264,9 +256,7 @@ class _Search:
         return self._last
 
     def _starts_for(self, theta: Array) -> Array:
-        """Return fitted initial states for given unknowns; their first guess is extrapolated from the best evaluation
-        so far.
-        """
+        """Return fitted initial states for given unknowns; the best evaluation so far gives their first guess."""
         base = self._base
         if base is None:
             return fit_starts(self.problem, theta, self.starts).starts

@@ -72,9 +72,7 @@ class LogPosterior:
     n_lost: int = 0
 
     def __call__(self, thetas: Array) -> Array:
-        """Return the logarithm of the density of each row of unknowns; minus infinity outside the bounds, and where a
-        measured orbit or a trajectory is lost.
-        """
+        """Return the log density of each row of unknowns; minus infinity outside bounds or where orbits are lost."""
         found = np.full(len(thetas), -np.inf)
         problem = self.problem
         inside = np.flatnonzero(((thetas >= problem.lower) & (thetas <= problem.upper)).all(axis=1))

@@ -276,9 +276,7 @@ def _own(table: MeasuredTable, values: dict[str, float]) -> dict[str, float]:
 
 
 def _carried(table: OrbitData, drawn: xr.Dataset) -> np.ndarray:
-    """Return amplitude or bifurcation value for each measured orbit or bifurcation, shape (draw, datum); NaN where none
-    is found.
-    """
+    """Return amplitude or bifurcation value by draw and measurement, (draw, datum); NaN where none is found."""
     names = [str(name) for name in drawn["parameter"].values]
     packed = np.array([table.packed(dict(zip(names, row, strict=True))) for row in drawn["value"].values])
     found = [[v[0] for v in row] for own, points in carried(table, packed) for row in quantities_of(table, own, points)]

@@ -161,9 +161,7 @@ def _kept(
 def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
-    """Return first guesses of the unknowns: that of the specification, then the best Sobol points or
-    results of CMA-ES.
-    """
+    """Return first guesses: that of the specification, then the best Sobol points or results of CMA-ES."""
     if n_starts == 1:
         return [problem.start]
     if method == "cma":
@@ -188,9 +186,7 @@ def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
 
 
 def costs(problem: Problem, thetas: Array) -> Array:
-    """Return the cost of each row of unknowns, at the first guesses of the initial states. The cost is infinite if a
-    trajectory diverges.
-    """
+    """Return the cost of each row of unknowns at the guessed initial states; infinite for diverging ones."""
     found = []
     for at in range(0, len(thetas), POPULATION):
         members = thetas[at : at + POPULATION]
@@ -252,9 +248,7 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
 
 
 def _stages(problem: Problem) -> list[Problem]:
-    """Return versions of the least-squares problem with short, longer and still longer stretches of the recordings.
-    Their initial states are estimated from the recordings.
-    """
+    """Return the problem with short, longer and still longer stretches, whose starts the recordings give."""
     if not problem.pieces:
         return [problem]
     longest = max(p.time[-1] for p in problem.pieces)

@@ -214,9 +214,7 @@ class WindowEdge:
 
     @property
     def shift_error_hz(self) -> float:
-        """Bound on the error of the shift [Hz]: half the measured plus half the computed frequency step. It is not a
-        standard error.
-        """
+        """Bound on the error of the shift [Hz], half of both frequency steps; it is not a standard error."""
         return self.measured_error_hz + self.computed_error_hz
 
 
@@ -275,9 +273,7 @@ def window_edges(measured: xr.Dataset, winners: np.ndarray, computed: Computed) 
 def _computed_end(
     window: Window, measured: xr.Dataset, winners: np.ndarray, computed: Computed
 ) -> tuple[float, float, str]:
-    """Return the frequency at which the regime of a measured window ends in the model, in the direction of the
-    sweep.
-    """
+    """Return where the regime of a measured window ends in the model, in the direction of the sweep."""
     f = measured["frequency"].values
     with_side = "side" in measured
     chosen = {}
@@ -296,9 +292,7 @@ def _computed_end(
 
 
 def _walk(place: int, sign: int, computed: Computed, holds: Callable[[int], bool]) -> tuple[float, float, str]:
-    """Follow a regime along the computed frequencies. Return the frequency at which it ends [Hz], half the frequency
-    step there, and a note if it does not end.
-    """
+    """Follow a regime along computed frequencies; return its end [Hz], half the step there, and a note without one."""
     f = computed.frequencies
     while 0 <= place + sign < f.size:
         if not holds(place + sign):
@@ -340,9 +334,7 @@ def compare(measured: xr.Dataset, run: AnalysedRun) -> xr.Dataset:
 
 
 def compare_with(measured: xr.Dataset, computed: Computed) -> xr.Dataset:
-    """Compare a measured diagram with computed attractors. The measured frequency steps must already have their class
-    of motion (``side``).
-    """
+    """Compare a measured diagram, whose steps have their class of motion (``side``), with computed attractors."""
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):
         own = computed.frequencies
@@ -382,9 +374,7 @@ def compare_with(measured: xr.Dataset, computed: Computed) -> xr.Dataset:
 
 
 def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray) -> dict[str, float]:
-    """Compare the measurement with the model at one frequency step. Write the distance from each attractor into
-    `distances`, and return the other results by name.
-    """
+    """Compare one frequency step; write the distances from the attractors, and return the other results."""
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]
@@ -446,9 +436,7 @@ def words_of(measured: xr.Dataset) -> tuple[str, ...]:
 
 
 def edges_table(compared: xr.Dataset) -> Table:
-    """Return a table of the frequencies at which regimes (period and class of motion) end on the rig and in
-    the model.
-    """
+    """Return a table of the frequencies at which regimes end on the rig and in the model."""
     words = words_of(compared)
     rows: list[Row] = []
     for k in range(compared.sizes.get("edge", 0)):

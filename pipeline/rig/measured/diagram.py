@@ -81,18 +81,14 @@ def find_period(points: Floats, noise: Floats, *, max_period: int = MAX_PERIOD) 
 
 
 def _second(points: Floats, noise: Floats, k: int) -> Floats:
-    """Return the squared second differences of section points at lag `k`, in units of their noise, averaged over the
-    states.
-    """
+    """Return squared second differences of section points at lag `k` in units of noise, averaged over states."""
     difference = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
     variance = noise[2 * k :] ** 2 + 4 * noise[k:-k] ** 2 + noise[: -2 * k] ** 2
     return np.asarray((difference**2 / variance).mean(axis=1))
 
 
 def _closure(squares: Floats) -> Floats:
-    """Return the rms second difference of the section points for each tested period. It is computed for all points and
-    for the later half, and the smaller value is kept.
-    """
+    """Return for each period the rms second difference: of all points or of the later half, the smaller."""
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)
     later = np.zeros(squares.shape[1], bool)
@@ -224,9 +220,7 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 def _with_instants(
     points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Return the noise of section points. For each state whose rate is measured, it includes the effect of the
-    uncertain times of the points.
-    """
+    """Return the noise of section points, with the effect of their uncertain times where rates are measured."""
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
@@ -339,9 +333,7 @@ def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:
 
 
 def steps_table(measured: xr.Dataset) -> Table:
-    """Return a table of the frequency steps: frequency, jitter, duty cycle, period, confidence, and the comparison with
-    a computed run if there is one.
-    """
+    """Return a table of the frequency steps, with the comparison with a computed run if there is one."""
     rows = [_row(measured.isel(step=i)) for i in range(measured.sizes["step"])]
     return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
 
