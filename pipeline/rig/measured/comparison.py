@@ -42,9 +42,7 @@ _DRAWS = 8
 
 
 def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
-    """Return the Wasserstein-1 distance between two sets of equally weighted points, (m, state) and (n, state), in
-    units of the scales.
-    """
+    """Return the Wasserstein-1 distance, in units of the scales, of points (m, state) and (n, state)."""
     ways = geometry.distance(a[:, None], b[None])
     if len(a) != len(b):
         return _transport(ways)
@@ -53,9 +51,7 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
 
 
 def _transport(ways: Floats) -> float:
-    """Return the smallest mean transport distance between two sets of equally weighted points, given all pairwise
-    distances.
-    """
+    """Return the smallest mean transport distance between two sets, given all pairwise distances."""
     m, n = ways.shape
     if min(m, n) == 1:
         return float(ways.mean())
@@ -156,9 +152,7 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
 
 
 def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
-    """Return at least `size` section points of an attractor: random points of an aperiodic attractor, or whole
-    repetitions of a periodic orbit.
-    """
+    """Return at least `size` section points: random ones of an aperiodic set, or whole repetitions of an orbit."""
     points = candidate.points
     if candidate.orbit_period:
         return np.tile(points, (max(1, -(-size // len(points))), 1))
@@ -231,9 +225,7 @@ def words_for(regime: Regime, words: tuple[str, ...]) -> str:
 
 
 def windows_of(measured: xr.Dataset) -> list[Window]:
-    """Return the windows of all recordings. A window is a run of consecutive frequency steps with the same regime
-    (period and class of motion).
-    """
+    """Return the windows of all recordings: runs of consecutive frequency steps with the same regime."""
     keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
     sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= CONFIDENT]
     labelled = itertools.groupby(sure, key=lambda i: (keys[i], regime_of(measured, i)))
