@@ -111,9 +111,7 @@ def security_of(address: Address) -> Any:
 
 
 def ask(address: Address) -> None:
-    """Raise `SchedulerError`, which says what is there instead, unless a dask scheduler answers at an address within
-    seconds.
-    """
+    """Raise `SchedulerError`, with what is there instead, unless a scheduler answers within seconds."""
     security = security_of(address)
     _knock(address)
     found: dict[str, Any] = {}

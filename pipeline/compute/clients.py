@@ -183,9 +183,7 @@ class Where:
         return scheduler if isinstance(scheduler, Where) else cls(scheduler)
 
     def resolved(self) -> Address | Cluster | str:
-        """Decide where tasks run, without starting anything: an address, a batch system's settings, or a place on this
-        machine.
-        """
+        """Decide where tasks run, and start nothing: an address, a batch system, or a place on this machine."""
         found = self._resolved()
         if self.dashboard and isinstance(found, str):
             raise SpecError(

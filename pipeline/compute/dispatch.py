@@ -38,9 +38,7 @@ MORE = 2.0
 
 
 class Limits:
-    """Limits of the run time of tasks, from estimated times on one core [s] and measured ones; without estimates there
-    are none.
-    """
+    """Limits of the run time of tasks, from estimated times on one core [s], if there are any, and measured ones."""
 
     def __init__(self, seconds: Callable[[int], float] | None) -> None:
         self._seconds = seconds
@@ -145,9 +143,7 @@ class Window:
             self._fill()
 
     def _fill(self) -> None:
-        """Send ready tasks to the workers until enough are in flight. At the end, send failed tasks again, one at a
-        time.
-        """
+        """Send ready tasks until enough are in flight; at the end send failed tasks again, one at a time."""
         wanted = WINDOW * max(self._n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:

@@ -172,9 +172,7 @@ def _halves(boxes: np.ndarray) -> np.ndarray:
 
 
 def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Group boxes of cells by their size. Yield each group's row numbers, and the flat indices of its cells (box,
-    cell).
-    """
+    """Group boxes by their size; yield each group's row numbers, and the flat indices of its cells (box, cell)."""
     first = np.ravel_multi_index(tuple(boxes[:, 0].T), shape)
     extents, which = np.unique(boxes[:, 1] - boxes[:, 0], axis=0, return_inverse=True)
     for i, extent in enumerate(extents):
@@ -184,9 +182,7 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each box whether all integrated cells in it and beside it end on one orbit, so that it need not be
-    halved.
-    """
+    """Return for each box whether all integrated cells in it and beside it end on one orbit."""
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -198,9 +194,7 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each cell the cell from which it takes its result: itself if it was integrated, else a corner of its
-    box.
-    """
+    """Return for each cell the one whose result it takes: itself if it was integrated, else a corner of its box."""
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

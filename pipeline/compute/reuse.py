@@ -73,9 +73,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read stored cells of this run. Return which of them can be used (integrated and undamaged), and their
-        variables.
-        """
+        """Read stored cells; return which of them were integrated and are undamaged, and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -96,9 +94,7 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the number of the task that contains each cell; for cells not in this run, a number beyond the last
-        task.
-        """
+        """Return the task that contains each cell; a number beyond the last task for cells not in this run."""
         plan = self.run.plan
         steps = np.unravel_index(np.maximum(place, 0), plan.shape)
         places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))

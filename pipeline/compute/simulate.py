@@ -64,9 +64,7 @@ class Closing(NamedTuple):
         return self.to_go == 0.0
 
     def sentence(self, n_transient: int) -> str:
-        """Return a sentence on whether the trajectory has closed; if not, it suggests a value of ``--transient`` that
-        suffices.
-        """
+        """Return a sentence on whether the trajectory has closed, or which ``--transient`` would suffice."""
         periods = f"{self.period} drive period{'s' if self.period > 1 else ''}"
         if self.is_closed:
             return f"closed: the motion repeats after {periods} (distance {self.distance:.1e})"

@@ -38,9 +38,7 @@ _PREPARING = threading.Lock()
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read the run that a task belongs to, once per process; raise RefusedError if this worker would compute other
-    results.
-    """
+    """Read the run of a task, once per process; raise `RefusedError` if this worker would compute other results."""
     if origin is not None:
         import_model(*origin)
     info = read_run(directory)
@@ -122,9 +120,7 @@ def run_task(
 
 
 def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
-    """Read the states in which the preceding task left the branches of this task; an empty dict if there is no such
-    task.
-    """
+    """Read the states in which the preceding task, if there is one, left the branches of this task."""
     predecessor = plan.predecessor(index)
     if predecessor is None:
         return {}
@@ -141,9 +137,7 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return arguments for `compute`: a function ``integrate`` that copies cells from other runs, or none if there are
-    no such runs.
-    """
+    """Return, if there are `sources`, a function ``integrate`` for `compute` that copies cells from them."""
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of

@@ -131,9 +131,7 @@ class _Plant:
     def run(
         self, state: np.ndarray, target: np.ndarray, n_periods: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Integrate the controlled rigs for some drive periods. Return the final states, and the measured state and the
-        controller's output at each sample.
-        """
+        """Integrate the rigs for some periods; return final states, and measured state and output at each sample."""
         period = 1.0 / self.rig.frequency_hz
         step, omega = period / SAMPLES, 2.0 * np.pi * self.rig.frequency_hz
         orders = np.arange(N_HARMONICS + 1)
@@ -166,9 +164,7 @@ class _Plant:
 
 
 def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray:
-    """Return the change of the rates under a drive of amplitude 1 at phase 0; raise SpecError unless the drive is a
-    cosine.
-    """
+    """Return the change of the rates under a drive of amplitude 1 at phase 0; raise SpecError unless it is a cosine."""
     shares = np.array([0.0, 0.125, 0.25, 0.5])
     states = np.stack([np.zeros(len(still.model.state_names)), 0.3 * np.asarray(still.model.scales)])
     found = np.array(
@@ -196,9 +192,7 @@ def _harmonics(signal: np.ndarray) -> np.ndarray:
 
 
 def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) -> tuple[str, ...]:
-    """Return ``yes``, ``no`` or ``unknown`` for the stability of each orbit, from the slope of the drive's amplitude
-    along the branch.
-    """
+    """Return the stability of each orbit, from the slope of the drive's amplitude along the branch."""
     if len(targets) < 2:
         return ("unknown",) * len(targets)
     order = np.argsort(targets)
@@ -213,9 +207,7 @@ def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) ->
 
 
 class ControlTable(Table):
-    """Table ``[control]`` of a virtual rig: controlled state, drive, gains, noise, and the range of target
-    amplitudes.
-    """
+    """Table ``[control]`` of a virtual rig: controlled state, drive, gains, noise, and range of the target."""
 
     state: str = Field(description="Controlled state; its rate is measured as well.")
     drive: str = Field(description="Parameter that is the amplitude of the drive, a cosine; control acts through it.")

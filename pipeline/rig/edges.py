@@ -61,9 +61,7 @@ class Edges:
 
     @property
     def error_s(self) -> float:
-        """Standard error of an edge's time [s] from sampling and measurement noise; the jitter of the drive is not
-        included.
-        """
+        """Standard error of an edge's time [s] from sampling and noise, without the jitter of the drive."""
         return math.hypot(self.resolution_s / math.sqrt(12), self.noise_s)
 
     def between(self, start_s: float, end_s: float) -> Edges:
@@ -99,9 +97,7 @@ class Edges:
         return Timing(1 / period, error / period**2, jitter, duty, duty_error, int(number[-1]))
 
     def _duty_cycle(self, fitted: Floats, period: float, jitter: float) -> tuple[float, float]:
-        """Return the mean duty cycle and its standard error; each falling edge is paired with the last rising edge
-        before it.
-        """
+        """Return the mean duty cycle and its error; a falling edge is paired with the last rising edge before it."""
         before = np.searchsorted(self.rising, self.falling, side="right") - 1
         high = np.where(before >= 0, self.falling - self.rising[before], np.inf)
         before, high = before[high < period], high[high < period]
@@ -178,9 +174,7 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
 
 @dataclass(frozen=True)
 class _Switch:
-    """Two-level signal: middle and distance of its levels, width of the hysteresis band about the middle, and noise of
-    a sample.
-    """
+    """Two-level signal: middle and distance of its levels, width of the hysteresis band, and noise of a sample."""
 
     middle: float
     span: float
@@ -189,9 +183,7 @@ class _Switch:
 
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
-    """Estimate the two levels of a drive signal and its noise. Raise SpecError if the difference of the levels is
-    within the noise.
-    """
+    """Estimate the levels of a drive signal and its noise; raise SpecError if the noise hides their difference."""
     low, high, noise = _levels(x)
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
@@ -206,9 +198,7 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
 
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
-    """Return the edges of a drive signal, in order. The signal is a sequence of stretches, each a pair of arrays
-    (sample times, values).
-    """
+    """Return the edges of a drive signal, in order, from its stretches (sample times, values)."""
     instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
@@ -256,18 +246,14 @@ def _levels(x: Floats) -> tuple[float, float, float]:
 
 
 def _crossing(t: Floats, above: Floats) -> float:
-    """Return the time of a sign change, by linear interpolation. If there are several sign changes, return the mean of
-    the first and the last.
-    """
+    """Return the time of a sign change by linear interpolation; of several, the mean of the first and the last."""
     at = np.flatnonzero((above[:-1] > 0) != (above[1:] > 0))[[0, -1]]
     share = above[at] / (above[at] - above[at + 1])
     return float((t[at] + share * (t[at + 1] - t[at])).mean())
 
 
 def _numbers(rising: Floats) -> Floats:
-    """Return the number of each rising edge, counted in drive periods from the first. Missing edges are counted as
-    well.
-    """
+    """Return the number of each rising edge from the first, counted in drive periods, missing edges included."""
     gaps = np.diff(rising)
     steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -226,9 +226,7 @@ def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndar
 
 
 def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> Any:
-    """Return the drive period by period over all its steps: the durations, and the values of the parameters that differ
-    between steps.
-    """
+    """Return the drive period by period: durations, and values of the parameters that differ between steps."""
     from magpend_core.sampling import Drive
 
     names = tuple(dict.fromkeys(name for step in drive for name in step.values))
@@ -387,9 +385,7 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
-    """Validate the tables of a virtual rig, with paths relative to `folder`; raise `SpecError` with all problems at
-    once.
-    """
+    """Validate the tables of a virtual rig, with paths relative to `folder`; raise `SpecError` with all problems."""
     keys = tuple(RigTable.model_fields)
     problems = [unknown_key(key, key, keys) for key in data if key not in keys]
     numbers = checked(RigTable, {"model": "-", **{k: data[k] for k in NUMBERS if k in data}}, "", problems)
@@ -431,9 +427,7 @@ def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
 
 
 def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[str]) -> Parameters | None:
-    """Return the parameters of a virtual rig from its tables. If they are not valid, add the errors to `problems` and
-    return None.
-    """
+    """Return the parameters of a virtual rig; if its tables are not valid, add problems and return None."""
     if "model" not in data:
         problems.append("model: missing; name the model, as magpend models lists them.")
         return None

@@ -120,17 +120,13 @@ class Declared:
         return None
 
     def _text_problem(self, content: bytes) -> str | None:
-        """Check the number of texts that a chunk declares, since decoding allocates memory for it; return a problem or
-        None.
-        """
+        """Check the number of texts that a chunk declares, as decoding allocates memory for it."""
         number = int.from_bytes(numcodecs.blosc.decompress(content[:-_CHECKSUM])[:4], "little")
         most = max(self._sizes.values(), default=1)
         return None if number <= most else f"declares {number} texts, and may have {most}"
 
     def _most(self, name: str) -> int:
-        """Return the allowed uncompressed size of a chunk [bytes]: exact for a variable, an upper bound for a
-        coordinate.
-        """
+        """Return the allowed size of a chunk [bytes]: exact for a variable, a bound for a coordinate."""
         if name in self._variables:
             _, chunk, dtype = self._variables[name]
             return math.prod(chunk) * np.dtype(dtype).itemsize
@@ -194,9 +190,7 @@ def _codecs_problem(codecs: tuple[Any, ...]) -> str:
 
 
 def product_problem(contents: Iterable[tuple[str, bytes]]) -> str | None:
-    """Check the sizes and codecs that the files of a stored analysis result declare; return the first problem, or
-    None.
-    """
+    """Check the sizes and codecs that a stored result's files declare; return the first problem, or None."""
     chunk_bytes: dict[str, int] = {}
     total, on_disk = 0, 0
     chunks: list[tuple[str, int]] = []

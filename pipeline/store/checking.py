@@ -43,9 +43,7 @@ class Verification:
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
-    """Read every stored file of a run and compare its sha256 with the recorded one; return what is damaged or left
-    over.
-    """
+    """Compare every stored file of a run with its recorded sha256; return what is damaged or left over."""
     info.files.refuse_links(CUBE)
     records, damaged = damaged_records(info, plan, contents=True)
     n_whole = sum(name_of(index) not in damaged for index in records)
@@ -73,9 +71,7 @@ def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
 
 
 def name_of(index: int) -> str:
-    """Return the name of the file for a single task's commit record, even if the record has been merged into a pack, a
-    file of many records.
-    """
+    """Return the file name of a single task's commit record, even if the record lies in a pack."""
     return marker_key(index).removeprefix(f"{COMMITS}/")
 
 

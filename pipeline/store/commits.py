@@ -165,25 +165,21 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 # ---- reading -----------------------------------------------------------------------------------
 
 
-def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
+def read_commits(info: RunInfo, plan: Plan) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
     If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this check
     would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of
-    chunks. `echo` prints a line for every record that does not count, with the reason.
+    chunks.
 
     Raise `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending,
     since a failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
-    records, rejected = scan(info, plan, copies=info.files.local is None)
-    problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
+    records, _ = scan(info, plan, copies=info.files.local is None)
     if not records.packs:  # a small run: listing its files takes little time
         absent = absent_objects(info, records)
         whole = {index: commit for index, commit in records.items() if index not in absent}
         records = Records(info.files, info.digest, whole)
-        problems = [f"task {i}: {problem}; it is computed again" for i, problem in absent.items()] + problems
-    for problem in problems if echo else ():
-        echo(problem)  # type: ignore[misc]
     return records
 
 
@@ -277,9 +273,7 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Return whether a file with one commit record must be read because no valid pack (file of many records) holds
-        its record.
-        """
+        """Return whether a file with one commit record must be read because no valid pack holds its record."""
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
             return self._blocks is None  # not the name of a record: read it in a full scan, to report it
@@ -367,9 +361,7 @@ def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None)
 
 
 class Packer:
-    """Merger of commit records: it counts committed tasks, and packs the records of each complete block of tasks in one
-    file.
-    """
+    """Counter of committed tasks that packs the records of each complete block of tasks in one file."""
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
         self._info = info
@@ -381,9 +373,7 @@ class Packer:
             self._pack_if_whole(block)
 
     def add(self, index: int) -> None:
-        """Count a newly committed task; if its block of tasks is complete, merge the block's commit records into one
-        file.
-        """
+        """Count a newly committed task; pack the records of its block if that is complete."""
         self._counts[index // BLOCK] += 1
         self._pack_if_whole(index // BLOCK)
 

@@ -71,9 +71,7 @@ def write_cube(run: RunDirectory, folder: Path, along: str | None, layers: Layer
 
 
 class _Columns:
-    """Chunk layout of the rewritten result cube: a chunk holds one state for all initial conditions at several values
-    of one swept parameter.
-    """
+    """Chunks of the rewritten cube: one state for all initial conditions at values of one parameter."""
 
     def __init__(self, run: RunDirectory, along: str | None) -> None:
         self.dims, self.shape, self._sizes = run.plan.dims, run.plan.shape, run.plan.sizes
@@ -85,9 +83,7 @@ class _Columns:
         self._order = [*starts, *([] if along is None else [along]), *others]
 
     def chunks(self, itemsize: int, own: tuple[str, ...] = ()) -> tuple[int, ...]:
-        """Return the chunk shape of an array whose dimensions are those of the cells, then the further dimensions
-        `own`, such as ``state``.
-        """
+        """Return the chunk shape of an array over the cells and the further dims `own`, such as ``state``."""
         apart = tuple(1 if dim == "state" else self._sizes[dim] for dim in own)
         room = max(1, CHUNK_BYTES // (itemsize * math.prod(apart)))
         found = {}
@@ -97,9 +93,7 @@ class _Columns:
         return (*(found[dim] for dim in self.dims), *apart)
 
     def slabs(self, chunks: tuple[int, ...], bytes_per_cell: int) -> Iterator[tuple[slice, ...]]:
-        """Yield index slices along the explorer's horizontal axis: whole chunks, as many per slice as fit in a fixed
-        amount of memory.
-        """
+        """Yield index slices along the horizontal axis: as many whole chunks as fit in some memory."""
         if self._along is None:
             yield (slice(None),) * len(self.dims)
             return

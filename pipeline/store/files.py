@@ -120,9 +120,7 @@ class Files(Protocol):
         ...
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder that occupies a path needed by the run into the run's folder ``aside``; return its new
-        path.
-        """
+        """Move what occupies a path needed by the run into the run's folder ``aside``; return its new path."""
         ...
 
     def refuse_links(self, *prefixes: str) -> None:

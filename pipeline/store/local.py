@@ -70,9 +70,7 @@ class LocalFiles:
         return content
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several files; yield each key with the file's content, or with a `FileNotFoundError` for a missing
-        file.
-        """
+        """Read several files; yield each key with the content, or with a `FileNotFoundError`."""
         for key in keys:
             try:
                 yield key, self.read(key)
@@ -145,9 +143,7 @@ class LocalFiles:
         return found + [name for name in OWN_FILES if os.path.isdir(self.root / name)]
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder that occupies a path needed by the run into the subfolder ``aside``; return its new
-        path.
-        """
+        """Move what occupies a path needed by the run into the subfolder ``aside``; return its new path."""
         path = self.root / key
         target = self.root / ASIDE / f"{key.replace('/', '-')}.{uuid.uuid4().hex[:8]}"
         refuse_links(target.parent)
@@ -172,9 +168,7 @@ class LocalFiles:
 
 
 def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
-    """Add the size of each file below a folder to a dict, by key; raise `RefusedError` if a folder directly in it is a
-    symbolic link.
-    """
+    """Add the size of each file below a folder by key; raise `RefusedError` for links directly in it."""
     with unreadable(folder), os.scandir(folder) as entries:
         below = list(entries)
     for entry in below:
@@ -250,9 +244,7 @@ def is_there(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn file system errors inside this context into `UnreadableError`, except for missing files, which may miss
-    rightly.
-    """
+    """Turn file system errors in this context into `UnreadableError`, except for missing files."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):

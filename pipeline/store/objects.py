@@ -145,9 +145,7 @@ class ObjectFiles:
         return self._store
 
     def below(self, prefix: str) -> ObjectFiles:
-        """Return the files below a prefix; calls with the same prefix return the same `ObjectFiles` object, which keeps
-        its connections.
-        """
+        """Return the files below a prefix; equal prefixes return one object, which keeps its connections."""
         if prefix not in self._below:
             self._below[prefix] = ObjectFiles(self.bucket, f"{self.prefix}/{prefix}".lstrip("/"))
         return self._below[prefix]
@@ -184,9 +182,7 @@ class ObjectFiles:
         return self._ask(key, lambda: bytes(obstore.get(self.store, key).bytes()))
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several objects at once; yield each key with the object's content, or with a `FileNotFoundError` for a
-        missing object.
-        """
+        """Read several objects at once; yield each key with the content, or with a `FileNotFoundError`."""
 
         def read(key: str) -> bytes | FileNotFoundError:
             try:
@@ -207,9 +203,7 @@ class ObjectFiles:
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Write an object unless it exists. An existing object must have the same content; otherwise raise
-        `DamagedError`.
-        """
+        """Write an object unless it exists; raise `DamagedError` if it then has another content."""
         import obstore
 
         for attempt in range(RETRIES):
@@ -276,9 +270,7 @@ class ObjectFiles:
         """Create a folder: there is nothing to do, since an object store has no folders."""
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Return the keys of folders found where files should be: there are none, since an object store has
-        no folders.
-        """
+        """Return the keys of folders where files should be: an object store has no folders."""
         return []
 
     def move_aside(self, key: str) -> str:

@@ -80,9 +80,7 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
 
 
 def _put_product(files: Files, ds: xr.Dataset) -> None:
-    """Write a product into an object store; ``zarr.json`` with the digest of the content comes last and makes it
-    valid.
-    """
+    """Write a product into an object store; ``zarr.json`` with the digest comes last and makes it valid."""
     data, attrs = _contents(ds)
     with contextlib.suppress(FileNotFoundError, DamagedError):
         if _own(read_product_attrs(files)) == attrs:
@@ -225,9 +223,7 @@ def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
-    """Rename a finished product (stored analysis result) to its final path; first remove a damaged or different one
-    found there.
-    """
+    """Rename a finished product to its final path; first remove a damaged or different one there."""
     for _ in range(_MOST_TRIES):
         try:
             temporary.rename(path)
@@ -243,9 +239,7 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
 
 
 def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Return the files of a product by key, which hold all variables, the attributes and a digest of the content; and
-    the attributes without the digest.
-    """
+    """Return the files of a product by key, with attributes and digest; and the attributes without it."""
     data: dict[str, Any] = {}
     store = MemoryStore(data)
     group = zarr.create_group(store, zarr_format=3)
@@ -270,9 +264,7 @@ def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
 
 
 def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
-    """Return one digest of a product (stored analysis result), computed from its attributes and the digests of its
-    files.
-    """
+    """Return one digest of a product, computed from its attributes and the digests of its files."""
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
     for key, sha256 in sorted(digests, key=lambda entry: entry[0].split("/")):
         digest.update(f"\n{key} {sha256}".encode())

@@ -19,9 +19,7 @@ from pipeline.store.stored_json import fits, seal
 
 
 def copy_text(singles: Mapping[int, Commit], digest: str) -> bytes:
-    """Return the content of the copy: the commit records in no pack, in order, then a line with their number and a
-    checksum.
-    """
+    """Return the content of the copy: unpacked commit records in order, then their number and a checksum."""
     body = b"".join(line_of(singles[index], digest) for index in sorted(singles))
     return body + seal(json.dumps({"digest": digest, "records": len(singles)}, sort_keys=True), body).encode()
 
@@ -46,9 +44,7 @@ def remove_copy(info: RunInfo) -> None:
 
 
 def copied_records(info: RunInfo, sizes: Mapping[str, int]) -> dict[int, Commit]:
-    """Return by task the records in the copy whose own files are there, with their sizes by name; none if it is
-    damaged.
-    """
+    """Return by task the records in an undamaged copy whose own files have the sizes given by name."""
     content = _content(info)
     if content is None or not fits(content):
         return {}

@@ -117,9 +117,7 @@ def pack_text(commits: Mapping[int, Commit], digest: str, block: int) -> bytes:
 
 
 def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
-    """Return the summary of a pack (a file of many commit records) if it is undamaged and of this run; otherwise return
-    the problem.
-    """
+    """Return the summary of a pack if it is undamaged and of this run; otherwise return the problem."""
     if not fits(content):
         return "torn or damaged"
     try:

@@ -92,9 +92,7 @@ def read_run(place: str | Path | Files) -> RunInfo:
 
 
 def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
-    """Raise `RefusedError` if ``run.json`` has another format number than this version reads, unless the number itself
-    may be damaged.
-    """
+    """Raise `RefusedError` for another format number in ``run.json``, unless the number may be damaged."""
     found = data["identity"]["format"]
     if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
         raise RefusedError(

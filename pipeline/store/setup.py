@@ -82,9 +82,7 @@ def _refuse_place(folder: Path) -> None:
 
 
 def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
-    """Raise `RefusedError` for a directory without a valid ``run.json``, unless it is empty or holds files of this same
-    run.
-    """
+    """Raise `RefusedError` for a directory without a valid ``run.json`` that holds what is not of this run."""
     foreign = [name for name in names if not _is_own(name)]
     if foreign:
         raise RefusedError(

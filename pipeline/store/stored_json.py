@@ -27,9 +27,7 @@ class SealError(ValueError):
 
 
 def seal(text: str, before: bytes = b"") -> str:
-    """Append a checksum to a non-empty JSON object; it also covers `before`, the bytes before the object in its
-    file.
-    """
+    """Append a checksum to a JSON object; it also covers `before`, the bytes before it in its file."""
     body = text.rstrip()
     if not body.endswith("}"):
         raise ValueError("only a JSON object can be sealed.")

@@ -35,9 +35,7 @@ SMALL = 200_000
 
 
 def checks_chunks() -> bool:
-    """Return whether chunks are compared with their commit records when read; MAGPEND_VERIFY=0 in the environment turns
-    it off.
-    """
+    """Return whether chunks are compared with their records when read; MAGPEND_VERIFY=0 turns it off."""
     return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
@@ -121,9 +119,7 @@ class CommittedStore(WrapperStore[Store]):
         return content
 
     def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
-        """Read a local file and compare it with its recorded size and sha256, unless MAGPEND_VERIFY=0 turns this
-        off.
-        """
+        """Read a local file and compare it with its recorded size and sha256."""
         try:
             content: bytes | None = self._files.read(f"{CUBE}/{key}")
         except FileNotFoundError:

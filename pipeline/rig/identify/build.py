@@ -33,9 +33,7 @@ LEAST_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class Built:
-    """Least-squares problem of an identification, and the held-out pieces of the recordings, on which the fit is only
-    tested.
-    """
+    """Least-squares problem of an identification, and held-out pieces on which the fit is only tested."""
 
     problem: Problem
     held_out: tuple[Piece, ...]  # pieces that are judged afterwards; only their starts are fitted
@@ -215,9 +213,7 @@ def _hold_out_problems(i: int, table: RecordingTable, own: Sequence[Piece]) -> l
 
 
 def free_of(spec: IdentificationSpec, channels: Sequence[str]) -> tuple[Free, ...]:
-    """Return the unknowns of the fit: parameters in the order of the specification, then zero offsets of sensors, then
-    phases of drives.
-    """
+    """Return the unknowns in the order of the specification: parameters, zero offsets of sensors, phases of drives."""
     found, n_recordings = [], len(spec.recordings)
     for u in spec.unknowns:
         p = spec.model.parameter(u.name)
@@ -309,9 +305,7 @@ def pieces_of(
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
-    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s` seconds; None keeps pieces
-    whole.
-    """
+    """Cut each uninterrupted piece into equal stretches of about `piece_s` seconds; None keeps pieces whole."""
     found: list[Stretch] = []
     piece, time = ds["piece"].values, ds["time"].values
     for begin, end in _runs(piece):
@@ -330,9 +324,7 @@ def _runs(piece: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None) -> slice:
-    """Return a stretch's usable samples: from the first with values of all channels to the last at which the drive is
-    known.
-    """
+    """Return a stretch's samples from the first with values of all channels to the last with a known drive."""
     begin, end = stretch.samples.start, stretch.samples.stop
     time = ds["time"].values[begin:end]
     good = np.all([np.isfinite(ds[name].values[begin:end]) for name in channels], axis=0)
@@ -354,9 +346,7 @@ def _start(model: Model, own: xr.Dataset) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Driven:
-    """Drive of a recording, with the times that it covers [s]; or its frequency and its phase at time 0, if they are
-    known.
-    """
+    """Drive of a recording, with the times that it covers [s]; or its known frequency and phase at time 0."""
 
     drive: Drive | None
     begin_s: float
@@ -364,9 +354,7 @@ class _Driven:
     known: tuple[float, float] | None = None
 
     def window(self, begin: float, end: float) -> Drive:
-        """Return the drive between two times of the recording [s]. If no drive was recorded, return a drive of zero
-        torque.
-        """
+        """Return the drive between two times of the recording [s]; zero torque if none was recorded."""
         if self.known is not None:
             frequency, phase = self.known
             return steady_drive(frequency, phase + frequency * begin, end - begin)
@@ -425,9 +413,7 @@ def _steadied(edges: Edges) -> Edges:
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
-    """Update each piece's index of its preceding piece (`Piece.follows`) after pieces were removed. The index is -1 if
-    the preceding piece was removed.
-    """
+    """Update `Piece.follows` after pieces were removed; it is -1 where the preceding piece was removed."""
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
     return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]
 

@@ -110,9 +110,7 @@ def _kept(path: Path) -> str:
 def identity_of(
     spec: IdentificationSpec, sources: Sequence[Source], orbits: Sequence[MeasuredTable] = ()
 ) -> dict[str, Any]:
-    """Return all inputs that decide the numerical results: specification, recordings, kernel version, model and code
-    digests.
-    """
+    """Return all inputs that decide the numbers: specification, recordings, model and versions."""
     tables = spec.as_dict()
     for table, source in zip(tables["recordings"], sources, strict=True):
         del table["file"], table["mapping"]
@@ -205,9 +203,7 @@ def establish(
     spec_text: str,
     orbits: Sequence[MeasuredTable] = (),
 ) -> Info:
-    """Create the directory of an identification with its ``identification.json``, unless they exist. Return the content
-    of this file.
-    """
+    """Create the directory with its ``identification.json``, unless they exist; return the content of this file."""
     identity = identity_of(spec, sources, orbits)
     if check(directory, identity) is None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -255,9 +251,7 @@ class Outcomes:
 
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write ``result.json`` with the sha256 of the other result files; its existence marks the identification as
-    finished.
-    """
+    """Write ``result.json`` with the sha256 of the other files; it marks the identification as finished."""
     entries = {name: entry_of((directory / name).read_bytes()) for name in sorted(files)}
     write_atomically(directory / RESULT, canonical({**result, "files": entries}))
 

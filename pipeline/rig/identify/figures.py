@@ -34,9 +34,7 @@ BINS = 30
 
 @dataclass(frozen=True)
 class Series:
-    """Piece of a recording within a dataset of residuals: its indices, its range of samples, and the size of its
-    residuals.
-    """
+    """Piece in a dataset of residuals: its indices, its range of samples, and the size of its residuals."""
 
     # index of the recording, and of the piece in it
     recording: int
@@ -99,9 +97,7 @@ def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
-    """Return the data of the residual plots: autocorrelation, mean residual against the channel's rate, density, rms by
-    piece.
-    """
+    """Return what the residual plots show: autocorrelation, mean against the rate, density, rms by piece."""
     fitted = [s.of(ds) for s in pieces_in(ds) if not s.held_out]
     step = float(np.median(np.diff(fitted[0]["time"].values)))
     most = max(2, int(LONGEST_LAG * min(p.sizes["sample"] for p in fitted)))
@@ -198,9 +194,7 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
 
 @style.drawn
 def plot_fit(ds: xr.Dataset) -> style.DataFigure:
-    """Draw measured and computed values of the first piece, the worst fit, a held-out piece and the last, with their
-    residuals.
-    """
+    """Draw the first piece, the worst fit, a held-out piece and the last: measured, computed, and residuals."""
     chosen = _chosen(pieces_in(ds))
     channels = str(ds.attrs["channels"]).split()
     part = xr.concat([s.of(ds) for s in chosen], "sample", join="override", combine_attrs="override")
@@ -430,9 +424,7 @@ def _draw_profile(ax: Axes, data: xr.Dataset, name: str, estimate: Mapping[str, 
 
 
 def _engineering(size: float) -> tuple[float, int]:
-    """Return the factor that scales a very small or very large number to 1 to 1000, and the exponent of ten that it
-    removes (a multiple of 3).
-    """
+    """Return the factor that scales a number to 1 to 1000, and the exponent that it removes (a multiple of 3)."""
     if not size > 0 or 1e-2 <= size < 1e4:
         return 1.0, 0
     exponent = 3 * math.floor(math.log10(size) / 3)

@@ -37,9 +37,7 @@ NEVER = 1e-6
 
 @dataclass(frozen=True)
 class Direction:
-    """Direction in parameter space with its singular value and standard error; each parameter is in units of its
-    typical size.
-    """
+    """Direction in parameter space, in units of typical sizes, with its singular value and standard error."""
 
     # norm of the change of all residuals, in standard deviations of the noise, for a step of one size. Priors do not
     # count.
@@ -183,9 +181,7 @@ UNKNOWN_STEP = 0.1
 
 @dataclass(frozen=True)
 class Profile:
-    """Profile likelihood of one parameter: the scaled increase of the cost away from the estimate, and its 95 %
-    interval.
-    """
+    """Profile likelihood of one parameter: scaled increase of the cost off the estimate, and its 95 % interval."""
 
     name: str
     values: np.ndarray  # (n,) rising, in the parameter's unit; the estimate is among them
@@ -197,9 +193,7 @@ class Profile:
 
     @property
     def lowest(self) -> float:
-        """Least increase of the cost along the profile; negative if the profile found a better fit than the search
-        did.
-        """
+        """Least increase of the cost along the profile; negative if it found a better fit than the search."""
         return float(np.nanmin(self.growth))
 
 
@@ -216,9 +210,7 @@ class Curvature:
 
 
 def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]) -> Profile:
-    """Compute the profile likelihood of one parameter: at each of its values, all other unknowns are fitted again by
-    `fit_local`.
-    """
+    """Compute the profile likelihood of a parameter: at each value, all other unknowns are fitted again."""
     index = [f.name for f in problem.free].index(name)
     free = problem.free[index]
     estimate = float(best.theta[index])
@@ -245,9 +237,7 @@ def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local:
 
 
 def following(information: np.ndarray, index: int) -> np.ndarray:
-    """Return the change of all optimal parameters per unit change of one parameter that is held fixed, shape
-    (n_free,).
-    """
+    """Return the change of all optimal parameters, (n_free,), per unit change of one that is held fixed."""
     others = np.delete(np.arange(len(information)), index)
     moves = np.ones(len(information))
     both = information[np.ix_(others, others)]
@@ -259,9 +249,7 @@ def following(information: np.ndarray, index: int) -> np.ndarray:
 
 
 def interval_of(values: np.ndarray, growth: np.ndarray, estimate: float, critical: float) -> tuple[float, float]:
-    """Return the ends of a parameter's interval: where the root of its profile likelihood reaches `critical` standard
-    errors.
-    """
+    """Return where the root of a parameter's profile likelihood reaches `critical` standard errors."""
     ends: list[Any] = []
     for side in (-1.0, 1.0):
         own = np.isfinite(growth) & (side * (values - estimate) >= 0)

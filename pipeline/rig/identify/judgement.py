@@ -56,9 +56,7 @@ class Judgement:
         return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return rms and correlation by channel, and the rms of each piece, as plain data; undefined values are
-        None.
-        """
+        """Return rms and correlation by channel, and the rms of each piece, as plain data; None is undefined."""
         return {
             "rms": json_value(self.rms),
             "correlation": json_value(self.correlation),
@@ -79,9 +77,7 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def judge_fit(problem: Problem, fit: Fit) -> Judgement:
-    """Compute the residuals of a fit on the pieces that it was fitted to, with their root mean squares and
-    correlations.
-    """
+    """Return the residuals of a fit on the pieces that it was fitted to."""
     return Judgement(problem.channels, problem.pieces, fit.residuals)
 
 

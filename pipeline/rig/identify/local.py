@@ -87,9 +87,7 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
 
 
 def choose_phases(problem: Problem, theta: Array) -> Array:
-    """Return the unknowns with the phase of each recording's known drive moved to the best of phases all round the
-    circle, with initial states fitted for each.
-    """
+    """Return the unknowns with the phase of each known drive moved to the best of phases all round the circle."""
     if not problem.phases:
         return theta
     shifts = np.arange(N_PHASES) / N_PHASES
@@ -112,9 +110,7 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Residuals of one piece of a recording and their derivatives by its initial state, compressed to few rows by a QR
-    decomposition.
-    """
+    """Residuals of one piece and their derivatives by its initial state, compressed by a QR decomposition."""
 
     jacobian: Array
     rows: Array
@@ -231,18 +227,14 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Split a scaled vector into the unknowns and the initial states. If it contains no initial states, return
-        their first guesses.
-        """
+        """Split a scaled vector into the unknowns and the initial states, by default their first guesses."""
         full = x * self.sizes
         if not self.joint:
             return full, self.starts
         return full[: self.n_free], full[self.n_free :].reshape(self.starts.shape)
 
     def at(self, x: Array) -> _Point:
-        """Evaluate residuals and Jacobian at a scaled vector of unknowns; reuse the last evaluation if the vector is
-        the same.
-        """
+        """Evaluate residuals and Jacobian at a scaled vector; reuse the last evaluation if it is the same."""
         key = x.tobytes()
         if self._last is None or key != self._key:
             theta, starts = self.split(x)
@@ -264,9 +256,7 @@ class _Search:
         return self._last
 
     def _starts_for(self, theta: Array) -> Array:
-        """Return fitted initial states for given unknowns; their first guess is extrapolated from the best evaluation
-        so far.
-        """
+        """Return fitted initial states for given unknowns; the best evaluation so far gives their first guess."""
         base = self._base
         if base is None:
             return fit_starts(self.problem, theta, self.starts).starts
@@ -283,11 +273,6 @@ class _Point(NamedTuple):
 
 
 Echo = Callable[[Array, float], None]
-
-
-class _Ending(NamedTuple):
-    max_evaluations: int
-    tolerance: float
 
 
 def fit_local(
@@ -328,9 +313,9 @@ def fit_local(
     -----
     A robust loss takes residuals in units of their scale, which a first least-squares fit gives.
     """
+    ending = max_evaluations, tolerance
     if fixed:
-        return _fit_others(problem, theta0, starts, fixed, _Ending(max_evaluations, tolerance))
-    ending = _Ending(max_evaluations, tolerance)
+        return _fit_others(problem, theta0, starts, fixed, ending)
     first = problem.starts if starts is None else starts
     plain = replace(problem, loss="linear") if problem.loss != "linear" else problem
     fit = _solve(plain, theta0, first, ending, echo)
@@ -343,7 +328,7 @@ def fit_local(
     return replace(robust, n_evaluations=fit.n_evaluations + robust.n_evaluations)
 
 
-def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo: Echo | None) -> Fit:
+def _solve(problem: Problem, theta0: Array, starts: Array, ending: tuple[int, float], echo: Echo | None) -> Fit:
     from threadpoolctl import threadpool_limits
 
     walk = _Search(problem, starts, echo)
@@ -358,7 +343,7 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo
     return _outcome(point, walk.count, ended, message)
 
 
-def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, bool, str]:
+def _least_squares(walk: _Search, x: Array, ending: tuple[int, float]) -> tuple[Array, bool, str]:
     """Run `scipy.optimize.least_squares`; return its final point, whether it converged, and its message."""
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
@@ -374,11 +359,11 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
         bounds=(lower / sizes, upper / sizes),
         method="trf",
         x_scale="jac",
-        xtol=ending.tolerance,
-        ftol=0.1 * ending.tolerance,
+        xtol=ending[1],
+        ftol=0.1 * ending[1],
         gtol=None,
         tr_solver="lsmr" if sparse else "exact",
-        max_nfev=ending.max_evaluations,
+        max_nfev=ending[0],
     )
     return found.x, bool(found.status > 0), found.message
 
@@ -414,16 +399,12 @@ def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
 
 
 def _fit_others(
-    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], ending: _Ending
+    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], ending: tuple[int, float]
 ) -> Fit:
     """Fit with some unknowns fixed at given values; the returned fit contains all unknowns."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
-        problem.without(fixed),
-        np.asarray(theta0)[~held],
-        starts=starts,
-        max_evaluations=ending.max_evaluations,
-        tolerance=ending.tolerance,
+        problem.without(fixed), np.asarray(theta0)[~held], starts=starts, max_evaluations=ending[0], tolerance=ending[1]
     )
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
     theta[~held] = part.theta

@@ -36,12 +36,12 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify import directory as store
 from pipeline.rig.identify.build import build, read_all
 from pipeline.rig.identify.directory import OUTCOMES, Info, Outcomes, read_info, stored_tables
-from pipeline.rig.identify.identification import unpack_fit
 from pipeline.rig.identify.local import Fit, fit_many_starts
 from pipeline.rig.identify.measured_orbits import MeasuredTable, read_orbits
 from pipeline.rig.identify.objective import LOST
 from pipeline.rig.identify.orbit_residuals import orbit_rows
 from pipeline.rig.identify.problem import Free, Problem
+from pipeline.rig.identify.search import unpack_fit
 from pipeline.rig.identify.specification import load_identification
 from pipeline.rig.identify.statistics import Linearised, linearise, loss_scale_of, root_of
 from pipeline.specification.files import find_spec
@@ -49,7 +49,6 @@ from pipeline.specification.problems import SpecError, import_extra
 from pipeline.store.errors import DamagedError
 
 # ---- density ---------------------------------------------------------------------------------------
-pass
 
 Array = NDArray[np.float64]
 
@@ -73,9 +72,7 @@ class LogPosterior:
     n_lost: int = 0
 
     def __call__(self, thetas: Array) -> Array:
-        """Return the logarithm of the density of each row of unknowns; minus infinity outside the bounds, and where a
-        measured orbit or a trajectory is lost.
-        """
+        """Return the log density of each row of unknowns; minus infinity outside bounds or where orbits are lost."""
         found = np.full(len(thetas), -np.inf)
         problem = self.problem
         inside = np.flatnonzero(((thetas >= problem.lower) & (thetas <= problem.upper)).all(axis=1))
@@ -121,7 +118,7 @@ def log_posterior(directory: str | Path, spec: str | Path | None, result: Mappin
     tables = stored_tables(directory)
     problem = _with_recordings(info, spec) if result["recordings"] else _without_recordings(info, result)
     if problem.continuity is not None:
-        raise SpecError(['--mcmc: the fit has a price on gaps (fit.continuity); identify with continuity = "free".'])
+        raise SpecError('--mcmc: the fit has a price on gaps (fit.continuity); identify with continuity = "free".')
     fitted = [table for table in tables if table.fitted]
     orbits = tuple(_orbit_data(table, known) for table, known in zip(fitted, fit.known, strict=True))
     problem = replace(problem, orbits=orbits, loss_scale=1.0)
@@ -167,10 +164,8 @@ def _best(info: Info, result: Mapping[str, Any]) -> Fit:
 def _with_recordings(info: Info, spec: str | Path | None) -> Problem:
     if spec is None:
         raise SpecError(
-            [
-                "--spec: missing; recordings were fitted, which the directory does not keep: give the specification of "
-                "this identification."
-            ]
+            "--spec: missing; recordings were fitted, which the directory does not keep: give the specification of "
+            "this identification."
         )
     parsed = load_identification(find_spec(spec))
     store.check(info.directory, store.identity_of(parsed, store.sources_of(parsed), read_orbits(parsed)))
@@ -269,7 +264,7 @@ def sample_posterior(
     n_free = len(density.problem.free)
     if n_walkers < 2 * n_free or n_walkers % 2:
         raise SpecError(
-            [f"--walkers = {n_walkers}: must be even and at least {2 * n_free}, twice the number of unknowns."]
+            f"--walkers = {n_walkers}: must be even and at least {2 * n_free}, twice the number of unknowns."
         )
     store = _Blocks(directory, seed, n_walkers)
     found: list[dict[str, Array]] = []
@@ -340,10 +335,8 @@ def _first(density: LogPosterior, covariance: Array, n_walkers: int, seed: int) 
                 return {"values": own[there][None], "log_density": heights[there][None], "keys": keys, "places": places}
         factor *= SHRINK
     raise SpecError(
-        [
-            "--mcmc: almost no parameters beside the best ones have all measured orbits and lie within the bounds; "
-            "widen the bounds, or hold out the orbits close to folds."
-        ]
+        "--mcmc: almost no parameters beside the best ones have all measured orbits and lie within the bounds; "
+        "widen the bounds, or hold out the orbits close to folds."
     )
 
 

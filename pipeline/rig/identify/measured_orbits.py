@@ -59,9 +59,7 @@ class MeasuredTable:
         return (*self.fitted, *self.held_out)
 
     def branches(self, values: Mapping[str, float]) -> tuple[xr.Dataset, Array]:
-        """Compute the model's branches along the measured parameter, and the amplitudes of their orbits, for values of
-        all parameters.
-        """
+        """Compute the model's branches along the measured parameter, and the amplitudes of their orbits."""
         parameters = _parameters(self.along.model, {**values, **self.settings})
         state = self.state or self.along.model.section_states[0]
         column = self.along.model.state_names.index(state)
@@ -267,9 +265,7 @@ def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[t
 
 
 def _error(scatter: float, n_cycles: int) -> float:
-    """Return the standard error of a median over cycles, from the scatter of the cycles. For fewer than two cycles
-    return the scatter itself.
-    """
+    """Return the standard error of a median over cycles from their scatter; the scatter itself for one cycle."""
     if not math.isfinite(scatter):
         return 0.0
     return scatter * MEDIAN / math.sqrt(n_cycles) if n_cycles > 1 else scatter
@@ -364,9 +360,7 @@ def _first_orbit(table: MeasuredTable, datum: Datum, branches: xr.Dataset, compu
 
 
 def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
-    """Return section point and parameter value of the computed bifurcation that is nearest to a measured one of the
-    same kind.
-    """
+    """Return section point and parameter of the computed bifurcation of a measured one's kind that is nearest."""
     words = words_of(branches["kind"]) if "kind" in branches else KINDS
     periods = branches["orbit_period"].values[branches["of_branch"].values]
     fits = [
@@ -447,9 +441,7 @@ def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return the rms of the relative errors by group (fitted, held out), stability and quantity; None if an orbit was
-    not found.
-    """
+    """Return the rms of the relative errors by group, stability and quantity; None if an orbit was not found."""
     found: dict[str, dict[str, dict[str, Any]]] = {group: {} for group in GROUPS}
     if "orbit" not in ds.sizes:
         return found

@@ -64,9 +64,7 @@ def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 def slopes_along(
     table: OrbitData, packed: Array, places: Sequence[tuple[int, int]], points: Sequence[Sequence[Point | None]]
 ) -> list[Array]:
-    """Return each orbit's derivatives of its quantities by arclength along the branch, divided by their standard
-    deviations.
-    """
+    """Return each orbit's derivatives of its quantities by arclength, divided by their standard deviations."""
     beside = [
         run_together([_moved(table, k, packed[i], points[i][k], side) for i, k in places]) for side in (BESIDE, -BESIDE)
     ]
@@ -85,9 +83,7 @@ def _steps_along(
     points: Sequence[Sequence[Point | None]],
     slopes: Sequence[Array],
 ) -> list[float]:
-    """Return the arclength step along the branch that brings each computed orbit nearest to the measured one
-    (Gauss-Newton).
-    """
+    """Return the arclength step that brings each computed orbit nearest to the measured one (Gauss-Newton)."""
     found = []
     for (i, k), slope in zip(places, slopes, strict=True):
         datum = table.data[k]
@@ -155,9 +151,7 @@ class OrbitRows:
 
 
 def orbit_rows(problem: Problem, thetas: Array, *, slopes: bool) -> list[OrbitRows]:
-    """Compute the residuals of all measured orbits and bifurcations for each row of unknowns, with `slopes` also their
-    derivatives.
-    """
+    """Compute the residuals of all measured orbits and bifurcations for each row of unknowns."""
     parts = [_table_rows(problem, table, thetas, slopes) for table in problem.orbits]
     found = []
     for member in zip(*parts, strict=True):
@@ -189,18 +183,14 @@ def _table_rows(problem: Problem, table: OrbitData, thetas: Array, slopes: bool)
 
 
 def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the residuals of a table of orbits in standard deviations, and a mask of the residuals of orbits that were
-    not found.
-    """
+    """Return the residuals of a table of orbits in standard deviations, and which of them were not found."""
     rows = np.concatenate([(d.measured - v) / d.sd for d, v in zip(table.data, values, strict=True)])
     is_lost = ~np.isfinite(rows)
     return np.where(is_lost, LOST, rows), is_lost
 
 
 def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[Array]) -> tuple[Array, OrbitData]:
-    """Return the derivatives by the unknowns of a table's residuals, and the table of orbits with the derivatives of
-    its orbits added.
-    """
+    """Return the derivatives of a table's residuals by the unknowns, and the table with those of its orbits."""
     jacobian = np.zeros((sum(len(d.measured) for d in table.data), len(problem.free)))
     ends, widths = _ends(problem, theta)
     if not len(ends):

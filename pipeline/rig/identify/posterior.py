@@ -121,10 +121,8 @@ def kept_draws(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
             there = kept.sizes["draw"]
             if n > there:
                 raise SpecError(
-                    [
-                        f"-n = {n}: {path} has {there} draws of the chain; make more: magpend identify posterior "
-                        f"{directory} --mcmc -n {n}."
-                    ]
+                    f"-n = {n}: {path} has {there} draws of the chain; make more: magpend identify posterior "
+                    f"{directory} --mcmc -n {n}."
                 )
             return kept.isel(draw=slice(n))
     return draw_posterior(directory, n, seed)
@@ -151,10 +149,8 @@ def _refuse_undetermined(names: list[str], matrix: np.ndarray) -> None:
     lost = [name for name, variance in zip(names, np.diag(matrix), strict=True) if not np.isfinite(variance)]
     if lost:
         raise SpecError(
-            [
-                f"{', '.join(lost)}: the data do not determine it, so it has no posterior; fix it under "
-                "[parameters], or give it a prior, and identify again."
-            ]
+            f"{', '.join(lost)}: the data do not determine it, so it has no posterior; fix it under "
+            "[parameters], or give it a prior, and identify again."
         )
 
 
@@ -171,10 +167,8 @@ def _within_bounds(
     while len(kept) < n:
         if tried and len(kept) < LEAST_SHARE * tried:
             raise SpecError(
-                [
-                    f"only {len(kept)} of {tried} draws lie within the bounds: the estimates' errors are larger than "
-                    "the bounds allow; widen the bounds, give priors, or identify fewer parameters."
-                ]
+                f"only {len(kept)} of {tried} draws lie within the bounds: the estimates' errors are larger than "
+                "the bounds allow; widen the bounds, give priors, or identify fewer parameters."
             )
         batch = mean + random.standard_normal((max(4 * n, 1000), len(names))) @ root
         tried += len(batch)
@@ -282,9 +276,7 @@ def _own(table: MeasuredTable, values: dict[str, float]) -> dict[str, float]:
 
 
 def _carried(table: OrbitData, drawn: xr.Dataset) -> np.ndarray:
-    """Return amplitude or bifurcation value for each measured orbit or bifurcation, shape (draw, datum); NaN where none
-    is found.
-    """
+    """Return amplitude or bifurcation value by draw and measurement, (draw, datum); NaN where none is found."""
     names = [str(name) for name in drawn["parameter"].values]
     packed = np.array([table.packed(dict(zip(names, row, strict=True))) for row in drawn["value"].values])
     found = [[v[0] for v in row] for own, points in carried(table, packed) for row in quantities_of(table, own, points)]

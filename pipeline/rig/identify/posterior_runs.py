@@ -42,7 +42,6 @@ def run_posterior(
     n: int,
     out: str | Path | None = None,
     *,
-    seed: int = 1,
     smoke: bool = False,
     workers: int | None = None,
     echo: Echo = print,
@@ -60,7 +59,7 @@ def run_posterior(
     parsed = Spec.read(path, smoke=smoke)
     names = [name for name in result["names"] if name in result["values"]] + list(result["tied"])
     _refuse_other_model(parsed.model.reference, result, list(parsed.axes), names)
-    drawn = kept_draws(identification, n, seed)
+    drawn = kept_draws(identification, n)
     tables = read_toml(path)
     if isinstance(tables.get("model"), str) and is_model_file(tables["model"]):
         tables["model"] = str((path.parent / tables["model"]).resolve())
@@ -136,7 +135,7 @@ def spread(folder: str | Path, *, branches: bool = False, attractors: bool = Fal
         for k, one in enumerate(runs):
             echo(f"attractors {k + 1} of {len(runs)}")
             sets.append(one.derive("attractors"))
-        found_rows, printed = attractor_rows(sets, _row)
+        found_rows, printed = _attractor_rows(sets)
         rows, shown = rows + found_rows, shown + printed
     if branches:
         found = []
@@ -217,11 +216,8 @@ def _line(row: Mapping[str, Any]) -> str:
 
 Rows = list[dict[str, Any]]
 
-Row = Callable[[str, str, float, np.ndarray, int], dict[str, Any]]
-"""Function that makes a row: what, name, value of the best run, values of the draws that have it, and their number."""
 
-
-def attractor_rows(runs: Sequence[xr.Dataset], row: Row) -> tuple[Rows, Rows]:
+def _attractor_rows(runs: Sequence[xr.Dataset]) -> tuple[Rows, Rows]:
     """Return rows on the attractors of all runs, the best run first, and those of them that are printed.
 
     For each attractor there is the ``share`` of all cells, and at each parameter point the share of its cells and the
@@ -239,8 +235,8 @@ def attractor_rows(runs: Sequence[xr.Dataset], row: Row) -> tuple[Rows, Rows]:
     for number in range(n):
         members = [_member(run, own, number) for run, own in zip(runs, ids, strict=True)]
         shares = np.array([0.0 if one is None else float(one["share"].mean()) for one in members])
-        whole = row("share", _named(number, members), shares[0], shares[1:], int(np.count_nonzero(shares[1:])))
-        places = list(_at_points(runs[0], members, number, dims, row))
+        whole = _row("share", _named(number, members), shares[0], shares[1:], int(np.count_nonzero(shares[1:])))
+        places = list(_at_points(runs[0], members, number, dims))
         all_rows += [whole, *places]
         printed += [whole, *(places if n_points <= FEW_POINTS else [])]
     return all_rows, printed
@@ -262,7 +258,7 @@ def _named(number: int, members: Sequence[xr.Dataset | None]) -> str:
 
 
 def _at_points(
-    reference: xr.Dataset, members: Sequence[xr.Dataset | None], number: int, dims: Sequence[str], row: Row
+    reference: xr.Dataset, members: Sequence[xr.Dataset | None], number: int, dims: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an attractor at each parameter point at which a run has it."""
     is_angle = np.asarray(model_of(reference).is_angle, bool)
@@ -274,7 +270,7 @@ def _at_points(
         place = ", ".join(f"{parameter_name(d)} = {v:g}" for d, v in values.items())
         name = f"attractor {number}" + (f" at {place}" if place else "")
         shares = np.array([0.0 if one is None else float(one["share"]) for one in own])
-        yield row("share", name, shares[0], shares[1:], int(sum(there[1:])))
+        yield _row("share", name, shares[0], shares[1:], int(sum(there[1:])))
         means = np.array(
             [
                 _mean_section(one, is_angle) if one is not None and t else np.full(len(is_angle), np.nan)
@@ -284,7 +280,7 @@ def _at_points(
         for k, state in enumerate(reference["state"].values):
             column = _about(means[:, k]) if is_angle[k] else means[:, k]
             known = column[1:][np.isfinite(column[1:])]
-            yield row(f"section {state}", name, float(column[0]), known, len(known))
+            yield _row(f"section {state}", name, float(column[0]), known, len(known))
 
 
 def _mean_section(one: xr.Dataset, is_angle: np.ndarray) -> np.ndarray:

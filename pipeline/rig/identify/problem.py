@@ -85,9 +85,7 @@ class Piece:
     known_hz: float = 0.0  # frequency of a drive that was not measured; 0 for any other [Hz]
 
     def turned(self, phase: float, detuning_hz: float) -> Piece:
-        """Return the piece with its known drive moved forward by a phase [drive periods] at the recording's time 0, and
-        with another frequency.
-        """
+        """Return the piece with its known drive moved by a phase at the recording's time 0, and detuned."""
         if self.drive is None or not self.known_hz or (phase == 0.0 and detuning_hz == 0.0):
             return self
         begun = self.drive.start_s * self.known_hz + phase + detuning_hz * self.begin_s
@@ -98,9 +96,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Problem:
-    """Least-squares problem of an identification: the unknowns are parameters, sensor offsets and the pieces' initial
-    states.
-    """
+    """Least-squares problem: the unknowns are parameters, sensor offsets and the pieces' initial states."""
 
     model: Model
     fixed: Parameters  # values of the parameters that are not identified
@@ -122,9 +118,7 @@ class Problem:
 
     @cached_property
     def system(self) -> System:
-        """System of equations that is integrated. If the recordings contain a measured torque, this torque is its
-        drive.
-        """
+        """System that is integrated; a torque that the recordings contain is its drive."""
         return with_recorded_drive(self.model.system) if self.recorded else self.model.system
 
     @property
@@ -237,9 +231,7 @@ class Problem:
         return np.hstack([packed, np.zeros((len(thetas), more)), thetas @ turns.T])
 
     def with_orbits(self, known: Sequence[Solution]) -> Problem:
-        """Return a copy of the least-squares problem with new computed orbits to start Newton's method, one `Solution`
-        per table.
-        """
+        """Return the problem with new computed orbits to start Newton's method, one `Solution` per table."""
         orbits = tuple(replace(table, known=own) for table, own in zip(self.orbits, known, strict=True))
         return replace(self, orbits=orbits)
 

@@ -68,9 +68,7 @@ class Finding:
 
 
 def beside_of(problem: Problem, fit: Fit, *words: str) -> dict[str, float]:
-    """Return the fitted unknowns that are no parameters of the model, by name: zero offsets of the sensors and phases
-    of known drives, or those whose names begin with one of the given words.
-    """
+    """Return the fitted unknowns beside the model's parameters: zeros and phases, or those of the given words."""
     prefixes = tuple(f"{word}." for word in words or (ZERO, PHASE))
     named = zip(problem.names, fit.theta, strict=True)
     return {name: float(value) for name, value in named if name.startswith(prefixes)}
@@ -266,9 +264,7 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
-    """Return one printed line for each channel: rms of its residuals, and correlation of its measured and computed
-    values.
-    """
+    """Return a printed line for each channel: rms of its residuals, and correlation with computed values."""
     lines = []
     for name, rms in judged["rms"].items():
         shown = "-" if rms is None else f"{rms:.4g} {units[name]}"

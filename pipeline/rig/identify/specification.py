@@ -191,9 +191,7 @@ class ParameterTables:
         return Unknown(name, start, max(low, least), min(high, most), one.prior)
 
     def _bounds(self, name: str, start: float) -> tuple[float, float]:
-        """Return the model's bounds on a parameter. A bound that is not itself an allowed value is replaced by an
-        allowed value close to it.
-        """
+        """Return the model's bounds on a parameter, just inside where the bound is not an allowed value."""
         return {
             POSITIVE: (_LEAST * start, math.inf),
             NON_NEGATIVE: (0.0, math.inf),
@@ -279,9 +277,7 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """Table ``[[recordings]]``: file of a recording, mapping file of its channels, kind of its drive, time window and
-    held-out pieces.
-    """
+    """Table ``[[recordings]]``: file, mapping, kind of the drive, time window and held-out pieces."""
 
     file: str = Field(description="Recording, relative to the specification")
     mapping: str = Field(description="Mapping file of the recording, relative to the specification")
@@ -433,9 +429,7 @@ def load_identification(path: str | Path) -> IdentificationSpec:
 
 
 def parse_identification(data: Mapping[str, Any], folder: Path) -> IdentificationSpec:
-    """Validate the TOML tables of an identification, with paths relative to `folder`; raise `SpecError` with all
-    problems at once.
-    """
+    """Validate an identification's tables, with paths relative to `folder`; raise `SpecError` with all problems."""
     kind = data.get("kind")
     if kind in ("sweep", "continuation"):
         raise SpecError(f'kind = "{kind}": is a run, not an identification; use magpend run.')

@@ -70,9 +70,7 @@ class Linearised:
 
     @property
     def stated(self) -> np.ndarray:
-        """Information matrix of priors and measured orbits, whose errors are stated rather than estimated, (n_free,
-        n_free).
-        """
+        """Information matrix, (n_free, n_free), of priors and measured orbits, whose errors are stated."""
         own = np.diag(self.prior).astype(float)
         return own if self.orbits is None else own + self.orbits.T @ self.orbits
 
@@ -151,9 +149,7 @@ def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray
 
 
 def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
-    """Return whether any channel's residuals, (n, n_channels) by piece, are autocorrelated: a Ljung-Box test over all
-    pieces.
-    """
+    """Return whether residuals, (n, n_channels) by piece, are autocorrelated: a Ljung-Box test over all pieces."""
     n_channels = residuals[0].shape[1]
     shortest = min(len(r) for r in residuals)
     lags = max(1, min(LAGS, shortest // 5))
@@ -212,9 +208,7 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores (gradients of the cost by the parameters) at each sample time, and information matrices, for
-    each piece.
-    """
+    """Gradients of the cost by the parameters at each sample time, and information matrices, by piece."""
 
     scores: list[np.ndarray]
     information: list[np.ndarray]
@@ -373,9 +367,7 @@ def _newey_west(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.
 
 
 def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
-    """Return the Newey-West sum of the scores' autocovariances over time, with Bartlett weights up to lag
-    `bandwidth`.
-    """
+    """Return the Newey-West sum of the scores' autocovariances, with Bartlett weights up to lag `bandwidth`."""
     n, p = scores.shape
     window = 1.0 - np.abs(np.arange(-bandwidth, bandwidth + 1)) / (bandwidth + 1)
     smoothed = np.stack(
@@ -451,9 +443,7 @@ def _information(
     prior: np.ndarray,
     scale: float,
 ) -> np.ndarray:
-    """Return the information matrix of the unknowns, summed over samples, or from the whole Jacobian if pieces are
-    coupled.
-    """
+    """Return the unknowns' information matrix: a sum over samples, or of the Jacobian for coupled pieces."""
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
     total = np.diag(prior)
@@ -466,9 +456,7 @@ def _information(
 
 
 def loss_scale_of(problem: Problem, fit: Fit) -> float:
-    """Return the residual, in units of the noise, above which a robust loss grows slower than the square; see
-    `fit_local`.
-    """
+    """Return the residual, in units of the noise, above which a robust loss grows slower than the square."""
     if problem.loss == "linear":
         return 1.0
     z = np.concatenate(fit.residuals) / problem.noise
@@ -476,9 +464,7 @@ def loss_scale_of(problem: Problem, fit: Fit) -> float:
 
 
 def groups_of(problem: Problem) -> tuple[int, ...]:
-    """Return the group number of each piece. Consecutive pieces tied by a continuity weight form one group; any other
-    piece forms a group alone.
-    """
+    """Return the group of each piece: consecutive pieces tied by a continuity weight form one."""
     found: list[int] = []
     for k, piece in enumerate(problem.pieces):
         joined = problem.continuity is not None and 0 <= piece.follows < k

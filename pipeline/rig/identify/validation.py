@@ -118,9 +118,7 @@ def check_orbits(directory: str | Path, table: str | Path) -> dict[str, Any]:
 
 
 def _stored(spec: dict[str, Any], result: dict[str, Any]) -> IdentificationSpec:
-    """Return a specification with the identified model and no orbits; its file paths are relative to the working
-    directory.
-    """
+    """Return a specification with the identified model and no orbits, with paths from the working directory."""
     first = next(iter(spec["identify"]))
     tables = {
         "kind": "identification",

@@ -97,9 +97,7 @@ def solve(
 
 
 def _inverse(jacobian: np.ndarray) -> np.ndarray:
-    """Return the inverse of the normal matrix ``J.T @ J``. The columns of the Jacobian ``J`` are scaled to equal size
-    for accuracy.
-    """
+    """Return the inverse of ``J.T @ J``; the columns of ``J`` are scaled to equal size for accuracy."""
     size = np.linalg.norm(jacobian, axis=0)
     _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
     if not s[-1] > len(jacobian) * _EPS * s[0]:
@@ -160,9 +158,7 @@ class Laws:
 
 @dataclass(frozen=True)
 class JointFit:
-    """Joint fit to all readings (Wojna et al. 2018, Eq. 18-19), with standard errors and correlations of its
-    parameters.
-    """
+    """Joint fit to all readings (Wojna et al. 2018, Eq. 18-19), with standard errors and correlations."""
 
     free: tuple[str, ...]
     values: dict[str, float]  # all of `laws.FITTED`

@@ -87,18 +87,14 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """Tie that holds the pendulum's upper link during the measurement. The weight of the tie adds a torque to the
-    readings.
-    """
+    """Tie that holds the pendulum's upper link; its weight adds a torque to the readings."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
     lever_m: float = Field(ge=0, description="Distance from the upper joint along the link to the mass [m].")
 
 
 class Correction(Table):
-    """Header table ``[correction]``: torques in the readings that do not come from the magnets and must be
-    subtracted.
-    """
+    """Header table ``[correction]``: torques in the readings that the magnets do not cause, to be subtracted."""
 
     weights: bool = Field(description="Whether the readings include the torque of the links' weights.")
     tie: Tie | None = Field(None, description="Weight of the tie, if the readings include it.")
@@ -183,9 +179,7 @@ class Measurement:
 
     @property
     def label(self) -> str:
-        """Title of the measurement for figures and presets, beginning with "SYNTHETIC" if the readings were
-        computed.
-        """
+        """Title of the measurement, beginning with "SYNTHETIC" if the readings were computed."""
         return ("SYNTHETIC: " if self.header.synthetic else "") + self.header.title
 
 
@@ -233,9 +227,7 @@ def read_measurement(path: str | Path) -> Measurement:
 def _besides(
     correction: Correction, p: Parameters, angle: np.ndarray, locked: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the part of the measured torque that does not come from the magnets but, for example, from the links'
-    weights [N m].
-    """
+    """Return the part of the torque that the magnets do not cause, such as that of the links' weights [N m]."""
     if correction.without is not None:
         return columns["without"]
     found = laws.weight_torque(angle, locked, p) if correction.weights else np.zeros_like(angle)
@@ -308,9 +300,7 @@ def _wanted(header: Header) -> dict[str, str]:
 
 
 def _but_for_units(wanted: dict[str, str], names: list[str], header: Header) -> tuple[dict[str, str], list[str]]:
-    """Accept columns whose names differ from those in the header only by a unit in brackets. Return the names found,
-    and warnings.
-    """
+    """Accept columns that differ from the header's by a unit in brackets; return their names, and warnings."""
     found, warnings = dict(wanted), []
     for key, name in wanted.items():
         near = units.names_with_unit(name, names)
@@ -364,9 +354,7 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _places(rows: Any) -> str:
-    """Format row numbers of the table for a message: at most three numbers, then the count of further rows. The first
-    reading is row 1.
-    """
+    """Name rows of the table, from 1, in a message: at most three, then the number of further ones."""
     named = ", ".join(str(i) for i in rows[:MAX_NAMED])
     more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
     return f"row{'s' if len(rows) > 1 else ''} {named}{more}"

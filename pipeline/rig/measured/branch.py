@@ -75,9 +75,7 @@ def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
 
 
 def _upward_crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the times [s] at which a signal rises through its mean. Before each crossing, the signal must have been
-    below a hysteresis band about the mean.
-    """
+    """Return the times [s] at which a signal that was below a band about its mean rises through the mean."""
     if len(values) < 2:
         return np.zeros(0)
     away = values - values.mean()

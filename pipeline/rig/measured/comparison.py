@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -42,9 +42,7 @@ _DRAWS = 8
 
 
 def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
-    """Return the Wasserstein-1 distance between two sets of equally weighted points, (m, state) and (n, state), in
-    units of the scales.
-    """
+    """Return the Wasserstein-1 distance, in units of the scales, of points (m, state) and (n, state)."""
     ways = geometry.distance(a[:, None], b[None])
     if len(a) != len(b):
         return _transport(ways)
@@ -53,9 +51,7 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
 
 
 def _transport(ways: Floats) -> float:
-    """Return the smallest mean transport distance between two sets of equally weighted points, given all pairwise
-    distances.
-    """
+    """Return the smallest mean transport distance between two sets, given all pairwise distances."""
     m, n = ways.shape
     if min(m, n) == 1:
         return float(ways.mean())
@@ -156,9 +152,7 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
 
 
 def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
-    """Return at least `size` section points of an attractor: random points of an aperiodic attractor, or whole
-    repetitions of a periodic orbit.
-    """
+    """Return at least `size` section points: random ones of an aperiodic set, or whole repetitions of an orbit."""
     points = candidate.points
     if candidate.orbit_period:
         return np.tile(points, (max(1, -(-size // len(points))), 1))
@@ -214,9 +208,7 @@ class WindowEdge:
 
     @property
     def shift_error_hz(self) -> float:
-        """Bound on the error of the shift [Hz]: half the measured plus half the computed frequency step. It is not a
-        standard error.
-        """
+        """Bound on the error of the shift [Hz], half of both frequency steps; it is not a standard error."""
         return self.measured_error_hz + self.computed_error_hz
 
 
@@ -233,9 +225,7 @@ def words_for(regime: Regime, words: tuple[str, ...]) -> str:
 
 
 def windows_of(measured: xr.Dataset) -> list[Window]:
-    """Return the windows of all recordings. A window is a run of consecutive frequency steps with the same regime
-    (period and class of motion).
-    """
+    """Return the windows of all recordings: runs of consecutive frequency steps with the same regime."""
     keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
     sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= CONFIDENT]
     labelled = itertools.groupby(sure, key=lambda i: (keys[i], regime_of(measured, i)))
@@ -275,9 +265,7 @@ def window_edges(measured: xr.Dataset, winners: np.ndarray, computed: Computed) 
 def _computed_end(
     window: Window, measured: xr.Dataset, winners: np.ndarray, computed: Computed
 ) -> tuple[float, float, str]:
-    """Return the frequency at which the regime of a measured window ends in the model, in the direction of the
-    sweep.
-    """
+    """Return where the regime of a measured window ends in the model, in the direction of the sweep."""
     f = measured["frequency"].values
     with_side = "side" in measured
     chosen = {}
@@ -296,9 +284,7 @@ def _computed_end(
 
 
 def _walk(place: int, sign: int, computed: Computed, holds: Callable[[int], bool]) -> tuple[float, float, str]:
-    """Follow a regime along the computed frequencies. Return the frequency at which it ends [Hz], half the frequency
-    step there, and a note if it does not end.
-    """
+    """Follow a regime along computed frequencies; return its end [Hz], half the step there, and a note without one."""
     f = computed.frequencies
     while 0 <= place + sign < f.size:
         if not holds(place + sign):
@@ -318,11 +304,11 @@ def _same(a: Regime, b: Regime, with_side: bool) -> bool:
 # ---- comparison ------------------------------------------------------------------------------------
 
 NOBODY = -1
+SEED = 0
+"""Seed of the samples drawn from sets that do not close."""
 
 
-def compare(
-    measured: xr.Dataset, run: AnalysedRun, *, at: Mapping[str, float] | None = None, seed: int = 0
-) -> xr.Dataset:
+def compare(measured: xr.Dataset, run: AnalysedRun) -> xr.Dataset:
     """Compare a measured bifurcation diagram with the attractors of a run of the same model over the drive frequency.
 
     Return `measured` with further variables. By step: ``noise_floor``, Wasserstein-1 between the halves of the step's
@@ -335,14 +321,12 @@ def compare(
     Raise `SpecError` if the run is of another model, has no frequency axis, or reaches none of the measured
     frequencies.
     """
-    computed = Computed.of(run, model_of(measured), at)
-    return compare_with(with_sides(measured, computed.parameters), computed, seed=seed)
+    computed = Computed.of(run, model_of(measured))
+    return compare_with(with_sides(measured, computed.parameters), computed)
 
 
-def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> xr.Dataset:
-    """Compare a measured diagram with computed attractors. The measured frequency steps must already have their class
-    of motion (``side``).
-    """
+def compare_with(measured: xr.Dataset, computed: Computed) -> xr.Dataset:
+    """Compare a measured diagram, whose steps have their class of motion (``side``), with computed attractors."""
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):
         own = computed.frequencies
@@ -352,7 +336,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
         )
     ids = computed.attractors["attractor"].values
     distances = np.full((f.size, ids.size), np.nan)
-    rows = [_step(measured, i, computed, distances[i], seed) for i in range(f.size)]
+    rows = [_step(measured, i, computed, distances[i]) for i in range(f.size)]
     names = {
         "noise_floor": ("1", "distance of the halves of the sections"),
         "winner": ("1", "nearest attractor"),
@@ -381,19 +365,17 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
     )
 
 
-def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int) -> dict[str, float]:
-    """Compare the measurement with the model at one frequency step. Write the distance from each attractor into
-    `distances`, and return the other results by name.
-    """
+def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray) -> dict[str, float]:
+    """Compare one frequency step; write the distances from the attractors, and return the other results."""
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]
     cloud = cloud_of(points, noise, int(measured["orbit_period"].values[step]))
-    floor = floor_of(cloud, geometry, np.random.default_rng(seed))
+    floor = floor_of(cloud, geometry, np.random.default_rng(SEED))
     candidates = computed.candidates(float(measured["frequency"].values[step]), states)
     ids = computed.attractors["attractor"].values.tolist()
     for c in candidates:
-        rng = np.random.default_rng([seed, c.attractor])
+        rng = np.random.default_rng([SEED, c.attractor])
         distances[ids.index(c.attractor)] = distance_to(c, cloud, geometry, rng)
     row = {"noise_floor": floor, "winner": NOBODY, "distance": np.nan, "runner_up": np.nan}
     row |= {"distance_in_noise": np.nan, "computed_period": NOBODY, "computed_side": 0}
@@ -446,9 +428,7 @@ def words_of(measured: xr.Dataset) -> tuple[str, ...]:
 
 
 def edges_table(compared: xr.Dataset) -> Table:
-    """Return a table of the frequencies at which regimes (period and class of motion) end on the rig and in
-    the model.
-    """
+    """Return a table of the frequencies at which regimes end on the rig and in the model."""
     words = words_of(compared)
     rows: list[Row] = []
     for k in range(compared.sizes.get("edge", 0)):

@@ -79,9 +79,7 @@ class Computed:
 
     @classmethod
     def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
-        """Read a run and its attractors; compute these if no stored result exists. See `cube_and_parameters` for
-        errors.
-        """
+        """Read a run and its attractors, or compute these; see `cube_and_parameters` for errors."""
         cube, parameters = cube_and_parameters(run, model, at)
         with refused(run.name):
             found = run.derive("attractors")
@@ -103,9 +101,7 @@ class Computed:
         return np.asarray(self.attractors[FREQUENCY_DIM].values, np.float64)
 
     def place(self, frequency_hz: float) -> int:
-        """Return the index of the computed frequency nearest to `frequency_hz`, or -1 if `frequency_hz` lies more than
-        about half a step outside the computed range.
-        """
+        """Return the index of the nearest computed frequency; -1 if it lies over half a step outside of their range."""
         f = self.frequencies
         i = int(np.abs(f - frequency_hz).argmin())
         near = np.abs(np.delete(f, i) - f[i])

@@ -56,14 +56,11 @@ class Regime:
     max_period: int
 
 
-def find_period(
-    points: Floats, noise: Floats, *, limit: float = LIMIT, max_period: int = MAX_PERIOD, seed: int = 0
-) -> Regime:
+def find_period(points: Floats, noise: Floats, *, max_period: int = MAX_PERIOD) -> Regime:
     """Estimate the period of a motion from consecutive noisy section points, (n, component), angles not wrapped.
 
-    A full turn per period is a trend, which cancels in second differences. `limit` is the largest closure of a closed
-    motion, in units of noise. A period k needs 2 k + 6 sections; with fewer than 8 sections, the period is 0 with
-    confidence 0.
+    A full turn per period is a trend, which cancels in second differences. A period k needs 2 k + 6 sections; with
+    fewer than 8 sections, the period is 0 with confidence 0.
     """
     n = len(points)
     periods = [k for k in range(1, max_period + 1) if n - 2 * k >= _LEAST]
@@ -73,29 +70,25 @@ def find_period(
     for row, k in enumerate(periods):
         squares[row, : n - 2 * k] = _second(points, noise, k)
     closure = _closure(squares)
-    found = _least(closure, limit)
-    share = _share(squares, found, limit, np.random.default_rng(seed))
+    found = _least(closure, LIMIT)
+    share = _share(squares, found)
     if found < 0:
         best = float(closure.min())
-        return Regime(0, share, best, best / limit, periods[-1])
-    rivals = closure[:found] / limit
-    margin = min(limit / float(closure[found]), float(rivals.min()) if found else np.inf)
+        return Regime(0, share, best, best / LIMIT, periods[-1])
+    rivals = closure[:found] / LIMIT
+    margin = min(LIMIT / float(closure[found]), float(rivals.min()) if found else np.inf)
     return Regime(periods[found], share, float(closure[found]), margin, periods[-1])
 
 
 def _second(points: Floats, noise: Floats, k: int) -> Floats:
-    """Return the squared second differences of section points at lag `k`, in units of their noise, averaged over the
-    states.
-    """
+    """Return squared second differences of section points at lag `k` in units of noise, averaged over states."""
     difference = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
     variance = noise[2 * k :] ** 2 + 4 * noise[k:-k] ** 2 + noise[: -2 * k] ** 2
     return np.asarray((difference**2 / variance).mean(axis=1))
 
 
 def _closure(squares: Floats) -> Floats:
-    """Return the rms second difference of the section points for each tested period. It is computed for all points and
-    for the later half, and the smaller value is kept.
-    """
+    """Return for each period the rms second difference: of all points or of the later half, the smaller."""
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)
     later = np.zeros(squares.shape[1], bool)
@@ -115,14 +108,14 @@ def _least(closure: Floats, limit: float) -> int:
     return int(closed[0]) if closed.size else -1
 
 
-def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) -> float:
+def _share(squares: Floats, found: int) -> float:
     """Return the fraction of bootstrap resamples of the section points that give the same period as all points do.
 
     Sections are drawn in blocks as long as second differences overlap, for all lags together. The limit is
     drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor
     of two.
     """
-    n = squares.shape[1]
+    n, rng = squares.shape[1], np.random.default_rng(0)
     block = min(max(4, squares.shape[0]), n)
     number = -(-n // block)
     same = 0
@@ -130,7 +123,7 @@ def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) 
         begins = rng.integers(0, n, number)
         chosen = (begins[:, None] + np.arange(block)).ravel() % n
         closure = _closure(squares[:, np.sort(chosen)])
-        same += _least(closure, limit * 2.0 ** rng.uniform(-1, 1)) == found
+        same += _least(closure, LIMIT * 2.0 ** rng.uniform(-1, 1)) == found
     return same / _RESAMPLES
 
 
@@ -227,9 +220,7 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 def _with_instants(
     points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Return the noise of section points. For each state whose rate is measured, it includes the effect of the
-    uncertain times of the points.
-    """
+    """Return the noise of section points, with the effect of their uncertain times where rates are measured."""
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
@@ -342,9 +333,7 @@ def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:
 
 
 def steps_table(measured: xr.Dataset) -> Table:
-    """Return a table of the frequency steps: frequency, jitter, duty cycle, period, confidence, and the comparison with
-    a computed run if there is one.
-    """
+    """Return a table of the frequency steps, with the comparison with a computed run if there is one."""
     rows = [_row(measured.isel(step=i)) for i in range(measured.sizes["step"])]
     return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
 

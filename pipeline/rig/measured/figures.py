@@ -99,9 +99,7 @@ def _rig(measured: xr.Dataset) -> str:
 def _ranges(
     measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return the ranges of the frequency axis and the state axis. The range of the state axis is None if a computed
-    diagram sets it.
-    """
+    """Return the ranges of the frequency axis and the state axis, which is None if a computed diagram sets it."""
     own = measured["frequency"].values
     f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
     margin = 0.02 * float(np.ptp(f)) or 0.02 * float(f[0])
@@ -128,9 +126,7 @@ def _dress(ax: Axes, measured: xr.Dataset, measure: labels.Measure, ranges: Any)
 
 
 def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) -> None:
-    """Draw the measured section points separately for each sweep direction and class of motion. Upward sweeps are drawn
-    on top.
-    """
+    """Draw measured section points by sweep direction and class of motion, upward sweeps on top."""
     motions = motions_of(measured)
     codes = measured["side"].values if "side" in measured else np.zeros(measured.sizes["step"], int)
     f, ways = measured["frequency"].values, measured["direction"].values.astype(str)
@@ -227,9 +223,7 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    """Return the attractors that are nearest to the measurement at some step. The most frequent attractor of each class
-    of motion gets the colour of the class.
-    """
+    """Return the attractors that are nearest at some step; the most frequent of each class has its colour."""
     cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
     winners, sides = compared["winner"].values, compared["computed_side"].values
     ids = [int(i) for i in np.unique(winners) if i >= 0]
@@ -293,9 +287,7 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
 
 
 def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequence[str]) -> None:
-    """Draw period and class of motion over the frequency as coloured strips. Each sweep direction has one strip for the
-    rig and one for the model.
-    """
+    """Draw period and class of motion as coloured strips, for each sweep direction one for rig and model each."""
     rows: list[str] = []
     for way in ways:
         chosen = np.flatnonzero(compared["direction"].values == way)
@@ -436,9 +428,7 @@ def _draw_portrait(ax: Axes, ds: xr.Dataset, pair: list[labels.Measure]) -> None
 
 
 def _looks(name: str) -> tuple[tuple[str, dict[str, Any]], ...]:
-    """Return variable name and line style of a state, first measured, then computed. The computed line is thinner and
-    on top.
-    """
+    """Return variable name and line style of a state, measured, then computed: thinner and on top."""
     return (
         (name, {"color": RIG, "linewidth": 1.3, "zorder": 2.0}),
         (name + SUFFIX, {"color": MODEL, "linewidth": 0.8, "zorder": 3.0}),

@@ -41,9 +41,7 @@ class Channel:
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
-    """Return the measured states of a recording. The slope of a state gives its rate if the rate itself is not
-    measured.
-    """
+    """Return the measured states of a recording; the slope of a state gives a rate that is not measured."""
     names = model.state_names
 
     def channel(place: int, state: State) -> Channel:
@@ -135,9 +133,7 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
 ) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
-    """Fit polynomials to the channels about each rising edge of the drive that has enough samples around it. Return the
-    number and the fit of each such edge.
-    """
+    """Fit polynomials about each rising edge with enough samples around it; return number and fit of each."""
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     data = np.stack([recording[c.name].values for c in channels], axis=1)
@@ -169,9 +165,7 @@ def _nearest(instants: Floats, at: float, beyond: float) -> float:
 def _fit(
     t: Floats, data: Floats, channels: list[Channel], half: float, order: int
 ) -> tuple[Floats, Floats, Floats, Floats] | None:
-    """Fit a polynomial to each channel about a drive edge. Return value and slope at the edge, their errors per unit
-    noise, the residual variance, and the kink.
-    """
+    """Fit a polynomial to each channel; return value and slope, errors per unit noise, residual variance, kink."""
     if min((t < 0).sum(), (t >= 0).sum()) < order + _LEAST_SPARE or not np.isfinite(data).all():
         return None
     values, spread = np.empty((len(channels), 2)), np.empty((len(channels), 2))
@@ -193,9 +187,7 @@ def _fit(
 
 
 def _basis(x: Floats, order: int, smooth: bool) -> Floats:
-    """Return the design matrix of a polynomial fit around a drive edge, with separate terms before and after
-    the edge.
-    """
+    """Return the design matrix of a polynomial fit, with separate terms before and after the edge."""
     left, right = np.where(x < 0, x, 0.0), np.where(x < 0, 0.0, x)
     first = 2 if smooth else 1
     shared = [np.ones_like(x), x] if smooth else [np.ones_like(x)]

@@ -74,9 +74,7 @@ def series_of(
 def _part(
     recording: xr.Dataset, edges: Edges, sections: xr.Dataset, start_s: float | None, n_periods: int
 ) -> tuple[int, int]:
-    """Return the first and the last rising edge of the part of a recording to compare. The drive frequency is constant
-    between them.
-    """
+    """Return the first and last rising edge of the compared part, in which the drive frequency is constant."""
     begin = -math.inf if start_s is None else start_s
     known = [int(n) for n in sections["number"].values if edges.rising[int(n)] >= begin]
     for first in known:
@@ -98,9 +96,7 @@ def _first_timing(edges: Edges) -> float:
 
 
 def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
-    """Return the times of edges `first` to `last` on a line fitted to all edges of their stretch of constant
-    frequency.
-    """
+    """Return the times of edges `first` to `last` on a line through all edges of their constant stretch."""
     a, b = next((a, b) for a, b in constant_spans(edges) if a <= first < b)
     rising = edges.rising[a : b + 1]
     n = np.arange(rising.size, dtype=np.float64)

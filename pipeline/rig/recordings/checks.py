@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,23 +26,14 @@ LEAP_AROUND = 9
 """Number of steps whose median is the usual step."""
 
 
+@dataclass(frozen=True, eq=False)
 class Signal:
-    """Readings of one channel, with the time of each sample and the number of its piece (part without a gap).
+    """Readings of one channel, with the time of each sample and the number of its piece (part without a gap)."""
 
-    Parameters
-    ----------
-    name
-        Name in the dataset.
-    raw
-        Readings, (n,) [the file's unit].
-    time
-        Times, (n,) [s].
-    piece
-        Index of the piece, (n,).
-    """
-
-    def __init__(self, name: str, raw: np.ndarray, time: np.ndarray, piece: np.ndarray) -> None:
-        self.name, self.raw, self.time, self.piece = name, raw, time, piece
+    name: str  # name in the dataset
+    raw: np.ndarray  # readings, (n,) [the file's unit]
+    time: np.ndarray  # times, (n,) [s]
+    piece: np.ndarray  # index of the piece, (n,)
 
     def found(self, kind: str, start: int, end: int, severity: str, text: str) -> Finding:
         """Return a finding (fault report) about the samples from index `start` up to, not including, `end`."""

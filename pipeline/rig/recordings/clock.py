@@ -197,9 +197,7 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
 def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
-    """Return the sample range of each channel in which all channels of a stretch have data, and findings about samples
-    left out.
-    """
+    """Return the sample range in which all channels of a stretch have data, and findings on samples left out."""
     starts = {n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()}
     known = [s for s in starts.values() if math.isfinite(s)]
     first = max(known, default=0.0)
@@ -277,9 +275,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
 def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None, source: str
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
-    """Divide the samples into pieces at gaps and where `forced` is true, and make the sample times even within each
-    piece.
-    """
+    """Divide samples into pieces at gaps and where `forced` is true, with even times within each piece."""
     is_gap = _missing(time, step) > 0
     if stated is None:
         _refuse_irregular(time, is_gap, step, source)
@@ -352,9 +348,7 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 
 
 def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
-    """Shift those stretches of a file whose time restarts, so that they follow the previous stretch. Return the time
-    stamps, and whether any stretch was shifted.
-    """
+    """Lay stretches whose time restarts after the one before; return the time stamps, and whether any was."""
     placed = [stamps[0]]
     moved = 0
     for s in stamps[1:]:
@@ -377,9 +371,7 @@ def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Fin
 def _even(
     time: np.ndarray, piece: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Fit lines of equal slope to the time stamps, one line per piece. Return the times on the lines, the slope and the
-    residuals.
-    """
+    """Fit lines of equal slope to the time stamps by piece; return times on them, slope and residuals."""
     count = np.bincount(piece)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     index = np.arange(len(time)) - first[piece]
@@ -399,9 +391,7 @@ def _even(
 
 
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
-    """Report time stamps that deviate from even steps. The report is a warning if they deviate by half a step
-    or more.
-    """
+    """Report time stamps that deviate from even steps, as a warning from half a step on."""
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []

@@ -180,9 +180,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
 
 
 def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
-    """Return the numeric columns, and the columns of dates or times of day, which are converted to seconds since the
-    first row.
-    """
+    """Return the numeric columns, and those of dates or times of day as seconds since the first row."""
     numbers = [j for j in range(form.n_columns) if j not in form.texts]
     values = table(body, numbers, form.delimiter, form.decimal)
     found = {j: values[:, k] for k, j in enumerate(numbers)}
@@ -225,9 +223,7 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
 
 
 def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
-    """Try to read the rows with one delimiter and decimal sign. Return the form of the text, or None if the rows do not
-    fit.
-    """
+    """Return the form of rows read with one delimiter and decimal sign, or None if they do not fit."""
     sample = rows[:LOOKED_AT]
     parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
     late = parsed[len(parsed) // 2 :]

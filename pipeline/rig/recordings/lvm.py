@@ -118,9 +118,7 @@ def _skip(lines: list[str], i: int) -> int:
 
 
 def _columns(segment: _Segment) -> dict[int, int | None]:
-    """Map the index of each channel column to the index of its abscissa (X) column, or to None if it has no such
-    column.
-    """
+    """Map the index of each channel column to that of its abscissa (X) column, or to None."""
     last_x: int | None = None
     found: dict[int, int | None] = {}
     for j, name in enumerate(segment.names):

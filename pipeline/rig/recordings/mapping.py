@@ -79,9 +79,7 @@ class PieceMap(Table):
 
 
 class CsvMap(Table):
-    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, for files in which they should not be detected
-    automatically.
-    """
+    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, if they should not be detected."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
         default=None, description="Separator of fields."
@@ -205,9 +203,7 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: st
 
 
 def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
-    """Validate the keys of a mapping file other than model, channels and drive, one by one so that all problems are
-    reported.
-    """
+    """Validate the keys other than model, channels and drive one by one, so that all problems are reported."""
     found = {}
     for key, value in rest.items():
         if key not in Mapping.model_fields:

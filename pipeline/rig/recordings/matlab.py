@@ -55,9 +55,7 @@ def _refuse_hdf5(path: Path) -> None:
 
 
 def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
-    """Add the numeric arrays of a MATLAB variable to `leaves` under its name; each field of a structure has its own
-    entry.
-    """
+    """Add the numeric arrays of a MATLAB variable to `leaves` by name; fields have entries of their own."""
     if not isinstance(value, np.ndarray):
         return
     if value.dtype.names:

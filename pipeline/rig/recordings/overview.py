@@ -61,9 +61,7 @@ def _channel_row(raw: Raw, name: str) -> dict[str, Any]:
 
 
 def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
-    """Return two tables of a recording: one row per measured quantity, with its noise from `smooth`, and one row per
-    finding.
-    """
+    """Return tables of a recording: a row per measured quantity, with its noise, and a row per finding."""
     from pipeline.rig.recordings.smoothing import smooth
 
     smoothed = smooth(ds)

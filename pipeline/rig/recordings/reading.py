@@ -174,9 +174,7 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
-    """Return the channel name in the file for each mapped quantity, and for ``time`` and ``piece``. Raise `SpecError`
-    if a channel is missing.
-    """
+    """Return the file's channel of each quantity, of ``time`` and ``piece``; raise `SpecError` for missing ones."""
     wanted: dict[str, Scaled | TimeMap | PieceMap] = dict(_entries(mapping))
     for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
         if axis is not None:
@@ -208,9 +206,7 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the one channel in the file whose name is that in the mapping file followed by a unit in brackets, else
-    None.
-    """
+    """Return the one channel whose name is the mapping's followed by a unit in brackets, else None."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
@@ -286,9 +282,7 @@ def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clo
 
 
 def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, list[Finding]]:
-    """Check the readings of a channel for faults and convert them to SI units; return the values and the findings
-    (fault reports).
-    """
+    """Check the readings of a channel for faults; return them in SI units, and the findings."""
     entry = _entries(mapping)[signal.name]
     found = checks.missing(signal)
     raw = np.where(np.isfinite(signal.raw), signal.raw, np.nan)

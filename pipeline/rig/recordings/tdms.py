@@ -65,9 +65,7 @@ def _channel(name: str, values: np.ndarray, properties: Mapping[str, Any], zero:
 
 
 def _numbers(data: Any, zero: int) -> np.ndarray | None:
-    """Return a channel's data as floats (time stamps become seconds since `zero`), or None if they are neither numbers
-    nor times.
-    """
+    """Return data as floats (time stamps as seconds since `zero`), or None if they are no numbers or times."""
     array = np.asarray(data)
     names = array.dtype.names or ()
     if "second_fractions" in names:
@@ -77,9 +75,7 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Return the whole second at or before the earliest start of all channels. Times are counted from it without loss
-    of digits.
-    """
+    """Return the whole second at or before the earliest start: times count from it without loss of digits."""
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 
@@ -89,9 +85,7 @@ def _seconds(stamp: Any, zero: int) -> float:
 
 
 def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
-    """Report data that the file announces but does not contain, from the file's segment lengths and the warnings of
-    npTDMS.
-    """
+    """Report data that the file announces but lacks, by its segment lengths and the warnings of npTDMS."""
     status = file.file_status
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:

@@ -78,8 +78,6 @@ def same(one: str, other: str) -> bool:
 
 
 def names_with_unit(wanted: str, names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the column names, such as ``Winkel oben [deg]``, that are `wanted` and a unit in brackets, each with the
-    unit.
-    """
+    """Return the names, such as ``Winkel oben [deg]``, that are `wanted` and a unit in brackets, with the unit."""
     parts = [(name, match) for name in names if (match := _WITH_UNIT.fullmatch(name))]
     return [(name, match[2]) for name, match in parts if match[1] == wanted.strip()]

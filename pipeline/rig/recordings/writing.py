@@ -57,9 +57,7 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
 
 
 def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
-    """Return the mapping (description of the channels) with which `read_recording` reads a file that `write_recording`
-    wrote.
-    """
+    """Return the mapping with which `read_recording` reads a file that `write_recording` wrote."""
     is_tdms = Path(path).suffix.lower() == ".tdms"
 
     def own(name: str) -> str:
