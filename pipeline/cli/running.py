@@ -93,9 +93,10 @@ def run(
     above 1 % a warning reports them.
     """
     from pipeline.compute.clients import Where
-    from pipeline.runs import outcome, preview
+    from pipeline.runs import preview
     from pipeline.runs import run as runs
     from pipeline.runs.derive import analyses_in
+    from pipeline.runs.status import summary, warning
 
     analyses = analyses_in(analyse)
     if posterior is not None:
@@ -115,8 +116,8 @@ def run(
         echo=console.note,
     )
     console.result(f"cube: {done.info.files.below('cube.zarr').name}")
-    console.result(*outcome.summary(done))
-    if text := outcome.warning(done):
+    console.result(*summary(done))
+    if text := warning(done):
         console.LOG.warning(text)
     where = Where(scheduler, cluster, dashboard)
     for name in analyses:
