@@ -88,7 +88,6 @@ def run(
     from pipeline.runs import outcome, preview
     from pipeline.runs import run as runs
     from pipeline.runs.derive import analyses_in
-    from pipeline.store.run import RunDirectory
 
     analyses = analyses_in(analyse)
     if posterior is not None:
@@ -97,7 +96,7 @@ def run(
     if dry_run:
         console.result(*preview.describe_plan(spec, out, workers=workers, smoke=smoke))
         return
-    state = runs.run(
+    done = runs.run(
         spec,
         out,
         workers=workers,
@@ -107,8 +106,7 @@ def run(
         smoke=smoke,
         echo=console.note,
     )
-    done = RunDirectory.open(state.files)
-    console.result(f"cube: {state.files.below('cube.zarr').name}")
+    console.result(f"cube: {done.info.files.below('cube.zarr').name}")
     console.result(*outcome.summary(done))
     if text := outcome.warning(done):
         console.LOG.warning(text)

@@ -364,7 +364,7 @@ def plot_manifolds(
     Parameters
     ----------
     ds
-        From `pipeline.analysis.manifolds.product.manifolds`.
+        From `pipeline.analysis.manifolds.analysis.manifolds`.
     basins
         A figure of basins over the same two states, which is drawn on.
     degrees

@@ -24,7 +24,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ----------
     ds
         Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
-        `pipeline.analysis.chaos.correlation.section_dimension` for one parameter point. In the latter
+        `pipeline.analysis.chaos.analysis.section_dimension` for one parameter point. In the latter
         case the attractor with the most cells is drawn, among those with a dimension.
     frame
         Width of the figure; ranges of the radius and the correlation sum.

@@ -256,7 +256,7 @@ def plot_coexisting(
     degrees
         Degrees instead of radians.
     hysteresis
-        Result of `pipeline.analysis.attractors.matching.hysteresis.hysteresis`; its loops are shaded.
+        Result of `pipeline.analysis.attractors.hysteresis.hysteresis`; its loops are shaded.
     frame
         Width of the figure and ranges of its axes.
 

@@ -40,7 +40,7 @@ def plot_gallery(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match`; gives colours and names.
     portraits
-        Result of `pipeline.analysis.attractors.describing.portraits.portraits` for one of its parameter points.
+        Result of `pipeline.analysis.attractors.portraits.portraits` for one of its parameter points.
     degrees
         Degrees instead of radians.
     frame
@@ -215,7 +215,7 @@ def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
 
 def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``gallery`` of a run; the motion on each attractor is integrated for it."""
-    from pipeline.analysis.attractors.describing.portraits import portraits
+    from pipeline.analysis.attractors.portraits import portraits
 
     at, notes = values_of(run, options)
     found = run.derive("attractors")

@@ -67,7 +67,7 @@ def plot_regimes(
     at
         Values of further swept parameters.
     curves
-        Bifurcation curves in the plane of the map, drawn over it (`pipeline.analysis.branches.curves_dataset`).
+        Bifurcation curves in the plane of the map, drawn over it (`pipeline.analysis.branches.curves`).
     frame
         Width of the figure and ranges of its axes.
 
@@ -360,7 +360,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     Parameters
     ----------
     ds
-        From `pipeline.analysis.branches.curves_dataset`.
+        From `pipeline.analysis.branches.curves`.
     frame
         Width of the figure and ranges of its axes.
 

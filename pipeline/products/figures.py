@@ -254,7 +254,7 @@ TONGUES = Figure(
     "Draw the edges of the Arnold tongues p/q in a plane, over the map of rotation numbers if the run spans it.",
     TongueFigureOptions,
     "pipeline.plots.tongues:draw_tongues",
-    needs="pipeline.analysis.branches.tongues_product:needs_rotation",
+    needs="pipeline.analysis.branches.tongues:needs_rotation",
 )
 
 MANIFOLDS = Figure(
@@ -278,7 +278,7 @@ RESILIENCE = Figure(
     Attractors stand side by side if nothing is swept. Bars show intervals.""",
     ResilienceFigureOptions,
     "pipeline.plots.resilience:draw",
-    needs="pipeline.analysis.resilience.product:needs_sweep",
+    needs="pipeline.analysis.resilience.analysis:needs_sweep",
     panels="several",
 )
 
@@ -287,7 +287,7 @@ EDGE = Figure(
     "Draw the edge states between two attractors, over the basins of a run on a grid of two states.",
     EdgeFigureOptions,
     "pipeline.plots.basins:draw_edge",
-    needs="pipeline.analysis.resilience.edge_product:needs_pair",
+    needs="pipeline.analysis.resilience.edge:needs_pair",
 )
 
 ESCAPES = Figure(

@@ -152,7 +152,7 @@ def ratio_of_intervals(results: Results, of: Sequence[str], options: Options) ->
     ``low``, ``high``, ``max_period``, as in `located_bifurcation`; exactly three bifurcations must lie there.
     The interval follows from the brackets of the three.
     """
-    from pipeline.analysis.branches.table import table_of
+    from pipeline.analysis.branches.analysis import table_of
     from pipeline.layout.vocabulary import parameter_name
 
     given = {name: options[name] for name in ("low", "high", "max_period")}
@@ -389,7 +389,7 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
     longest period of continued orbits; ``generations`` of branches that spring from bifurcations, by default 1.
     The interval spans all bifurcations found. Each is located exactly, independent of the step of the run's axis.
     """
-    from pipeline.analysis.branches.table import table_of
+    from pipeline.analysis.branches.analysis import table_of
 
     given = {name: options[name] for name in ("low", "high", "max_period")}
     found = results.run(of[0]).derive("branches", **given, generations=int(options.get("generations", 1)))

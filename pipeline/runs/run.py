@@ -17,7 +17,6 @@ from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, check_plan, check_space, make_plan
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
-from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
@@ -53,8 +52,8 @@ def run(
     dashboard: bool = False,
     smoke: bool = False,
     echo: Echo = print,
-) -> State:
-    """Compute the tasks of a specification that its run directory lacks, and return the state of the run.
+) -> RunDirectory:
+    """Compute the tasks of a specification that its run directory lacks, and open the finished run.
 
     Damaged ``run.json``, metadata or coordinates are rebuilt from the specification. Committed cells that fit
     their records stay.
@@ -78,8 +77,8 @@ def run(
 
     Returns
     -------
-    State
-        State of the finished run.
+    RunDirectory
+        The finished run.
 
     Raises
     ------
@@ -111,7 +110,7 @@ def run(
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     finished = RunDirectory.open(files)
     warn_of_steps(parsed, finished, echo)
-    return state(finished)
+    return finished
 
 
 def ready(spec: Spec, files: Files) -> Spec:

@@ -46,18 +46,11 @@ IN_CLOUD = 2 * LEG
 
 @dataclass(frozen=True)
 class Followed:
-    """Ends of trajectories.
+    """Ends of trajectories."""
 
-    Attributes
-    ----------
-    label : ndarray of int64, (n,)
-        Attractor's id, `outcomes.DIVERGED`, `ELSEWHERE` or `UNDECIDED`.
-    entered : ndarray, (n,)
-        Drive periods or returns after which each stays near its attractor; NaN if not asked for, not decided or
-        not seen.
-    """
-
-    label: np.ndarray
+    label: np.ndarray  # int64, (n,): attractor's id, `outcomes.DIVERGED`, `ELSEWHERE` or `UNDECIDED`
+    # (n,): drive periods or returns after which each stays near its attractor; NaN if not asked for, not decided or
+    # not seen
     entered: np.ndarray
 
 

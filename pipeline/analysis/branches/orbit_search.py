@@ -9,8 +9,8 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from pipeline.analysis.branches.deflation import FoundOrbit, coverage, expected_index, index_sums, search_orbits
+from pipeline.analysis.branches.problems import state_units
 from pipeline.analysis.branches.starting_orbits import parameters_at
-from pipeline.analysis.branches.units import state_units
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.tabular import Row, Words, aligned, counted

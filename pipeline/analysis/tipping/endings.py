@@ -29,16 +29,9 @@ NONE = -1
 
 @dataclass(frozen=True)
 class Final:
-    """The constant parameters at which trajectories go on after the drift.
+    """The constant parameters at which trajectories go on after the drift."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        Of the model whose parameters do not move.
-    frequency_hz : float
-    """
-
-    parameters: Parameters
+    parameters: Parameters  # of the model whose parameters do not move
     frequency_hz: float
 
     @property
@@ -82,29 +75,14 @@ def ends_s(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarr
 
 @dataclass(frozen=True)
 class Group:
-    """Cells that go on at the same final parameters, with what became of them.
-
-    Attributes
-    ----------
-    final : Final
-    cells : ndarray of int
-        Their numbers.
-    ids : Dataset
-        Result of `identify`; its cells are those that were integrated on.
-    integrated : ndarray of int
-        Their numbers.
-    settled : ndarray, (len(integrated), n_states)
-        Their states after the integration.
-    outcome : ndarray of int, (len(cells),)
-        Attractors' ids in `ids`, `DIVERGED`, or `NONE`.
-    """
+    """Cells that go on at the same final parameters, with what became of them."""
 
     final: Final
-    cells: np.ndarray
-    ids: xr.Dataset | None
-    integrated: np.ndarray
-    settled: np.ndarray
-    outcome: np.ndarray
+    cells: np.ndarray  # their numbers
+    ids: xr.Dataset | None  # result of `identify`; its cells are those that were integrated on
+    integrated: np.ndarray  # their numbers
+    settled: np.ndarray  # (len(integrated), n_states): their states after the integration
+    outcome: np.ndarray  # int, (len(cells),): attractors' ids in `ids`, `DIVERGED`, or `NONE`
 
 
 def endings(

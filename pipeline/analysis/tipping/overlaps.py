@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.basins import check_starts
+from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, place
 from pipeline.analysis.tabular import Row, aligned, with_interval
-from pipeline.analysis.tipping.table import outcome_word
+from pipeline.analysis.tipping.analysis import outcome_word
 from pipeline.layout.vocabulary import axis_name
 from pipeline.products.product import Table
 from pipeline.products.tipping import OverlapOptions

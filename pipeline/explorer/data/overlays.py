@@ -16,7 +16,7 @@ from pipeline.analysis.branches.bifurcations import KINDS as BIFURCATIONS
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.outcomes import share_interval
 from pipeline.analysis.ragged import dense, isel
-from pipeline.analysis.resilience.table import end_of
+from pipeline.analysis.resilience.analysis import end_of
 from pipeline.analysis.tabular import sets_of
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun

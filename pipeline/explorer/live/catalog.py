@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.describing import features
+from pipeline.analysis.attractors import features
 from pipeline.analysis.attractors.destinations import KnownSets
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, raw_orbit

@@ -19,7 +19,7 @@ import numpy as np
 
 from magpend_core.multipliers import orbit_exponents
 from magpend_core.status import Status
-from pipeline.analysis.attractors.describing import features
+from pipeline.analysis.attractors import features
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.lockstep import run_alone
 from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem

@@ -58,19 +58,11 @@ Check = Callable[[], None]
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A parameter point: parameters, frequency and, if it is a point of the run, its index there.
-
-    Attributes
-    ----------
-    frequency : float
-        As the engine takes it [Hz]: of the drive; of a flow seen at crossings one over the longest wait.
-    index : tuple of int or None
-        Index on each axis of the cube's parameters; None where the cube has no such point.
-    """
+    """A parameter point: parameters, frequency and, if it is a point of the run, its index there."""
 
     parameters: Parameters
-    frequency: float
-    index: tuple[int, ...] | None
+    frequency: float  # as the engine takes it [Hz]: of the drive; of a flow seen at crossings one over the longest wait
+    index: tuple[int, ...] | None  # index on each axis of the cube's parameters; None where the cube has no such point
 
     @property
     def key(self) -> tuple[float, ...]:

@@ -389,14 +389,13 @@ def run(
     >>> run("quickstart").cube().section.sel(frequency=2.2)  # doctest: +SKIP
     """
     parsed = Spec.read(spec, smoke=smoke)
-    if out is None:
-        out = parsed.directory
+    out = parsed.directory if out is None else out
     try:
         with bar_in_notebook():
-            names_arguments(complete)(parsed, out, smoke=smoke, echo=echo, **options)
+            done = names_arguments(complete)(parsed, out, smoke=smoke, echo=echo, **options)
     except InterruptedRunError:
         raise interrupt(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
-    return Run.open(out)
+    return Run.open(done)
 
 
 @overload

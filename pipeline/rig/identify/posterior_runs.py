@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.attractors.matching.across import match_across
+from pipeline.analysis.attractors.matching import match_across
 from pipeline.analysis.draws import LEVELS
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.tabular import FEW_POINTS, points_of, words_of

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
-from pipeline.analysis.branches.units import parameter_units
+from pipeline.analysis.branches.problems import parameter_units
 from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_attribute, model_of, parameter_name

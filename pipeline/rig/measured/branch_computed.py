@@ -13,8 +13,10 @@ from magpend_core.models.sectioned import SectionedModel
 from magpend_core.sampling import Drive, sample
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore
 from pipeline.analysis.branches.carrying import Along
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.rig.measured.branch import N_HARMONICS
 

@@ -9,7 +9,7 @@ import pytest
 
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
 from pipeline.runs.derive import derive

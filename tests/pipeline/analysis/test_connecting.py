@@ -12,8 +12,7 @@ from magpend_core import trajectory
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.matching.connections import grouped
-from pipeline.analysis.attractors.matching.matching import BASES
+from pipeline.analysis.attractors.matching import BASES, grouped
 from pipeline.analysis.branches import connecting
 from pipeline.analysis.branches.connecting import Web, connect
 from pipeline.analysis.branches.sheets import BORDER, ENDED, LINKED, Axis, Grid

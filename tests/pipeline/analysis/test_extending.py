@@ -9,17 +9,12 @@ import numpy as np
 import pytest
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.describing.labelling import (
-    _label_courses,
-    _Labels,
-    _preserves_volume,
-    _representatives,
-)
 from pipeline.analysis.attractors.extension.extending import Outcome, _Extension, extend
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.labelling import _label_courses, _Labels, _preserves_volume, _representatives
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
-from pipeline.analysis.manifolds import Saddle, first_tangency, stable_manifold, unstable_manifold
-from pipeline.analysis.manifolds.growing import Resolution
+from pipeline.analysis.manifolds.analysis import first_tangency
+from pipeline.analysis.manifolds.growing import Resolution, Saddle, stable_manifold, unstable_manifold
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.0 / (2.0 * np.pi)

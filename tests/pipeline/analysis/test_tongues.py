@@ -9,8 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
-from pipeline.analysis.branches.tongues import fractions_between
-from pipeline.analysis.branches.tongues_product import cells_of, tongues_table
+from pipeline.analysis.branches.tongues import cells_of, fractions_between, tongues_table
 from pipeline.plots.tongues import plot_rotation, plot_tongues
 from pipeline.products.rotation import RotationFlag
 from pipeline.runs.derive import AnalysedRun

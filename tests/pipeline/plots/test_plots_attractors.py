@@ -13,14 +13,13 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
-from pipeline.analysis.attractors.matching.hysteresis import hysteresis
+from pipeline.analysis.attractors.hysteresis import hysteresis
 from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
-from pipeline.analysis.branches.curves import Curve
-from pipeline.analysis.branches.curves_dataset import curves_dataset
+from pipeline.analysis.branches.curves import Curve, curves_dataset
 from pipeline.analysis.branches.problems import Family, Value
-from pipeline.analysis.branches.table import curves_table
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.layout import vocabulary

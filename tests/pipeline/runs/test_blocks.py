@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magpend_core.engine.threads import number_of_threads
-from pipeline.analysis.attractors import product
+from pipeline.analysis.attractors import analysis
 from pipeline.compute import execute
 from pipeline.products.registry import ANALYSES
 from pipeline.runs import blocks
@@ -141,13 +141,13 @@ def test_in_blocks__every_analysis_of_points(name, options, copy, sizes):
 
 @pytest.mark.parametrize(("workers", "threads"), [(0, 1), (1, 1), (3, 3)])
 def test_derive__workers_are_threads_without_blocks(copy, monkeypatch, workers, threads):
-    seen, real = [], product.attractors
+    seen, real = [], analysis.attractors
 
     def attractors(*given):
         seen.append(number_of_threads())
         return real(*given)
 
-    monkeypatch.setattr(product, "attractors", attractors)
+    monkeypatch.setattr(analysis, "attractors", attractors)
     derive(copy("run"), "attractors", workers=workers)
     assert seen == [threads]
 

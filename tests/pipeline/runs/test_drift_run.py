@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from magpend_core.status import Status
 from pipeline import open_run
+from pipeline.analysis.tipping.analysis import tipping_table
 from pipeline.analysis.tipping.delay import delay_table, lags, left_at
-from pipeline.analysis.tipping.table import tipping_table
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import model_of, parameters_of

@@ -17,9 +17,9 @@ from magpend_core import Status
 from magpend_core.engine import jit
 from magpend_core.models import imported
 from pipeline import open_run
-from pipeline.analysis.attractors.table import attractors_table
-from pipeline.analysis.branches.table import branches_table
-from pipeline.analysis.chaos.table import chaos_table
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.branches.analysis import branches_table
+from pipeline.analysis.chaos.analysis import chaos_table
 from pipeline.analysis.ragged import dense
 from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of, parameters_of

@@ -25,7 +25,7 @@ from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits, products, records
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
-from pipeline.store.local import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.products import write_product
 from pipeline.store.run import RunDirectory
 from pipeline.store.stored_json import seal, unseal

@@ -20,11 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, left_behind, were_on
+from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, is_one_torus, left_behind, were_on
 from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
-from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
-from pipeline.analysis.attractors.extension.tori import is_one_torus
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
@@ -33,6 +31,7 @@ from pipeline.analysis.attractors.finding.equilibria import approaching, rest_ne
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Work
 from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
+from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import REACH
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET, NEUTRAL, NOT_SETTLED
@@ -68,27 +67,13 @@ LOOK_BACK = 4
 
 @dataclass
 class Outcome:
-    """Result of the further integration of the trajectories of one parameter point.
+    """Result of the further integration of the trajectories of one parameter point."""
 
-    Attributes
-    ----------
-    orbits : list of Orbit
-        Known orbits, old and new.
-    courses : list of Course
-        Sampled cells.
-    sets : list of BoundedSet
-        Sets that do not close.
-    spent : int
-        Periods integrated.
-    ran_out : bool
-        Whether the budget ended the work.
-    """
-
-    orbits: list[Orbit]
-    courses: list[Course]
-    sets: list[BoundedSet]
-    spent: int = 0
-    ran_out: bool = False
+    orbits: list[Orbit]  # known orbits, old and new
+    courses: list[Course]  # sampled cells
+    sets: list[BoundedSet]  # sets that do not close
+    spent: int = 0  # periods integrated
+    ran_out: bool = False  # whether the budget ended the work
 
 
 def extend(

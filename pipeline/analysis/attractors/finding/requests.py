@@ -31,7 +31,6 @@ FINDING, EXTENDING = "finding attractors", "extending cells"
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
 
-
 MOST_SLOPES = 16_384
 """Most derivatives of the section map in one call of the engine."""
 
@@ -78,42 +77,20 @@ Work = Generator[Request, Any, T]
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings with which trajectories of a run are integrated further: tolerances, limits, system and method.
+    """Settings with which trajectories of a run are integrated further: tolerances, limits, system and method."""
 
-    Attributes
-    ----------
-    rtol, atol : float
-        Tolerances of the run.
-    max_steps : int
-        Most steps per period.
-    closure : float
-        Scaled distance at which extended cells count as closed.
-    longest : int
-        Longest orbit period in the search.
-    residual : float
-        Scaled residual that Newton's method is to reach.
-    seen : int
-        Drive periods or returns for which the run integrated a cell.
-    system : System or None
-        System to integrate.
-    method : str
-        Integration method of the run, also used for legs.
-    geometry : Geometry
-        Geometry of the states.
-    known : dict
-        Orbits that were polished before, see `closed_orbits.polish`.
-    """
-
+    # tolerances of the run
     rtol: float
     atol: float
-    max_steps: int
-    closure: float
-    longest: int
-    residual: float
-    seen: int
-    system: System | None
-    method: str
-    geometry: Geometry
+    max_steps: int  # most steps per period
+    closure: float  # scaled distance at which extended cells count as closed
+    longest: int  # longest orbit period in the search
+    residual: float  # scaled residual that Newton's method is to reach
+    seen: int  # drive periods or returns for which the run integrated a cell
+    system: System | None  # system to integrate
+    method: str  # integration method of the run, also used for legs
+    geometry: Geometry  # geometry of the states
+    # orbits that were polished before, see `closed_orbits.polish`
     known: dict[bytes, Orbit | None] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod

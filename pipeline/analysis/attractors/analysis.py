@@ -1,4 +1,4 @@
-"""Tabulate the attractors of a run, and the other sets on which its cells end."""
+"""Define the analyses ``identified`` and ``attractors`` of a run, and tabulate attractors."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import xarray as xr
 
 from pipeline.analysis.outcomes import other_cells, sentence, share_interval
 from pipeline.analysis.ragged import N_IDS, N_POINTS, SAMPLE, SET, places_of_rows, row_of_cells
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     FRACTION,
@@ -29,6 +30,7 @@ from pipeline.analysis.tabular import (
     words_of,
 )
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims
+from pipeline.products.attractors import AttractorOptions, IdentifyOptions
 from pipeline.products.product import Table
 
 MOST_STATES = 2
@@ -38,6 +40,21 @@ RUN_AWAY = {"diverged", "not settled"}
 """What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
 
 _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high")
+
+
+def identified(run: OpenRun, options: IdentifyOptions) -> xr.Dataset:
+    """Find the attractors of a run at each parameter point, without ids that connect the points."""
+    from pipeline.analysis.attractors.attractors import identify
+
+    return identify(run.cube(), options)
+
+
+def attractors(run: OpenRun, options: AttractorOptions) -> xr.Dataset:
+    """Find the attractors of a run, and give them ids that stay the same along the swept parameters."""
+    from pipeline.analysis.attractors.attractors import match
+
+    found = run.derive("identified", **options.part(IdentifyOptions))
+    return match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
 
 
 def attractors_table(ds: xr.Dataset) -> Table:

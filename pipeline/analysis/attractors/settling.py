@@ -1,4 +1,4 @@
-"""Tabulate the non-periodic sets, with the evidence from trajectories that were integrated beyond the run."""
+"""Define the analysis ``settling``: the evidence on whether each non-periodic set attracts or is transient."""
 
 from __future__ import annotations
 
@@ -8,9 +8,41 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.ragged import dims_of
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, plain, sets_of, values
 from pipeline.layout.vocabulary import APERIODIC, model_of, periods_of
-from pipeline.products.product import Table
+from pipeline.products.product import Options, Table
+
+VARIABLES = (
+    "kind",
+    "stability",
+    "evidence",
+    "n_cells",
+    "n_sampled",
+    "n_left",
+    "n_leaving",
+    "n_sets",
+    "from_set",
+    "to",
+    "n_to",
+    "time_at_risk",
+    "mean_lifetime",
+    "lifetime_low",
+    "lifetime_high",
+    "lyapunov_max",
+    "lyapunov_low",
+    "lyapunov_high",
+    "closes_above",
+    "orbit_period",
+    "ran_out",
+)
+"""Variables of the attractors that the settling table shows."""
+
+
+def settling(run: OpenRun, options: Options) -> xr.Dataset:
+    """Return the evidence on whether each non-periodic set attracts or is transient."""
+    found: xr.Dataset = run.derive("attractors")
+    return found[list(VARIABLES)]
 
 
 def settling_table(ds: xr.Dataset) -> Table:

@@ -13,9 +13,12 @@ import xarray as xr
 
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import Words, aligned, counted, unit_of, values
+from pipeline.products.product import Options, Table
 
 
-def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
+def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     """Find where a continuation meets different attractors on its way up and on its way down.
 
     Parameters
@@ -166,3 +169,61 @@ def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict
         "jump_count": (counts, "branches"),
     }
     return {name: ("jump", data, {"units": "1", "long_name": text}) for name, (data, text) in texts.items()}
+
+
+def needs_directions(run: OpenRun, options: Options) -> None:
+    """Raise ValueError unless the run is a continuation both up and down its parameter."""
+    check_directions(run.cube())
+
+
+def hysteresis(run: OpenRun, options: Options) -> xr.Dataset:
+    """Compute the hysteresis loops of a run and the jumps between its attractors."""
+    return find_hysteresis(run.cube(), run.derive("attractors"))
+
+
+def hysteresis_table(ds: xr.Dataset) -> Table:
+    """Return the table of hysteresis. It has one row per kind of jump between two attractors, and text lines about the
+    loops.
+    """
+    names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
+    jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
+    rows = [
+        {"direction": "up" if one["jump_direction"] > 0 else "down"}
+        | {n.removeprefix("jump_"): v for n, v in values(one, *names).items()}
+        for one in jumps
+    ]
+    path, n = ds.attrs["path"], ds.sizes["loop"]
+    unit = f"{path}{unit_of(ds, path)}" if path in ds.coords else path
+    words = [
+        {
+            "direction": r["direction"],
+            f"from {unit}": f"{r['from']:g}",
+            "to": f"{r['to']:g}",
+            "ids": f"{r['from_id']} -> {r['to_id']}",
+            "branches": str(r["count"]),
+        }
+        for r in rows
+    ]
+    lines = [
+        f"{counted(n, 'loop') if n else 'no loops'}: neighbouring points where up and down meet other attractors",
+        *aligned([_loop_words(ds.isel(loop=i), unit) for i in range(n)]),
+        f"jumps of the branches: {sum(row['count'] for row in rows) or 'none'}",
+        *aligned(words),
+    ]
+    return Table(rows, lines)
+
+
+def _loop_words(loop: xr.Dataset, unit: str) -> Words:
+    return {
+        **{str(n).removeprefix("loop_at_"): f"{float(loop[n]):g}" for n in loop if "loop_at_" in str(n)},
+        f"from {unit}": f"{float(loop['loop_from']):g}",
+        "to": f"{float(loop['loop_to']):g}",
+        "only up": _met(loop["only_up"].values),
+        "only down": _met(loop["only_down"].values),
+        "points": str(int(loop["loop_points"])),
+    }
+
+
+def _met(counts: np.ndarray) -> str:
+    """Format the ids of attractors, each with the number of parameter points at which a continuation was on it."""
+    return ", ".join(f"{i} ({counted(counts[i], 'point')})" for i in np.flatnonzero(counts)) or "-"

@@ -44,34 +44,20 @@ MOST_SAMPLES = 2**20
 
 @dataclass
 class Cells:
-    """Statistics of the trajectories (cells) on one attractor, collected from one block of cells after another.
-
-    Attributes
-    ----------
-    n : int
-        Cells.
-    low, high : ndarray, (state,)
-        Range of the kept sections.
-    rotations : list of ndarray, (cell, angle)
-        Mean rotation of the cells.
-    turns : list of ndarray, (cell, angle)
-        Full turns of the cells over their sections.
-    sides : dict
-        Cells by the classifier's code.
-    points : ndarray, (m, state)
-        Section points of least hash.
-    seconds : list of ndarray, (cell,)
-        Mean time between two sections of the cells [s].
-    """
+    """Statistics of the trajectories (cells) on one attractor, collected from one block of cells after another."""
 
     n_points: int
-    n: int = 0
+    n: int = 0  # cells
+    # (state,): range of the kept sections
     low: np.ndarray = field(default_factory=lambda: np.full(1, np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(1, -np.inf))
+    # list of ndarray, (cell, angle): mean rotation of the cells
     rotations: list[np.ndarray] = field(default_factory=list)
+    # list of ndarray, (cell, angle): full turns of the cells over their sections
     turns: list[np.ndarray] = field(default_factory=list)
-    sides: dict[int, int] = field(default_factory=dict)
-    points: np.ndarray | None = None
+    sides: dict[int, int] = field(default_factory=dict)  # cells by the classifier's code
+    points: np.ndarray | None = None  # (m, state): section points of least hash
+    # list of ndarray, (cell,): mean time between two sections of the cells [s]
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magpend_core.multipliers import orbit_exponents
-from pipeline.analysis.attractors.describing import features as feature
-from pipeline.analysis.attractors.describing.features import Cells, Features
+from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
 from pipeline.analysis.attractors.extension.courses import AT_REST as RESTS
 from pipeline.analysis.attractors.extension.courses import DIVERGED, ON_SET, rest_number
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
-from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.features import Cells, Features
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
@@ -27,6 +26,7 @@ from pipeline.analysis.attractors.finding.probing import is_approaching, probe_e
 from pipeline.analysis.attractors.finding.requests import Slopes, Work
 from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.finding.spirals import keys_of
+from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.sets import Geometry, looked_up, order_by_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
@@ -50,27 +50,13 @@ MOST_PROBES = 8
 
 @dataclass
 class Found:
-    """Result of `analyse` at one parameter point: the sets on which its cells end, and the set of each cell.
+    """Result of `analyse` at one parameter point: the sets on which its cells end, and the set of each cell."""
 
-    Attributes
-    ----------
-    label : ndarray of int32, (cell,)
-        Index into `features`, -1 for none.
-    decision : ndarray of int8, (cell,)
-        Codes of `vocabulary.DECISIONS`.
-    features : list of Features
-        Features of each set.
-    counts : list of int
-        Number of cells on each set.
-    ran_out : bool
-        Whether the budget of the extension ended before all cells were decided.
-    """
-
-    label: np.ndarray
-    decision: np.ndarray
-    features: list[Features]
-    counts: list[int]
-    ran_out: bool = False
+    label: np.ndarray  # int32, (cell,): index into `features`, -1 for none
+    decision: np.ndarray  # int8, (cell,): codes of `vocabulary.DECISIONS`
+    features: list[Features]  # features of each set
+    counts: list[int]  # number of cells on each set
+    ran_out: bool = False  # whether the budget of the extension ended before all cells were decided
 
 
 @dataclass
