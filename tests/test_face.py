@@ -19,7 +19,9 @@ from matplotlib import pyplot as plt
 import magpend
 from magpend._plots import Plots
 from pipeline.cli import reference
-from pipeline.plots.style import TARGET
+from pipeline.plots import pixels
+from pipeline.plots.style import TARGET, Target
+from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs.arguments import in_python
@@ -315,6 +317,31 @@ def test_plot__shows_absent_cells_below_the_given_axes(run):
     assert cube.magpend.counts()["pending"] == 4
     whole = cube.magpend.plot.bifurcation()  # a strip is no panel
     assert len(whole.figure.axes) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bifurcation", "lyapunov", "convergence", "gallery", "attractors"])
+def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
+    """What is not passed on to the caller's figure would not be seen."""
+    made = []
+    monkeypatch.setattr(
+        Target, "__setattr__", lambda self, key, value: (object.__setattr__(self, key, value), made.append(value))
+    )
+    figure = plt.figure()
+    options = AT if name in ("convergence", "gallery") else {}
+    getattr(run.plot, name)(figure=figure, **options)
+    (guest,) = [value for value in made if isinstance(value, GuestFigure)]
+    assert [type(artist).__name__ for artist in guest.get_children()] == ["Rectangle"]
+    assert figure.axes
+
+
+@pytest.mark.slow
+def test_plot__counts_points_on_pixels_as_fine_as_in_files(run, monkeypatch):
+    """The image of many points does not depend on the resolution of the screen."""
+    monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
+    monkeypatch.setitem(plt.rcParams, "figure.dpi", 72.0)
+    (shown,), (kept,) = run.plot.bifurcation().images, magpend.figure(run, "bifurcation").axes[0].images
+    np.testing.assert_allclose(shown.get_array().shape, kept.get_array().shape, rtol=0.02)  # texts differ by pixels
 
 
 # ---- Datasets -----------------------------------------------------------------------------------

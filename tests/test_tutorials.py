@@ -48,6 +48,19 @@ def test_tutorial__does_what_it_says(name, others, tmp_path, monkeypatch):
         assert name not in FRESH or not tutorials.is_stale(kept, made)
 
 
+def test_is_stale__tells_a_changed_picture(tmp_path):
+    """A line of 1 % of the pixels is seen, a shade is not."""
+    for name, shade, line in (("kept", 255, 0), ("shaded", 250, 0), ("drawn", 255, 1)):
+        image = Image.new("RGB", (100, 100), (shade,) * 3)
+        image.paste((0, 0, 0), (0, 0, 100, line))
+        image.save(tmp_path / f"{name}.png")
+    kept = tmp_path / "kept.png"
+    assert not tutorials.is_stale(kept, kept)
+    assert not tutorials.is_stale(kept, tmp_path / "shaded.png")
+    assert tutorials.is_stale(kept, tmp_path / "drawn.png")
+    assert tutorials.is_stale(tmp_path / "gone.png", kept)
+
+
 @pytest.mark.slow
 def test_first_motion__is_what_its_command_draws(tmp_path, command):
     """The motion has closed, and the tutorial's picture shows it."""

@@ -11,7 +11,6 @@ import pytest
 from magpend_core import Status
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
-from pipeline.runs.status import state
 from pipeline.specification.spec import Spec
 from pipeline.store.commits import marker_key
 from tests.pipeline.factories import duffing, quietly
@@ -143,29 +142,6 @@ def test_walk__goes_on_from_where_it_does_not_return(write_spec, tmp_path):
     # each cell is left in a place of its own, not where the walk ends
     assert len(np.unique(ds.rest_state.values[left], axis=0)) == left.sum()
     assert np.isnan(ds.rest_state.values[~left]).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n_committed", [1, 3, 5])
-def test_walk__interrupted_and_resumed(write_spec, tmp_path, bytes_of, monkeypatch, n_committed):
-    from pipeline.compute import task
-
-    path, original, calls = write_spec(cut_at(walk(), 3)), task.write_task, []
-    quietly(path, tmp_path / "whole")
-
-    def stop(*arguments):
-        if len(calls) == n_committed:
-            raise KeyboardInterrupt
-        calls.append(arguments)
-        original(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(task, "write_task", stop)
-        with pytest.raises(Exception, match="the same command continues"):
-            quietly(path, tmp_path / "run")
-    assert len(state(tmp_path / "run").done) == n_committed
-    assert quietly(path, tmp_path / "run").complete
-    assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
 
 
 @pytest.mark.slow

@@ -219,6 +219,7 @@ WRONG = {
             "drive.steps[1]: sensors.psi1.kind",
         ),
         ({}, "model:"),
+        ({"model": "pendulum", "preset": "none"}, "preset"),
         ({"model": "pendulum", "sampling_rate_hz": 100.0}, "duration_s:"),
         ({"model": "pendulum", "sampling_rate_hz": 100.0, "duration_s": 1.0}, "sensors:"),
         ({"model": "pendulum", "sensors": 3}, "sensors"),

@@ -18,7 +18,6 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs import estimate as estimates
-from pipeline.runs import progress as notebook
 from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
 from pipeline.runs.outcome import outcomes_of
 from pipeline.runs.progress import LINE_EVERY_S, Progress
@@ -102,18 +101,6 @@ def test_progress__rate_and_time_left_count_this_session_only():
         assert lines == ["600/1000 cells (60 %), 10 cells/s, 40 s left"]
         progress.add(400)
     assert lines[-1].startswith("1000/1000 cells (100 %)")
-
-
-def test_bar__shows_counts_then_how_it_ended():
-    bar = notebook.Bar()
-    bar._show = lambda: None
-    assert repr(bar) == ""
-    bar("compiling", 0, 0)
-    assert "<progress  style" in bar._repr_html_()
-    bar("computing cells", 10, 40)
-    assert repr(bar).startswith("computing cells: 10 of 40 (25 %)")
-    bar.end("stopped")
-    assert repr(bar).startswith("computing cells: 10 of 40 (25 %), stopped after")
 
 
 # ---- how its cells ended ---------------------------------------------------------------------------------

@@ -163,11 +163,8 @@ REFUSED = [
     (["RUN", "--cell", "6"], "--cell 6: the run has the cells 0 to 5, counted through frequency, i"),
     (["RUN", "--cell", "1", "--attractor", "A"], "--attractor and --cell: a film shows one of these"),
     ([*POINT, "--cell", "1"], "--at: a cell already has a parameter point"),
-    (["RUN", "--model", "duffing"], "--model: the run sets this"),
     ([*POINT, "--degrees"], "have no angle"),
-    ([*POINT, "--portrait", "y"], "unknown portrait 'y'; there are portr"),
     (["--at", "q=1"], "--at: needs a run; give its directory."),
-    (["--out", "gone/film.gif"], "gone: no such folder; make it first."),
     (["--seconds", "500", "--fps", "50"], "25000 frames; at most 5000. Lower one of the two."),
     (["--speed", "1e6", "--model", "duffing"], "periods are too many for a film"),
 ]

@@ -32,7 +32,8 @@ from pipeline.store.errors import RefusedError
 from pipeline.store.files import entry_of
 from pipeline.store.runfile import read_run
 from pipeline.store.stored_json import seal, unseal
-from tests.pipeline.factories import FOLD, LOOPBACK, WELL, duffing, n_committed, quietly, silent, wait_for
+from tests.pipeline.conftest import SWEEP, WALK
+from tests.pipeline.factories import FOLD, LOOPBACK, WELL, duffing, edges, n_committed, quietly, silent, wait_for
 
 MANY = """
 [axes]
@@ -50,6 +51,21 @@ DRIFT = Spec(**FOLD).with_integration(n_keep=8).with_execution(trajectories_per_
 NOISE = WELL.replace("[0.45, 0.55, 0.7]", "[0.45, 0.7]").replace("stop = 199", "stop = 7")
 NOISE = NOISE.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 8")
 NOISE = f"{NOISE}\n[execution]\ntrajectories_per_task = 4"
+RECORDED = """
+kind = "sweep"
+[drive]
+file = "drive.csv"
+[axes]
+q = { values = [0.6, 1.6] }
+[initial_conditions]
+kind = "list"
+points_deg = [[10, -20, 0, 0], [20, -20, 0, 0]]
+[integration]
+n_transient = 6
+n_keep = 4
+[execution]
+trajectories_per_task = 1
+"""
 MANY_SWEEP = f'kind = "sweep"\n{MANY}\n{EIGHT}'
 HALF = MANY.replace("n = 64", "n = 32")  # both ways, as many cells as the sweep
 MANY_WALK = f'kind = "continuation"\n{HALF}\n[continuation]\ndirection = "both"\n{EIGHT}\npoints_per_task = 1'
@@ -76,16 +92,32 @@ def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["sweep", "walk", "drift", "noise"])
-def test_run__same_bytes_everywhere(write_spec, sweep_text, walk_text, tmp_path, bytes_of, kind):
-    path = write_spec({"sweep": sweep_text, "walk": walk_text, "drift": DRIFT, "noise": NOISE}[kind])
-    places = [(0, None), (1, "threads"), (2, "threads"), (3, "threads")]
-    places += [(2, "processes")] if kind == "walk" else []
-    found = []
-    for workers, scheduler in places:
-        directory = tmp_path / f"{scheduler}{workers}"
-        assert run(path, directory, workers=workers, scheduler=scheduler, echo=silent).complete
-        found.append(bytes_of(directory))
+@pytest.mark.parametrize("kind", ["sweep", "walk", "drift", "noise", "recorded"])
+def test_run__same_bytes_everywhere_and_where_it_was_stopped(kind, write_spec, tmp_path, bytes_of, monkeypatch):
+    kinds = {"sweep": SWEEP, "walk": WALK, "drift": DRIFT, "noise": NOISE, "recorded": RECORDED}
+    path, found = write_spec(kinds[kind]), []
+    (tmp_path / "drive.csv").write_text(edges(12, 2.2, jitter=0.01), "utf-8")
+    for workers, scheduler in [(0, None), (1, "threads"), (3, "threads"), (2, "processes")]:
+        if scheduler != "processes" or kind in ("walk", "recorded"):
+            directory = tmp_path / f"{scheduler}{workers}"
+            assert run(path, directory, workers=workers, scheduler=scheduler, echo=silent).complete
+            found.append(bytes_of(directory))
+    original, calls = task.write_task, []
+
+    def stop(*arguments):
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(arguments)
+        original(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "write_task", stop)
+        with pytest.raises(InterruptedRunError, match="the same command continues") as caught:
+            quietly(path, tmp_path / "stopped")
+    assert caught.value.signal_number == signal.SIGINT
+    assert len(state(tmp_path / "stopped").done) == 2
+    assert quietly(path, tmp_path / "stopped").complete
+    found.append(bytes_of(tmp_path / "stopped"))
     assert all(other == found[0] for other in found[1:])
     assert sum(key.startswith("commits/") for key in found[0]) > 2
 
@@ -116,7 +148,7 @@ def test_run__numbers_do_not_depend_on_the_tasks(write_spec, sweep_text, tmp_pat
     assert one.drop_attrs(deep=False).identical(other.drop_attrs(deep=False))
 
 
-def counted(monkeypatch, fail_at=None, error=None):
+def counted(monkeypatch, fail_at=None):
     """Count the tasks computed in this process; let one of them fail, whenever it is tried."""
     calls = []
     original = task.compute
@@ -124,7 +156,7 @@ def counted(monkeypatch, fail_at=None, error=None):
     def compute(spec, cells, block):
         calls.append(block)
         if fail_at is not None and block == calls[min(fail_at, len(calls)) - 1] and len(calls) >= fail_at:
-            raise error or RuntimeError("out of luck")
+            raise RuntimeError("out of luck")
         return original(spec, cells, block)
 
     monkeypatch.setattr(task, "compute", compute)
@@ -160,14 +192,6 @@ def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, m
     quietly(path, tmp_path / "run")
     assert len(calls) == 1
     assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
-
-
-def test_run__ctrl_c_in_process(write_spec, sweep_text, tmp_path, monkeypatch):
-    counted(monkeypatch, fail_at=2, error=KeyboardInterrupt())
-    with pytest.raises(InterruptedRunError, match="the same command continues") as caught:
-        quietly(write_spec(sweep_text), tmp_path / "run")
-    assert caught.value.signal_number == signal.SIGINT
-    assert state(tmp_path / "run").done == {0}
 
 
 def test_run__changed_spec_or_other_kernel_is_refused(write_spec, sweep_text, tmp_path, bytes_of, monkeypatch):

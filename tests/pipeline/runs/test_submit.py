@@ -47,7 +47,8 @@ SLURM = """#!/usr/bin/env bash
 #SBATCH --mem=7630M
 #SBATCH --time=04:00:00
 #SBATCH -pe smp 4
-#SBATCH --exclusive"""
+#SBATCH --exclusive
+"""
 # lines of a job that holds all, and of a coordinator of other jobs: one core, whatever they need, and a longer life
 LINES = {
     "slurm": ("--cpus-per-task=4; --mem=7630M", "--cpus-per-task=1; --mem=3815M; --time=48:00:00"),

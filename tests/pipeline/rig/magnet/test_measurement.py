@@ -146,6 +146,8 @@ def test_read_measurement__says_all_that_is_wrong_with_the_readings_at_once(rig)
         ("l2 = 0.18\n", "l2 = 0.18\nalpha1 = 1.0\n", "parameters.alpha1: is fitted; drop it, or name it in hold"),
         ("[columns]", 'hold = ["eps"]\n[columns]', "hold = 'eps': must be"),
         ("[columns]", 'model = "duffing"\n[columns]', "model = 'duffing': has no alpha1"),
+        ("[columns]", 'model = "pendulim"\n[columns]', "did you mean pendulum"),
+        ("wojna2018", "wojna2019", "did you mean wojna2018"),
         ("[columns]", "titel = 'x'\n[columns]", "titel: unknown key; did you mean title"),
         ("lever_m = 0.12", "lever_m = -0.12", "correction.tie.lever_m = -0.12: must be at least 0"),
     ],

@@ -101,11 +101,13 @@ def test_parse_mapping__refuses(entry, sentence):
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
+        ({"model": None}, "model: missing"),
         ({"model": "pendulm"}, "did you mean pendulum"),
         ({"channels": None}, "channels: missing"),
         ({"drive": "off"}, 'must be "none"'),
         ({"time": {"channel": "t"}, "sampling_rate_hz": 1.0}, "keep time or sampling_rate_hz"),
         ({"time": {"channel": "t", "unit": "V"}}, "time.unit"),
+        ({"window_s": [3.0, 1.0]}, "the second number must be the greater one"),
         ({"resample": 50.0}, "resample: needs time stamps"),
         (
             {"resample": 50.0, "time": {"channel": "t"}, "channels": {"psi1": {"channel": "a", "wraps": True}}},
