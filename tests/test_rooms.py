@@ -16,7 +16,7 @@ from magpend_core.models.text.views import DEFAULT_PRESET
 ROOT = Path(__file__).parents[1]
 PIPELINE = sorted((ROOT / "pipeline").rglob("*.py"))
 CORE = sorted((ROOT / "magpend_core").rglob("*.py"))
-MAX_FUNCTION, MAX_MODULE = 60, 480
+MAX_FUNCTION, MAX_MODULE = 60, 640
 
 # every model as text has a preset of the name that is left out, which is a common word
 PRESETS = "|".join(sorted({p for name in model_names() for p in load_model(name).preset_names} - {DEFAULT_PRESET}))

@@ -27,8 +27,7 @@ def explore(
     run and changes nothing. It shows the results of analyses that you have run. From another machine, tunnel
     the port: ssh -L PORT:127.0.0.1:PORT
     """
-    from pipeline.explorer.serving.browser import browser
-    from pipeline.explorer.serving.server import serve
+    from pipeline.explorer.server import browser, serve
 
     def serving(address: str) -> None:
         console.at_rest()

@@ -36,16 +36,15 @@ def export(
     The files hold the diagram, its overlays and the orbits of attractors, but no live integration. Parts that
     do not fit into one file are left out, and the page names them.
     """
-    from pipeline.explorer.copies.export import export_page
-    from pipeline.explorer.copies.folder import export_folder
+    from pipeline.explorer.copies.export import export_folder, export_page
     from pipeline.specification.problems import SpecError
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
     if page is not None and folder is not None:
         raise SpecError("--page and --folder: give one of them.")
     if page is not None and page.suffix.lower() not in (".html", ".htm"):
         raise SpecError(f"--page {page}: the suffix must be .html.")
-    run, wanted = Run.open(directory), quantity or []
+    run, wanted = RunDirectory.open(directory), quantity or []
     with console.progress("exporting"):
         if folder is not None:
             written = export_folder(run, folder, force=force, quantities=wanted, most_orbits=orbits)

@@ -16,12 +16,12 @@ from pipeline.cli.options import completing
 from pipeline.cli.plot import draw
 
 if TYPE_CHECKING:
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
 
 def workflow_names() -> Iterable[str]:
     """Return the names of the workflows (specifications) that ship with magpend."""
-    from pipeline.runs.workflows import shipped_workflows
+    from pipeline.specification.files import shipped_workflows
 
     return shipped_workflows()
 
@@ -88,7 +88,6 @@ def run(
     from pipeline.runs import outcome, preview
     from pipeline.runs import run as runs
     from pipeline.runs.derive import analyses_in
-    from pipeline.store.run import Run
 
     analyses = analyses_in(analyse)
     if posterior is not None:
@@ -97,7 +96,7 @@ def run(
     if dry_run:
         console.result(*preview.describe_plan(spec, out, workers=workers, smoke=smoke))
         return
-    state = runs.run(
+    done = runs.run(
         spec,
         out,
         workers=workers,
@@ -107,8 +106,7 @@ def run(
         smoke=smoke,
         echo=console.note,
     )
-    done = Run.open(state.files)
-    console.result(f"cube: {state.files.below('cube.zarr').name}")
+    console.result(f"cube: {done.info.files.below('cube.zarr').name}")
     console.result(*outcome.summary(done))
     if text := outcome.warning(done):
         console.LOG.warning(text)
@@ -127,7 +125,7 @@ def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke
     console.result(f"runs: {folder}; their bifurcations: magpend identify spread {folder} --branches")
 
 
-def _plot(run: Run) -> None:
+def _plot(run: RunDirectory) -> None:
     """Draw the figure that shows a finished run best; if it cannot be drawn, print the reason."""
     from pipeline.products.registry import FIGURES
     from pipeline.runs.preview import figure_command, shown

@@ -45,7 +45,6 @@ def submit(
     What is not given is chosen: the batch system whose commands are here, its default queue, and cores, memory
     and time by the measured work. The job continues where an earlier one was stopped.
     """
-    from pipeline.runs import explaining
     from pipeline.runs import submit as sending
     from pipeline.specification.problems import SpecError
 
@@ -55,12 +54,12 @@ def submit(
         check_file(write, "--write")
     prepared = sending.prepare(spec, out, cluster, job or [], smoke=smoke, analyse=analyse)
     if dry_run:
-        tell_data(explaining.as_data(prepared), explaining.explain(prepared), json)
+        tell_data(sending.as_data(prepared), sending.explain(prepared), json)
     elif prepared.complete:
-        tell_data(explaining.as_data(prepared), [f"{prepared.name} is complete; nothing to send."], json)
+        tell_data(sending.as_data(prepared), [f"{prepared.name} is complete; nothing to send."], json)
     elif write is not None:
         sending.write(prepared, write)
-        tell_data(explaining.as_data(prepared), explaining.written(prepared, str(write)), json)
+        tell_data(sending.as_data(prepared), sending.written(prepared, str(write)), json)
     else:
         sent = sending.send(prepared)
-        tell_data(explaining.as_data(sent), explaining.brief(sent), json)
+        tell_data(sending.as_data(sent), sending.brief(sent), json)

@@ -63,13 +63,7 @@ class Processes:
         self._is_closed = False
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Run the task in the process of this thread.
-
-        Raises
-        ------
-        ProcessError
-            If it fails there, or the process dies.
-        """
+        """Run the task in the process of this thread; raise `ProcessError` if it fails there, or the process dies."""
         process: _Process = getattr(self._own, "process", None) or self._start()
         try:
             result, reason = process.ask(self._task, index)

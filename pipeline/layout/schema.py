@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.layout.period_names import periods_of
+from pipeline.layout.vocabulary import periods_of
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable, flag_attrs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pipeline.products.branches import CurveOptions
 from pipeline.products.product import Analysis, option
 
-_ROOM = "pipeline.analysis.branches.tongues_product"
+_ROOM = "pipeline.analysis.branches.tongues"
 
 
 class TongueOptions(CurveOptions):

@@ -11,7 +11,7 @@ import numpy as np
 from magpend_core.status import Status
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
 from pipeline.runs.preview import figure_command
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -25,23 +25,12 @@ Range = tuple[str, float, float, str]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Cells of a run that have one status, such as diverged: their number, share and parameter ranges.
+    """Cells of a run that have one status, such as diverged: their number, share and parameter ranges."""
 
-    Attributes
-    ----------
-    status : Status
-        Status of the cells.
-    n_cells : int
-        Number of cells.
-    share : float
-        Fraction of all cells of the run.
-    where : tuple of Range
-        Ranges of swept parameters in which these cells lie, without parameters whose whole range they cover.
-    """
-
-    status: Status
-    n_cells: int
-    share: float
+    status: Status  # status of the cells
+    n_cells: int  # number of cells
+    share: float  # fraction of all cells of the run
+    # ranges of swept parameters in which these cells lie, without parameters whose whole range they cover
     where: tuple[Range, ...]
 
     @property
@@ -66,7 +55,7 @@ class Outcome:
         return text + (f"  {self.place}" if self.where else "")
 
 
-def outcomes_of(run: Run) -> list[Outcome]:
+def outcomes_of(run: RunDirectory) -> list[Outcome]:
     """Count the cells of a run that have each status, and find their parameter ranges."""
     status = run.cube()["status"].load()
     codes = np.flatnonzero(np.bincount(status.values.ravel().astype(np.int64)))
@@ -86,7 +75,7 @@ def _outcome(status: xr.DataArray, code: Status) -> Outcome:
     return Outcome(code, n_cells, n_cells / max(status.size, 1), tuple(ranges))
 
 
-def summary(run: Run) -> list[str]:
+def summary(run: RunDirectory) -> list[str]:
     """Return the text lines that ``magpend run`` prints at its end: cells by status, and suggested commands."""
     found = outcomes_of(run)
     lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
@@ -104,7 +93,7 @@ def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
     return [o for o in found if o.status in (DIVERGED, *FAILED)]
 
 
-def warning(run: Run) -> str:
+def warning(run: RunDirectory) -> str:
     """Return a warning if too many of a run's cells diverged or failed; an empty text otherwise."""
     found = outcomes_of(run)
     lost, computed = lost_cells(found), sum(o.n_cells for o in found if o.status != PENDING)
@@ -120,7 +109,7 @@ def warning(run: Run) -> str:
     )
 
 
-def _zoom(lost: list[Outcome], run: Run) -> str:
+def _zoom(lost: list[Outcome], run: RunDirectory) -> str:
     """Return a ``magpend zoom`` command for the ranges in which cells diverged or failed; an empty text if there are
     none.
     """

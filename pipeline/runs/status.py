@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.layout.plan import Plan
 from pipeline.store.files import Files
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class State:
         return "\n".join(describe_state(self))
 
 
-def state(source: str | Path | Files | Run) -> State:
+def state(source: str | Path | Files | RunDirectory) -> State:
     """Read the state of a run: its committed tasks, and the number of cells by status.
 
     Raises
     ------
     RefusedError, DamagedError, UnreadableError
-        See `Run.open`.
+        See `RunDirectory.open`.
     """
-    run = Run.open(source)
+    run = RunDirectory.open(source)
     return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
 
 

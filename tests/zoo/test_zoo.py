@@ -41,7 +41,7 @@ def test_zoo__other_units_change_no_conclusion(name, setting):
 
 @pytest.mark.slow
 def test_zoo__systems_have_a_source_and_valid_specifications_that_vary_in_one_thing():
-    from pipeline.specification.parsing import parse_spec
+    from pipeline.specification.spec import Spec
 
     assert len(ANSWERS) >= 114
     for name, answer in ANSWERS.items():
@@ -53,7 +53,7 @@ def test_zoo__systems_have_a_source_and_valid_specifications_that_vary_in_one_th
         for word, data in every.items():
             changed = [key for key in own if own[key] != data[key]]
             assert len(changed) == (word != variants.OWN), (name, word)
-        parse_spec(own)
+        Spec.parse(own)
 
 
 # ---- the judge ---------------------------------------------------------------------------------

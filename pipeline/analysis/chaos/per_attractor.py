@@ -52,7 +52,7 @@ from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yor
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     APERIODIC,
     CHAOTIC_SET,

@@ -19,19 +19,24 @@ from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
 from pipeline.rig.identify.build import Built, build, read_all
 from pipeline.rig.identify.directory import Outcomes, Source
-from pipeline.rig.identify.drive_frequency import estimate_frequencies
-from pipeline.rig.identify.judging import judge, judge_fit
-from pipeline.rig.identify.linearise import linearise, loss_scale_of
+from pipeline.rig.identify.identifiability import Curvature, Profile, estimate_frequencies, following, profile
+from pipeline.rig.identify.judgement import judge, judge_fit
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.measured_orbits import judge_orbits, read_orbits
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import ZERO, Problem
-from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
 from pipeline.rig.identify.search import search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
-from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
+from pipeline.rig.identify.statistics import (
+    Covariance,
+    Linearised,
+    covariance_of,
+    linearise,
+    loss_scale_of,
+    n_effective,
+)
 from pipeline.runs.stopping import stoppable
-from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.specification.files import default_directory, find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.files import FIGURES, local_path
 from pipeline.store.local import make_folder, refuse_links, writer_lock
@@ -140,12 +145,8 @@ def _write(
 
 
 def refuse_invisible(problem: Problem) -> None:
-    """Evaluate the residuals once, and raise `SpecError` if they do not depend on some of the unknowns.
-
-    Raises
-    ------
-    SpecError
-        If there are such unknowns (the message names all), or if trajectories diverge at the start.
+    """Evaluate the residuals once; raise `SpecError` if they do not depend on some unknowns, or if trajectories
+    diverge.
     """
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
@@ -191,13 +192,7 @@ def _is_driven(problem: Problem) -> bool:
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
-    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings.
-
-    Raises
-    ------
-    NotConvergedError
-        If no start converged.
-    """
+    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings."""
     problem, table = built.problem, spec.search
     keep = Kept(outcomes)
     fits = search(
@@ -326,14 +321,7 @@ def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
 
 
 class Kept:
-    """Store of finished local fits for `pipeline.rig.identify.search.search`. The key of a fit is the number of its
-    first guess.
-
-    Parameters
-    ----------
-    outcomes
-        Files of the outcomes.
-    """
+    """Store of finished local fits; the key of a fit is the number of its first guess."""
 
     def __init__(self, outcomes: Outcomes) -> None:
         self._outcomes = outcomes

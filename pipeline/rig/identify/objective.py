@@ -13,7 +13,7 @@ from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.branches.carrying import OrbitData
-from pipeline.rig.identify.orbit_rows import OrbitRows, orbit_rows
+from pipeline.rig.identify.orbit_residuals import OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
@@ -33,28 +33,18 @@ LOST = 1e6
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residuals, and on request their derivatives, for one set of unknowns.
+    """Residuals, and on request their derivatives, for one set of unknowns."""
 
-    Attributes
-    ----------
-    residuals : tuple of ndarray, (n, n_channels)
-        Measured less computed, piece by piece [SI]; NaN where nothing was measured.
-    rows : ndarray, (m,)
-        Residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per
-        piece, which keeps the cost, ``rows @ rows / 2``.
-    jacobian : ndarray, (m, n_free + n_piece*n_states)
-        Slopes of `rows`: the unknowns first, then the starts, piece by piece; empty without slopes.
-    failed : int
-        Number of pieces whose trajectory did not reach its end, and of measured orbits that were not found.
-    orbits : tuple of OrbitData
-        Measured orbits, with the computed ones of these unknowns.
-    """
-
+    # (n, n_channels) measured less computed, piece by piece [SI]; NaN where nothing was measured
     residuals: tuple[Array, ...]
+    # (m,) residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per piece,
+    # which keeps the cost, ``rows @ rows / 2``.
     rows: Array
+    # (m, n_free + n_piece*n_states) slopes of `rows`: the unknowns first, then the starts, piece by piece; empty
+    # without slopes
     jacobian: Array
-    failed: int
-    orbits: tuple[OrbitData, ...] = ()
+    failed: int  # number of pieces whose trajectory did not reach its end, and of measured orbits that were not found
+    orbits: tuple[OrbitData, ...] = ()  # measured orbits, with the computed ones of these unknowns
 
     @property
     def cost(self) -> float:
@@ -75,21 +65,8 @@ class _Motions(NamedTuple):
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
     """Compute the residuals of a fit, and on request their derivatives, for each row of a matrix of unknowns.
 
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    thetas
-        Unknowns, shape (n, n_free) [SI].
-    starts
-        Starts of the pieces, shape (n, n_piece, n_states) [SI].
-    slopes
-        Whether to compute slopes; `Problem.slopes` selects the method.
-
-    Returns
-    -------
-    list of Evaluation
-        One for each member.
+    `thetas` are unknowns, (n, n_free) [SI], and `starts` those of the pieces, (n, n_piece, n_states) [SI].
+    `Problem.slopes` selects the method of slopes.
     """
     of_orbits = orbit_rows(problem, thetas, slopes=slopes) if problem.orbits else [None] * len(thetas)
     if not problem.pieces:

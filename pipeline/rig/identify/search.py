@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.products.reporting import report
-from pipeline.rig.identify.first_guesses import choose_phases, fit_starts
-from pipeline.rig.identify.local import Echo, Fit, fit_local
+from pipeline.rig.identify.local import Echo, Fit, choose_phases, fit_local, fit_starts
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.specification.extras import import_extra
+from pipeline.specification.problems import import_extra
 
 Array = NDArray[np.float64]
 
@@ -59,36 +58,11 @@ def search(
 ) -> list[Fit]:
     """Fit from many first guesses. Return the fits sorted by cost, converged ones first.
 
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    n_starts
-        Number of first guesses that are followed to an optimum; the first is the problem's own.
-    seed
-        Seed of the guesses.
-    spread
-        Largest distance of a guess from the problem's own, relative to the unknowns' sizes. All guesses lie
-        within the bounds.
-    method
-        ``sobol``: the best of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if
-        none of them converges; ``cma``: CMA-ES over the shortest stretches finds the guesses.
-    n_samples
-        Number of points that are evaluated; at least `n_starts`.
-    keep
-        Store of outcomes, so that a killed search can continue.
-    tell
-        Function that prints a line about each outcome.
-
-    Returns
-    -------
-    list of Fit
-        Best first; those that converged before those that did not.
-
-    Raises
-    ------
-    SpecError
-        If the package cma is not installed.
+    The first of the `n_starts` guesses that are followed to an optimum is the problem's own; the others are at most
+    `spread` away from it, relative to the unknowns' sizes, and within the bounds. With the method ``sobol``, the best
+    of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if none of them converges; with ``cma``,
+    CMA-ES over the shortest stretches finds the guesses. `keep` stores outcomes, so that a killed search can continue;
+    `tell` prints a line about each.
     """
     import_extra("cma", "rig", "identify")  # now, and not when the first starts have failed
     stages = _stages(problem)

@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.plots import style
-from pipeline.plots.files import save_data, save_figure, with_provenance
+from pipeline.plots.figure import save_data, save_figure, with_provenance
 from pipeline.rig.magnet.fitting import Outcome
 from pipeline.rig.magnet.measurement import SAME_ANGLE
 from pipeline.store.provenance import provenance, versions

@@ -150,21 +150,11 @@ class Header(Table):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Torque curve: the readings at one locked angle, on one side of the fixed magnet.
+    """Torque curve: the readings at one locked angle, on one side of the fixed magnet."""
 
-    Attributes
-    ----------
-    side : int
-        Index in `laws.SIDES`.
-    locked : float
-        Locked angle [rad].
-    rows : ndarray
-        Indices of its readings in the measurement.
-    """
-
-    side: int
+    side: int  # index in `laws.SIDES`
     locked: float
-    rows: np.ndarray
+    rows: np.ndarray  # indices of its readings in the measurement
 
     def __str__(self) -> str:
         return f"{laws.LOCKED} = {math.degrees(self.locked):.4g} deg, {laws.SIDES[self.side]}"
@@ -172,38 +162,19 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques.
-
-    Attributes
-    ----------
-    path : Path
-        Path of the header.
-    digest : str
-        sha256 of the table.
-    parameters : Parameters
-        Parameters of the model that are known before the fit.
-    angle, locked : ndarray
-        Angles [rad], one per reading.
-    side : ndarray of int
-        Indices in `laws.SIDES`.
-    reading : ndarray
-        Uncorrected torque [N m].
-    torque : ndarray
-        Of the magnets alone [N m].
-    warnings : tuple of str
-        Names of columns that were taken though they are not the header's.
-    """
+    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques."""
 
     header: Header
     path: Path
-    digest: str
-    parameters: Parameters
+    digest: str  # sha256 of the table
+    parameters: Parameters  # parameters of the model that are known before the fit
+    # angles [rad], one per reading
     angle: np.ndarray
     locked: np.ndarray
-    side: np.ndarray
-    reading: np.ndarray
-    torque: np.ndarray
-    warnings: tuple[str, ...] = ()
+    side: np.ndarray  # indices in `laws.SIDES`
+    reading: np.ndarray  # uncorrected torque [N m]
+    torque: np.ndarray  # of the magnets alone [N m]
+    warnings: tuple[str, ...] = ()  # names of columns that were taken though they are not the header's
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
@@ -230,29 +201,15 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
 
 
 def find_measurement(name: str | Path) -> Path:
-    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package.
-
-    Raises
-    ------
-    SpecError
-        If there is neither.
-    """
+    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package."""
     return find_file("measurement", name, {path.stem: path for path in shipped_files("magnet/*.toml")})
 
 
 def read_measurement(path: str | Path) -> Measurement:
     """Read a measurement: its TOML header and its table of readings, corrected and in SI units.
 
-    Parameters
-    ----------
-    path
-        Path of the header; see `find_measurement`.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once: unknown or missing keys and columns, fields that are not numbers, angles
-        out of range, curves with too few readings, sides with too few curves.
+    Raise `SpecError` with all problems at once: unknown or missing keys and columns, fields that are not numbers,
+    angles out of range, curves with too few readings, sides with too few curves.
     """
     path = Path(path)
     header = validated(Header, read_toml(path))

@@ -16,9 +16,8 @@ from magpend_core.models.preset_writing import write_preset
 from magpend_core.models.presets import Preset, find_preset
 from pipeline.layout.writing import json_value, write_atomically
 from pipeline.products.product import padded
-from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome
+from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome, Quality
 from pipeline.rig.magnet.measurement import Measurement
-from pipeline.rig.magnet.solving import Quality
 from pipeline.store.provenance import provenance, versions
 
 REPORT, PRESET, DIPOLE_PRESET = "fit.json", "preset.toml", "preset-dipoles.toml"

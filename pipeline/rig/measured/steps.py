@@ -31,31 +31,20 @@ _AROUND = 16
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive drive periods with the same frequency: the edges at which section points are taken, and their timing.
+    """Consecutive drive periods of one frequency: the edges at which section points are taken, and their timing."""
 
-    Attributes
-    ----------
-    edges : Edges
-        Edges at which sections are taken, without the transient. If they scatter only by the error of
-        measuring, rising edges are placed on the line through all edges of the stretch, which is more exact.
-    timing : Timing
-        Timing of all edges of the stretch.
-    start_s, end_s : float
-        First and last edge [s], with the transient.
-    instant_scatter_s, instant_error_s : float
-        Standard errors of a rising edge [s]: the part that differs from edge to edge, and the part that all
-        edges share. The latter is up to half a sample if edges fall on the same place between two samples.
-    direction : int
-        1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other.
-    """
-
+    # edges at which sections are taken, without the transient. If they scatter only by the error of measuring, rising
+    # edges are placed on the line through all edges of the stretch, which is more exact.
     edges: Edges
-    timing: Timing
+    timing: Timing  # timing of all edges of the stretch
+    # first and last edge [s], with the transient
     start_s: float
     end_s: float
+    # standard errors of a rising edge [s]: the part that differs from edge to edge, and the part that all edges share.
+    # The latter is up to half a sample if edges fall on the same place between two samples.
     instant_scatter_s: float
     instant_error_s: float
-    direction: int
+    direction: int  # 1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other
 
     @property
     def shake_s(self) -> float:
@@ -65,28 +54,13 @@ class Stretch:
 
 
 def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) -> list[Stretch]:
-    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows.
+    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows, in the order
+    of time.
 
-    Parameters
-    ----------
-    edges
-        Edges of a recording.
-    transient
-        Periods that are dropped at the beginning of each constant stretch.
-    window
-        Periods of a window of a slow sweep; none are dropped. 0 never cuts into windows. By default windows
-        of 40 periods are used if stretches have only a few periods, or if most of them are curved the same
-        way.
-
-    Returns
-    -------
-    list of Stretch
-        Stretches in the order of time, each with at least 8 periods without the transient.
-
-    Raises
-    ------
-    SpecError
-        If a number is out of bounds, or nothing long enough is left.
+    The `transient` is dropped at the beginning of each constant stretch; a stretch keeps at least 8 periods. A `window`
+    of 0 never cuts into windows. By default windows of 40 periods are used if stretches have only a few periods, or if
+    most of them are curved the same way. Raise `SpecError` if a number is out of bounds, or nothing long enough is
+    left.
     """
     problems = []
     if transient < 0:

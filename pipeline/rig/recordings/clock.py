@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding, runs
-from pipeline.rig.recordings.raw import Channel
+from pipeline.rig.recordings.channels import Channel, Finding, runs
 from pipeline.specification.problems import SpecError
 
 MIXED = 1e-3
@@ -39,27 +38,13 @@ UNEVEN = 0.5
 
 @dataclass(eq=False)
 class Clock:
-    """Uniform sample times of a recording, and the range of samples used from each channel.
+    """Uniform sample times of a recording, and the range of samples used from each channel."""
 
-    Attributes
-    ----------
-    time : ndarray
-        Times, (n,) [s since the first sample], even within a piece.
-    piece : ndarray
-        Index of the piece, (n,): 0, 1, ...
-    step_s : float
-        Sampling interval [s].
-    taken : list of mappings
-        For each stretch, by channel, the first sample and the one after the last.
-    findings : list of Finding
-        Findings about times.
-    """
-
-    time: np.ndarray
-    piece: np.ndarray
-    step_s: float
-    taken: list[dict[str, tuple[int, int]]]
-    findings: list[Finding] = field(default_factory=list)
+    time: np.ndarray  # times, (n,) [s since the first sample], even within a piece
+    piece: np.ndarray  # index of the piece, (n,): 0, 1, ...
+    step_s: float  # sampling interval [s]
+    taken: list[dict[str, tuple[int, int]]]  # for each stretch, by channel, the first sample and the one after the last
+    findings: list[Finding] = field(default_factory=list)  # findings about times
 
 
 def clock_of(
@@ -72,30 +57,12 @@ def clock_of(
 ) -> Clock:
     """Give the channels of all stretches of a file the same uniform sample times.
 
-    Parameters
-    ----------
-    stretches
-        Channels that are used, by name, with time stamps or sampling intervals.
-    sampling_rate_hz
-        Rate from the mapping, which takes precedence over the file's.
-    source
-        Name of the file, for messages.
-    numbers
-        Piece numbers of the first channel's samples, (n,), one stretch after the other. A new piece begins
-        where the number changes.
-    apart
-        Whether each stretch is a piece, even if it continues the stretch before.
+    All channels begin at the latest start and end at the earliest end; samples left out are findings. A
+    `sampling_rate_hz` from the mapping takes precedence over the file's. A new piece begins where the piece number of
+    the first channel's samples, `numbers`, changes, and with `apart` at each stretch.
 
-    Returns
-    -------
-    Clock
-        All channels begin at the latest start and end at the earliest end; samples left out are findings.
-
-    Raises
-    ------
-    SpecError
-        If no sampling interval is known, channels have different ones, time stamps go backwards, or there
-        are no samples.
+    Raise `SpecError` if no sampling interval is known, channels have different ones, time stamps go backwards, or there
+    are no samples.
     """
     stated = None if sampling_rate_hz is None else 1.0 / sampling_rate_hz
     step = _common_step(stretches, stated, source)
@@ -123,11 +90,6 @@ def resampled(channel: Channel, rate_hz: float) -> Channel:
 
     A gap is a step of more than `GAP_STEPS` times the longest of 99 % of the steps, and more than that many steps of
     the new rate.
-
-    Raises
-    ------
-    SpecError
-        If the time stamps do not increase.
     """
     time = channel.time
     if time is None or len(time) < 2 or not (np.diff(time) > 0.0).all():

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.rig.recordings.findings import findings_of
+from pipeline.rig.recordings.channels import findings_of
 from pipeline.rig.recordings.mapping import DRIVE
 
 MOST_DOTS = 6000

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout.vocabulary import model_of
-from pipeline.rig.recordings.findings import runs
+from pipeline.rig.recordings.channels import runs
 from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.specification.problems import SpecError
 

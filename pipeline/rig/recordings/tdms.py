@@ -11,10 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding
-from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
+from pipeline.specification.problems import SpecError, import_extra
 
 SIMULATED = "simulated"
 """Property of a file with simulated readings."""
@@ -31,14 +29,8 @@ _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 def read_tdms(path: Path) -> Raw:
     """Read all channels of numbers or times in a TDMS file, under the names ``GROUP/CHANNEL``.
 
-    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by
-    default rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a
-    finding.
-
-    Raises
-    ------
-    SpecError
-        If it is not a TDMS file.
+    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by default
+    rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a finding.
     """
     TdmsFile = import_extra("nptdms", "rig", str(path)).TdmsFile
     with _listening() as warnings:

@@ -8,7 +8,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Slopes
 from pipeline.analysis.sets import Geometry
 
 N_KEEP = 20
@@ -76,8 +76,9 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0, n_sample=32)
                 section[:, i] = state
             n = len(state)
             status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
-            answer = Extended(
-                section, status, np.zeros(n, int), np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG))
+            none = np.zeros(n, int)
+            answer = Block(
+                slice(0, n), section, status, none, np.zeros((n, 0), int), seconds=np.ones((n, LEG)), step=np.zeros(n)
             )
         elif isinstance(asked, Slopes):
             point.rtols.append(asked.rtol)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magpend_core.crossing import Crossing
-from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
 from tests.core.flows import BAUTIN, HOPF, table

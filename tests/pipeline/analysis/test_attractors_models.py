@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from magpend_core import load_model, sections
-from pipeline.analysis.attractors.describing.portraits import portraits
-from pipeline.analysis.attractors.settling_table import settling_table
-from pipeline.analysis.attractors.table import attractors_table
-from pipeline.analysis.basins.basins import basins
-from pipeline.analysis.chaos.chaos import chaos
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.attractors.portraits import portraits
+from pipeline.analysis.attractors.settling import settling_table
+from pipeline.analysis.chaos.analysis import chaos_of
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET
 from tests.pipeline.analysis.dense_sets import identify, match, rows_of
 
@@ -79,12 +78,12 @@ def test_identify__two_published_orbits(two):
     assert found["mirror_partner"].values.tolist() == [1, 0]
     assert found["mirror_distance"].values.max() < 1e-7
     assert found["lyapunov_max"].values == pytest.approx(np.log(0.624230) * FREQUENCY, rel=1e-5)
-    fractions = basins(two, rows_of(found))["fraction"].values
+    fractions = basins_of(two, rows_of(found))["fraction"].values
     assert fractions.sum() == pytest.approx(1.0)
 
 
 def test_chaos__by_the_zero_one_test(chaotic, strange):
-    found = chaos(chaotic, rows_of(strange))
+    found = chaos_of(chaotic, rows_of(strange))
     assert found["nature"].attrs["flag_meanings"].split()[found["nature"].item()] == "chaotic"
     assert found["median_zero_one"].item() > 0.95
     # 1.37 from 1e4 points

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from pipeline.analysis.attractors.finding.points import PASSING
-from pipeline.analysis.attractors.matching.hysteresis import hysteresis
+from pipeline.analysis.attractors.hysteresis import find_hysteresis
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.products.reporting import reporting
 from tests.pipeline.analysis.dense_sets import identify, match
@@ -292,7 +292,7 @@ def test_hysteresis__loop_and_jumps():
         {**{name: (dims, v) for name, v in states.items()}, "stability": (("frequency", "attractor"), shown)},
         {**coords, "attractor": [0, 1]},
     )
-    table = hysteresis(ds, ids)
+    table = find_hysteresis(ds, ids)
     assert table["differs"].values.tolist() == [False, False, True, True, True, False]
     assert table["loop_from"].values.tolist() == [2.2]
     assert table["loop_to"].values.tolist() == [2.4]
@@ -308,10 +308,10 @@ def test_hysteresis__loop_and_jumps():
     )
     assert jumps == {(1, 2.4, 2.5, 0, 1, 2), (-1, 2.2, 2.1, 1, 0, 1), (-1, 2.2, 2.0, 1, 0, 1)}
     with pytest.raises(ValueError, match="both"):
-        hysteresis(ds.isel(branch=[0, 1]), ids.isel(branch=[0, 1]))
+        find_hysteresis(ds.isel(branch=[0, 1]), ids.isel(branch=[0, 1]))
     # what is not shown to attract makes no loop
     ids["stability"][:, 0] = NOT_SETTLED
-    assert not hysteresis(ds, ids)["differs"].any()
+    assert not find_hysteresis(ds, ids)["differs"].any()
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.branches.bands import GRID, orbit_data, place_variables
-from pipeline.analysis.branches.bands_product import bands_table
+from pipeline.analysis.branches.bands import GRID, bands_table, orbit_data, place_variables
 from pipeline.analysis.branches.carrying import Along
 from pipeline.analysis.draws import LEVELS, stretches
 from pipeline.runs.derive import derive, stored

@@ -11,14 +11,17 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
+from pipeline.analysis.branches.analysis import table_of, windows_of
 from pipeline.analysis.branches.arclength import Point, Settings
 from pipeline.analysis.branches.bifurcations import Bifurcation, counts_of, multipliers_of, n_unstable, tell_apart
-from pipeline.analysis.branches.crossings import cross
 from pipeline.analysis.branches.curves import continue_curves
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, cross, explore
 from pipeline.analysis.branches.following import Branch, first_point
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.lockstep import Query, run_alone, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem, Value, doubling_test, fold_test, torus_test
+from pipeline.analysis.branches.starting_orbits import orbits_near
 from tests.core.cells import run_cells, scipy_end, stroboscopic_map
 
 DUFFING, VAN_DER_POL = load_model("duffing").system, load_model("forced-van-der-pol").system

@@ -6,19 +6,13 @@ from scipy.optimize import fsolve
 
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.branches import (
-    Scope,
-    Start,
-    curves_dataset,
-    curves_from,
-    dataset_of,
-    explore,
-    table_of,
-    windows_of,
-)
+from pipeline.analysis.branches.analysis import branches_table, table_of, windows_of
+from pipeline.analysis.branches.curves import curves_dataset, curves_from
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.starting_orbits import family_of
 from pipeline.analysis.branches.stuck import grows_without_bound
-from pipeline.analysis.branches.table import branches_table
 from tests.core.cells import scipy_end
 from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow, table
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.branches.analysis import branches_table, curves_table
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
-from pipeline.analysis.branches.table import branches_table, curves_table
 from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET

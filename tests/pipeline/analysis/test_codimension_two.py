@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, codimension_two, curves_dataset, explore
-from pipeline.analysis.branches.curves import continue_curves
+from pipeline.analysis.branches import codimension_two
+from pipeline.analysis.branches.analysis import curves_table
+from pipeline.analysis.branches.curves import continue_curves, curves_dataset
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.table import curves_table
 from tests.core.flows import table
 
 # z' = (1 + i w0) z - |z|^2 z + F exp(i W t) for z = x + i y

@@ -6,8 +6,7 @@ import xarray as xr
 
 from magpend_core import trajectory
 from magpend_core.models import load_model
-from pipeline.analysis.attractors.matching.connections import grouped
-from pipeline.analysis.attractors.matching.matching import BASES
+from pipeline.analysis.attractors.matching import BASES, grouped
 from pipeline.analysis.branches import connecting
 from pipeline.analysis.branches.connecting import Web, connect
 from pipeline.analysis.branches.sheets import BORDER, ENDED, LINKED, Axis, Grid

@@ -8,12 +8,13 @@ from scipy.optimize import fsolve
 from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore
+from pipeline.analysis.branches.analysis import branches_table
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.bifurcations import n_unstable
-from pipeline.analysis.branches.equilibria import EquilibriumProblem
-from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.table import branches_table
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.problems import EquilibriumProblem, Family
 from tests.core.cells import scipy_end
 from tests.core.flows import model_of, table
 from tests.core.models.test_library import EQUATIONS

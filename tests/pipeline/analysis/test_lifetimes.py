@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.intervals import lifetime_interval
 
 # ---- intervals ---------------------------------------------------------------------------------
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.manifolds import Saddle, first_tangency, stable_manifold, unstable_manifold
-from pipeline.analysis.manifolds.growing import Resolution
+from pipeline.analysis.manifolds.analysis import first_tangency
+from pipeline.analysis.manifolds.growing import Resolution, Saddle, stable_manifold, unstable_manifold
 from tests.core.cells import polish, scipy_end
 
 DUFFING = load_model("duffing")

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from magpend_core.models import load_model
-from pipeline.analysis.attractors.matching import across
+from pipeline.analysis.attractors import matching
 from pipeline.layout.vocabulary import model_attribute
 from tests.pipeline.analysis.dense_sets import rows_of
 
@@ -14,7 +14,7 @@ PERIODIC = 2
 
 def match_across(runs, **options):
     """Common ids of the attractors of runs, whose sets are on the dim ``attractor``."""
-    return across.match_across([rows_of(run) for run in runs], **options)
+    return matching.match_across([rows_of(run) for run in runs], **options)
 
 
 def run_of(*sets):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, explore
 from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.normal_forms import critical_vectors, judge
 from pipeline.analysis.branches.problems import Family
 from tests.core.flows import model_of, table

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from magpend_core import load_preset
-from pipeline.analysis.attractors.describing.portraits import portraits
+from pipeline.analysis.attractors.portraits import portraits
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, BOUNDED_SET, PERIODIC_ORBIT
 
 from .cubes import ORBITS, STATES, attributes_of

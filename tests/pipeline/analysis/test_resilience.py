@@ -9,12 +9,11 @@ from scipy.linalg import expm
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, search_together
-from pipeline.analysis.resilience.edge_table import edge_table
-from pipeline.analysis.resilience.shocks import Settings, ShockSearch
-from pipeline.analysis.resilience.table import resilience_table
+from pipeline.analysis.resilience.analysis import resilience_table
+from pipeline.analysis.resilience.edge import edge_table
+from pipeline.analysis.resilience.shocks import Asked, Bases, Settings, Shocked, ShockSearch, search_together
 from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
-from pipeline.plots.edge import plot_edge
+from pipeline.plots.basins import plot_edge
 from pipeline.plots.resilience import plot_resilience
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError

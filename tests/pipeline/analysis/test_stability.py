@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.describing.features import Features
-from pipeline.analysis.attractors.describing.labelling import _fill_orbit
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.attractors.features import Features
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
-from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.attractors.labelling import _fill_orbit
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
 from pipeline.analysis.ragged import dense, isel
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, PERIODIC_ORBIT, UNSTABLE

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
-from pipeline.analysis.branches.tongues import fractions_between
-from pipeline.analysis.branches.tongues_product import cells_of, tongues_table
-from pipeline.plots.rotation import plot_rotation
-from pipeline.plots.tongues import plot_tongues
+from pipeline.analysis.branches.tongues import cells_of, fractions_between, tongues_table
+from pipeline.plots.tongues import plot_rotation, plot_tongues
 from pipeline.products.rotation import RotationFlag
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError

@@ -12,8 +12,8 @@ from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import model_of, overrides_of, parameters_of
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import load_spec
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create
 from tests.core.flows import BAUTIN
 from tests.pipeline.runs.test_golden_bits import DRIVE, RUNS
@@ -26,10 +26,10 @@ def test_settings__of_run_json_are_those_of_the_cubes_attributes(name, tmp_path)
     """Of runs of every kind of motion, which are set up and not computed."""
     (tmp_path / "drive.csv").write_text(DRIVE, "utf-8")
     (tmp_path / "spec.toml").write_text(RUNS[name], "utf-8")
-    spec = load_spec(tmp_path / "spec.toml")
+    spec = Spec.read(tmp_path / "spec.toml")
     plan = make_plan(spec)
     create(tmp_path / "run", spec, plan, identity_of(spec, plan), RUNS[name])
-    run = Run.open(tmp_path / "run")
+    run = RunDirectory.open(tmp_path / "run")
     spec, cube = run.spec, run.cube()
     assert model_of(cube) is run.model is spec.model
     assert parameters_of(cube) == spec.values
@@ -64,7 +64,7 @@ CYCLE = sweep(
 @pytest.mark.parametrize(("spec", "n_ends"), [(FIVE, 5), (CYCLE, 2)], ids=["five orbits", "a cycle and a rest"])
 def test_destinations__of_the_live_page_are_those_of_the_analyses(spec, n_ends, computed):
     """Starts beside those of the run: both find the attractor of the run on which each ends."""
-    run = Run.open(computed(spec))
+    run = RunDirectory.open(computed(spec))
     cube, attractors = run.cube(), derive(run.directory, "attractors")
     (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
     ((_, there),) = destinations_at(cube, attractors, points)

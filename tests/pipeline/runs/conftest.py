@@ -24,3 +24,11 @@ def command_of(tmp_path, monkeypatch):
         return str(folder / name)
 
     return write
+
+
+@pytest.fixture
+def whole(made):
+    """A run directory of five tasks with made-up numbers, all of them committed."""
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    return made
