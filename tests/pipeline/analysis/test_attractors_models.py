@@ -7,6 +7,7 @@ from magpend_core import load_model, sections
 from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.attractors.portraits import portraits
 from pipeline.analysis.attractors.settling import settling_table
+from pipeline.analysis.basins.analysis import basins_of
 from pipeline.analysis.chaos.analysis import chaos_of
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET
 from tests.pipeline.analysis.dense_sets import identify, match, rows_of
