@@ -12,7 +12,7 @@ import pytest
 from typer.main import get_command
 
 from pipeline.cli import main, reference
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.specification.files import shipped_workflows

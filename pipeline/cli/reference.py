@@ -136,7 +136,7 @@ def _options(command: Any) -> list[Row]:
 
 def exit_codes() -> str:
     """Return the Markdown table of the exit codes of all commands."""
-    from pipeline.cli.exits import Exit
+    from pipeline.cli.console import Exit
 
     return table(("code", "meaning"), ((str(int(code)), code.sentence) for code in Exit))
 

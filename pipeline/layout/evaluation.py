@@ -2,7 +2,7 @@
 
 A state of 1e-9 m or of 1e9 persons would be compared with tolerances made for numbers of the order of one. Its size
 becomes its scale, and the unit of its absolute tolerance and of its bound. It is a power of ten, and 1 for all that is
-between 0.1 and 100 (`magpend_core.natural`). A run keeps its sizes in the text of its model, as the key ``size``.
+between 0.1 and 100 (`magpend_core.sizes`). A run keeps its sizes in the text of its model, as the key ``size``.
 
 The size is between the largest value of the later motion (a tenth of the largest value at all, if that is more) and
 the largest value at all: wide starts do not hide a small attractor, and a state that comes to rest at 0 keeps about the
@@ -21,7 +21,7 @@ from magpend_core.models import load_model
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of, value_of
-from magpend_core.natural import natural_size
+from magpend_core.sizes import natural_size
 from pipeline.layout.cells import initial_states, parameter_axes
 from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError

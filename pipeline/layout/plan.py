@@ -22,8 +22,8 @@ import numpy as np
 from pipeline.layout.cells import CellMap
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
+from pipeline.products.product import Variable
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.products.variable import Variable
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY

@@ -23,7 +23,7 @@ from pipeline.layout.vocabulary import split_dims, told_by
 from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.plots.looks import DPI, LOCK, VECTORS
 from pipeline.plots.style import DataFigure, Frame
-from pipeline.products.animation import AnimationOptions
+from pipeline.products.figures import AnimationOptions
 from pipeline.products.product import FigureOptions, Options, function_of
 from pipeline.products.registry import FIGURES
 from pipeline.specification.problems import unknown_name

@@ -21,9 +21,9 @@ from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import fixed_of, swept_parameters
 from pipeline.plots.branches import take_room
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
+from pipeline.products.branches import TongueOptions
 from pipeline.products.figures import TongueFigureOptions
 from pipeline.products.product import FigureOptions
-from pipeline.products.tongues import TongueOptions
 
 NAMED = 5
 """Largest denominator of the steps p/q that a staircase names."""

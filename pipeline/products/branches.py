@@ -110,3 +110,28 @@ ORBITS = Analysis(
     table="pipeline.analysis.branches.orbit_search:orbits_table",
     needs="pipeline.analysis.branches.orbit_search:needs_point",
 )
+
+
+_ROOM = "pipeline.analysis.branches.tongues"
+
+
+class TongueOptions(CurveOptions):
+    """Options for finding Arnold tongues and following their edges."""
+
+    max_denominator: int = option(5, "Largest q of the tongues p/q.", ge=1, le=64, flag="--denominator")
+    at: dict[str, float] = option({}, "Value of a further axis of the run: the row on which tongues are searched.")
+
+
+TONGUES = Analysis(
+    "tongues",
+    """Find the Arnold tongues p/q of a plane: where motions lock to the drive, p turns in q drive periods.
+
+    Searches one row of cells with rotation numbers for all fractions up to a denominator. Continues the folds at
+    the edges of each tongue in the plane of two parameters.""",
+    TongueOptions,
+    compute=f"{_ROOM}:tongues",
+    table=f"{_ROOM}:tongues_table",
+    needs=f"{_ROOM}:needs_rotation",
+    settle=f"{_ROOM}:settle_tongues",
+    figure="tongues",
+)

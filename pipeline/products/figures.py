@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipeline.products.branches import BranchOptions, CurveOptions
+from pipeline.products.branches import BranchOptions, CurveOptions, TongueOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
-from pipeline.products.product import Figure, FigureOptions, StateOptions, option
+from pipeline.products.product import Figure, FigureOptions, Options, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
-from pipeline.products.tongues import TongueOptions
 
 Per = Literal["s", "period"]
 
@@ -308,3 +307,20 @@ DENSITY = Figure(
     "pipeline.plots.noise:draw_density",
     panels="either",
 )
+
+
+MOST_FRAMES = 5000
+"""Most frames of a film; it takes some minutes to draw, and some hundred megabytes as GIF."""
+
+
+class AnimationOptions(Options):
+    """Options of an animation of a run."""
+
+    at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point to show.")
+    nearest: bool = option(False, "Use the axes' values nearest to --at, and print them; otherwise --at must match.")
+    degrees: bool = option(False, "Use degrees instead of radians.")
+    portrait: str = option("", "State whose phase portrait is shown.")
+    seconds: float = option(8.0, "Length of the film.", unit="s", gt=0.0, le=600.0)
+    fps: float = option(25.0, "Frames per second.", unit="1/s", gt=0.0, le=120.0)
+    speed: float | None = option(None, "Seconds of the model per second of film.", gt=0.0)
+    size: int = option(800, "Width of a frame.", unit="pixels", ge=200, le=4000)

@@ -23,7 +23,7 @@ from pipeline.layout.vocabulary import (
     parameters_of,
     start_dims,
 )
-from pipeline.products.animation import AnimationOptions
+from pipeline.products.figures import AnimationOptions
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun, Echo, Source, refused
 from pipeline.runs.instants import RTOL, Moving
@@ -79,7 +79,7 @@ def animation(
     source
         Run directory, or an opened run; None for a start without one.
     options, more
-        Options of `pipeline.products.animation.AnimationOptions` that differ from the defaults.
+        Options of `pipeline.products.figures.AnimationOptions` that differ from the defaults.
     attractors
         Letters of attractors of the run. By default, without `cells` and `start`, all attractors at the
         parameter point.

@@ -87,7 +87,7 @@ def analysed(data: Mapping[str, Any], folder: Path) -> tuple[Any, list[dict[str,
     from pipeline.runs.derive import derive
     from pipeline.runs.run import run
 
-    run(variants.write(data, folder), folder / "run", workers=0, echo=lambda _: None)
+    run(data, folder / "run", workers=0, echo=lambda _: None)
     found = derive(folder / "run", "attractors")
     return dense(found, points=True), attractors_table(found).rows
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magpend_core.multipliers import orbit_exponents
+from magpend_core.orbits import orbit_exponents
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members

@@ -32,9 +32,9 @@ from pipeline.analysis.tabular import Row as TableRow
 from pipeline.analysis.tabular import Words, aligned, counted, number
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of, split_dims
+from pipeline.products.branches import TongueOptions
 from pipeline.products.product import Table
 from pipeline.products.rotation import RotationFlag
-from pipeline.products.tongues import TongueOptions
 
 BISECTIONS = 26
 """Most halvings of an interval of the parameter in which a fraction is passed between two cells."""

@@ -47,7 +47,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from magpend_core.multipliers import orbit_exponents
+from magpend_core.orbits import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magpend_core.multipliers import orbit_exponents
+from magpend_core.orbits import orbit_exponents
 from magpend_core.status import Status
 from pipeline.analysis.attractors import features
 from pipeline.analysis.branches.arclength import Point, Settings, correct

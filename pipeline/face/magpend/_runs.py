@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, overload
 from magpend._methods import AnalysisMethod
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.basins import BasinOptions
-from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions
+from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions, TongueOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
@@ -17,7 +17,6 @@ from pipeline.products.product import Options, function_of
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
-from pipeline.products.tongues import TongueOptions
 from pipeline.runs.arguments import names_arguments
 from pipeline.runs.derive import stale, stored_each
 from pipeline.runs.progress import bar_in_notebook

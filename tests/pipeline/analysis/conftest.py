@@ -1,7 +1,5 @@
 """One cascade of period doublings for all tests of branches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Numbers on basins against values known on paper, published values, and simulated truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -72,21 +70,6 @@ def test_basin_fractions__counts():
     np.testing.assert_allclose(ds["fraction_if_none"], [1 / 6, 1 / 6, 3 / 6])
     np.testing.assert_allclose(ds["fraction_if_all"], [2 / 6, 2 / 6, 4 / 6])
     assert basin_fractions([0, -1], unfinished=())["label"].values.tolist() == [-1, 0]
-
-
-@pytest.mark.parametrize(
-    ("method", "expected"),
-    # scipy.stats.binomtest(k, 20).proportion_ci; "exact" is Clopper and Pearson's
-    [("wilson", "wilson"), ("clopper-pearson", "exact")],
-)
-def test_binomial_interval__agrees_with_scipy(method, expected):
-    for k in range(21):
-        reference = stats.binomtest(k, 20).proportion_ci(0.9, method=expected)
-        low, high = binomial_interval(k, 20, confidence=0.9, method=method)
-        np.testing.assert_allclose([low, high], [reference.low, reference.high], atol=1e-12)
-
-
-def test_basin_fractions__rule_of_three():
     ds = basin_fractions(np.zeros(1000, dtype=int))
     bound = ds["unseen_high"].item()
     assert (1 - bound) ** 1000 == pytest.approx(0.05)
@@ -95,6 +78,14 @@ def test_basin_fractions__rule_of_three():
     assert half["unseen_high"].item() == pytest.approx(3 / 500, rel=0.01)
     # all 500 unfinished cells may have gone to one that was not seen
     assert 0.5 < half["unseen_high_if_all"].item() < 0.53
+
+
+@pytest.mark.parametrize(("method", "expected"), [("wilson", "wilson"), ("clopper-pearson", "exact")])
+def test_binomial_interval__agrees_with_scipy(method, expected):
+    for k in range(21):
+        reference = stats.binomtest(k, 20).proportion_ci(0.9, method=expected)
+        low, high = binomial_interval(k, 20, confidence=0.9, method=method)
+        np.testing.assert_allclose([low, high], [reference.low, reference.high], atol=1e-12)
 
 
 @pytest.mark.slow
@@ -184,9 +175,6 @@ def test_basin_entropy__on_paper():
     assert ds["boundary_entropy"].item() == pytest.approx((quarter + np.log(2)) / 2)
     assert (ds["n_boxes"].item(), ds["n_boundary_boxes"].item(), ds["n_labels"].item()) == (6, 2, 3)
     assert ds["fraction_used"].item() == pytest.approx(24 / 30)
-
-
-def test_basin_entropy__three_dimensions():
     labels = np.zeros((9, 8, 12), dtype=int)
     labels[:5] = 1
     labels[:, :, ::2] += 10
@@ -195,19 +183,6 @@ def test_basin_entropy__three_dimensions():
     mixed = np.log(3) - 2 / 3 * np.log(2)
     assert ds["entropy"].item() == pytest.approx(mixed / 3)
     assert ds["boundary_entropy"].item() == pytest.approx(mixed)
-
-
-def test_basin_entropy__ln_2():
-    rng = np.random.default_rng(0)
-    three = basin_entropy(rng.integers(3, size=(60, 60)))
-    assert three["boundary_entropy"].item() > 1.0
-    assert three["above_ln2"].item()
-    assert three["above_ln2_surely"].item()
-    two = basin_entropy(rng.integers(2, size=(60, 60)))
-    assert not two["above_ln2"].item()
-
-
-def test_basin_entropy__unfinished():
     labels = np.zeros((4, 4), dtype=int)
     labels[0, 0], labels[0, 1], labels[2:, 2:] = 1, -1, -1
     ds = basin_entropy(labels, 2)
@@ -216,6 +191,28 @@ def test_basin_entropy__unfinished():
     assert ds["n_boxes"].item() == 3
     assert ds["fraction_unfinished"].item() == 5 / 16
     assert basin_entropy(labels, 2, unfinished=())["n_labels"].item() == 3
+    rng = np.random.default_rng(0)
+    three = basin_entropy(rng.integers(3, size=(60, 60)))
+    assert three["boundary_entropy"].item() > 1.0
+    assert three["above_ln2"].item()
+    assert three["above_ln2_surely"].item()
+    two = basin_entropy(rng.integers(2, size=(60, 60)))
+    assert not two["above_ln2"].item()
+    # Three labels in one box exceed ln 2, and one box proves nothing
+    one = np.arange(25).reshape(5, 5) % 3
+    found = basin_entropy(one, 5)
+    assert found["above_ln2"]
+    assert not found["above_ln2_surely"]
+    assert np.isnan([found[f"{name}_stderr"] for name in ("entropy", "boundary_entropy")]).all()
+    # twenty boxes, four of them on the boundary
+    four = np.zeros((100, 5), int)
+    four[:20] = np.tile(one, (4, 1))
+    found = basin_entropy(four, 5)
+    assert np.isfinite(found["entropy_stderr"])
+    assert np.isnan(found["boundary_entropy_low"])
+    assert not found["above_ln2_surely"]
+    many = basin_entropy(np.tile(one, (8, 1)), 5)
+    assert many["above_ln2_surely"]
 
 
 @pytest.mark.slow
@@ -265,7 +262,7 @@ def test_uncertainty_exponent__grebogi_map():
     assert 0.2 <= ds["exponent"].item() <= 0.3
 
 
-def test_uncertainty_exponent__cantor_boundary_is_exact():
+def test_uncertainty_exponent__of_a_cantor_set_and_of_a_diagonal():
     # boxes that are the intervals of the construction: 2^level of 3^level see more than one basin
     ds = uncertainty_exponent(cantor_basins(), method="boxes", epsilons=[3**k for k in range(1, 8)])
     assert ds["exponent"].item() == pytest.approx(1 - np.log(2) / np.log(3), abs=1e-12)
@@ -273,6 +270,11 @@ def test_uncertainty_exponent__cantor_boundary_is_exact():
     np.testing.assert_allclose(ds["fitted"], ds["uncertain"])
     assert ds["exponent_stderr_fit"].item() < 1e-12
     assert ds["exponent_stderr"].item() > 0.005
+    i = np.arange(400)
+    ds = uncertainty_exponent((i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50])
+    # only the boxes on the diagonal are mixed, each about half and half
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.03)
+    np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3])
@@ -286,21 +288,30 @@ def test_uncertainty_exponent__plane_boundary_is_exact(dims):
     np.testing.assert_allclose(ds["uncertain"], 2 * ds["epsilon"] / room / dims)
 
 
-def test_uncertainty_exponent__entropy_of_a_straight_boundary():
-    i = np.arange(400)
-    ds = uncertainty_exponent((i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50])
-    # only the boxes on the diagonal are mixed, each about half and half
-    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.03)
-    np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)
-
-
-def test_uncertainty_exponent__boxes_that_see_nothing_are_no_part_of_the_fit():
+def test_uncertainty_exponent__of_empty_boxes_unfinished_cells_and_one_basin():
     labels = np.repeat([0, 1], 1200)  # sides of 4, 5 and 6 meet the boundary with an edge
     ds = uncertainty_exponent(labels, method="boxes", epsilons=[4, 5, 6, 7, 11, 16, 17])
     assert ds["used"].values.tolist() == [False, False, False, True, True, False, True]
     np.testing.assert_allclose(ds["uncertain"].values[[3, 4, 6]], [1 / 342, 1 / 218, 1 / 141])
     slope = np.polyfit(np.log([7, 11, 17]), np.log([1 / 342, 1 / 218, 1 / 141]), 1)[0]
     assert ds["exponent"].item() == pytest.approx(slope)
+    labels = np.zeros((200, 200), dtype=int)
+    labels[100:] = 1
+    spoilt = labels.copy()
+    spoilt[::7, ::5] = -1
+    ds = uncertainty_exponent(spoilt)
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.05)
+    assert ds["fraction_unfinished"].item() > 0.02
+    assert uncertainty_exponent(spoilt, unfinished=())["exponent"].item() < 0.7
+    labels = np.full((50, 50), 4)
+    for method in ("perturbation", "boxes", "entropy"):
+        ds = uncertainty_exponent(labels, method=method)
+        assert np.isnan(ds["exponent"].item())
+        assert not ds["used"].any()
+    ds = basin_entropy(labels)
+    assert ds["entropy"].item() == 0.0
+    assert np.isnan(ds["boundary_entropy"].item())
+    assert not ds["above_ln2"].item()
 
 
 @pytest.mark.slow
@@ -319,29 +330,6 @@ def test_uncertainty_exponent__bootstrap_tells_the_scatter():
     assert 0.6 < np.mean(errors) / np.std(values) < 1.5
 
 
-def test_uncertainty_exponent__unfinished_cells_are_no_boundary():
-    labels = np.zeros((200, 200), dtype=int)
-    labels[100:] = 1
-    spoilt = labels.copy()
-    spoilt[::7, ::5] = -1
-    ds = uncertainty_exponent(spoilt)
-    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.05)
-    assert ds["fraction_unfinished"].item() > 0.02
-    assert uncertainty_exponent(spoilt, unfinished=())["exponent"].item() < 0.7
-
-
-def test_boundaries__of_one_basin():
-    labels = np.full((50, 50), 4)
-    for method in ("perturbation", "boxes", "entropy"):
-        ds = uncertainty_exponent(labels, method=method)
-        assert np.isnan(ds["exponent"].item())
-        assert not ds["used"].any()
-    ds = basin_entropy(labels)
-    assert ds["entropy"].item() == 0.0
-    assert np.isnan(ds["boundary_entropy"].item())
-    assert not ds["above_ln2"].item()
-
-
 # --- Wada ------------------------------------------------------------------------------------------------
 
 
@@ -355,6 +343,13 @@ def test_wada_merge_test__published_toy_cases():
     ds = wada_merge_test(fractal, 1)
     assert ds["beyond"].item() == 0.0
     assert ds["wada"].all()
+    labels = np.repeat([0, 1, -1, 2], 5)[:, None] * np.ones(8, dtype=int)
+    ds = wada_merge_test(labels, 50)
+    assert np.isinf(ds["hausdorff_distance"].item())
+    assert not ds["wada"].item()
+    assert ds["n_boundary"].values.tolist() == [16, 16, 0]
+    assert ds["beyond"].item() == 0.1
+    assert ds["fraction_unfinished"].item() == 0.25
 
 
 def test_wada_merge_test__newton_is_wada():
@@ -364,9 +359,6 @@ def test_wada_merge_test__newton_is_wada():
     assert 0 < ds["beyond"].values[1] < ds["beyond"].values[0] < 0.01
     assert np.all(ds["beyond_stderr"].values[:2] > 0)
     assert ds["beyond_low"].values[0] < ds["beyond"].values[0] < ds["beyond_high"].values[0]
-
-
-def test_wada_merge_test__two_boundaries_are_not_wada():
     # two of three basins finely mixed, the third apart behind a straight line
     labels = np.random.default_rng(0).integers(2, size=(60, 60))
     labels[40:] = 2
@@ -396,34 +388,6 @@ def test_wada_merge_test__agrees_with_all_pairs(metric, name, shape):
     np.testing.assert_array_equal(ds["distance"], [[d.max() for d in row] for row in far])
     most = max((d > 1).sum() for row in far for d in row)
     assert ds["beyond"].item() == pytest.approx(most / labels.size)
-
-
-def test_wada_merge_test__hidden_boundary():
-    labels = np.repeat([0, 1, -1, 2], 5)[:, None] * np.ones(8, dtype=int)
-    ds = wada_merge_test(labels, 50)
-    assert np.isinf(ds["hausdorff_distance"].item())
-    assert not ds["wada"].item()
-    assert ds["n_boundary"].values.tolist() == [16, 16, 0]
-    assert ds["beyond"].item() == 0.1
-    assert ds["fraction_unfinished"].item() == 0.25
-
-
-def test_basin_entropy__few_boxes_have_no_error():
-    """Three labels in one box exceed ln 2, and one box proves nothing."""
-    one = np.arange(25).reshape(5, 5) % 3
-    found = basin_entropy(one, 5)
-    assert found["above_ln2"]
-    assert not found["above_ln2_surely"]
-    assert np.isnan([found[f"{name}_stderr"] for name in ("entropy", "boundary_entropy")]).all()
-    # twenty boxes, four of them on the boundary
-    four = np.zeros((100, 5), int)
-    four[:20] = np.tile(one, (4, 1))
-    found = basin_entropy(four, 5)
-    assert np.isfinite(found["entropy_stderr"])
-    assert np.isnan(found["boundary_entropy_low"])
-    assert not found["above_ln2_surely"]
-    many = basin_entropy(np.tile(one, (8, 1)), 5)
-    assert many["above_ln2_surely"]
 
 
 ONE, THREE = np.zeros((50, 50), int), [[0, 1], [2, 0]]

@@ -1,7 +1,5 @@
 """Basins of a cube: numbers known on paper, and what is said of cells without an outcome."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -70,9 +68,6 @@ def test_basins__a_straight_boundary():
     assert (found["n_periods"] == 7).all()
     assert found["uncertain"].dims == ("epsilon",)
     assert found.attrs["not_computed"] == ""
-
-
-def test_basins__wada_test_of_parallel_strips():
     found = basins_of(*labelled([thirds(), halves()]), radius=20)
     # the boundary of the first strip is 20 cells from that of the last
     assert found["wada_distance"].values[0] == 20
@@ -97,9 +92,6 @@ def test_basins__cells_without_an_outcome():
     assert basins_table(found).lines[-1] == (
         "380 of 400 cells end on attractors; 5 diverged, 5 pending, 5 not settled, 5 that could not be integrated"
     )
-
-
-def test_basins__a_point_without_any_outcome():
     empty = np.full((20, 20), -1)
     status = np.stack([np.full((20, 20), Status.PERIODIC), np.full((20, 20), Status.PENDING)])
     found = basins_of(*labelled([halves(20, 8), empty], status))
@@ -131,9 +123,6 @@ def test_basins__starts_that_are_no_regular_grid():
     found = basins_of(*sample)
     assert found.attrs["not_computed"] == "boundaries: the starts are no grid"
     assert found["fraction"].dims == ("set",)
-
-
-def test_basins__a_grid_too_small_for_the_boxes():
     found = basins_of(*labelled([halves(20, 8)]), box=21)
     assert "box (21, 21) is larger than the grid (20, 20)" in found.attrs["not_computed"]
     assert np.isnan(found["basin_entropy"]).all()

@@ -1,7 +1,5 @@
 """Branches of Duffing oscillators, a model without angles: against harmonic balance and symmetry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Intervals of lifetimes: published values, and how often they cover the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

@@ -12,7 +12,7 @@ import xarray as xr
 
 import magpend
 from pipeline.analysis.ragged import dense
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.plots import bifurcation
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs.derive import derive

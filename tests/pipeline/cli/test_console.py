@@ -18,8 +18,7 @@ from magpend_core.engine import jit
 from magpend_core.models import DEFAULT
 from pipeline.cli import console, models
 from pipeline.cli.common import tell
-from pipeline.cli.console import Work, progress
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit, Work, progress
 from pipeline.products.product import Table
 from pipeline.products.reporting import report, reporting
 from tests.programs import fresh_python

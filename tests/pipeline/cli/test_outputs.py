@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from tests.pipeline.factories import contents, duffing, quietly
 
 pytestmark = pytest.mark.slow

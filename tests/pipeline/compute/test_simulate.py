@@ -1,4 +1,4 @@
-"""One trajectory to a series on disk."""
+"""One trajectory to a series on disk, under the model's drive or a recorded one, and whether it has closed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is too large is refused at once, in words, before anything is created."""
+"""What is too large, or has not the period of the drive, is refused at once, before anything is created."""
 
 from __future__ import annotations
 

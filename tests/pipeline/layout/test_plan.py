@@ -1,4 +1,4 @@
-"""Plans: every cell once, whole chunks, nothing that depends on the machine."""
+"""Plans: every cell once, whole chunks, nothing that depends on the machine; and what the kernel sees of cells."""
 
 from __future__ import annotations
 

@@ -58,7 +58,6 @@ def test_section_pair__leaves_the_crossing_state_out():
 
 
 def test_readable_unit__none():
-    """What others read: test_units."""
     phrases = ["widgets", "drive periods", "length of the pendulum"]
     for text in [*phrases, "2 m", "m/", "(m", "m)", "m^", "1e-3 m", "$", "s^1.5"]:
         assert readable_unit(text) is None, text

@@ -13,7 +13,7 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
-from pipeline.analysis.attractors.hysteresis import hysteresis
+from pipeline.analysis.attractors.hysteresis import find_hysteresis
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Point
@@ -233,7 +233,7 @@ def walk():
 
 @pytest.mark.slow
 def test_figures_of_walks__directions_loops_and_no_sample(walk):
-    fig = plot_coexisting(walk, hysteresis=hysteresis(walk, walk))
+    fig = plot_coexisting(walk, hysteresis=find_hysteresis(walk, walk))
     assert legend_texts(fig)[-3:] == ["up", "down", "up and down differ"]
     present = fig.data["present"].sel(attractor=0)
     assert present.sel(direction="up").values.tolist() == [1, 1, 1, 0, 0]

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.report.study import load_study, shipped_studies
 from pipeline.specification.problems import SpecError
 

@@ -1,4 +1,4 @@
-"""Commands of batch systems, made up for a test."""
+"""Commands of batch systems, made up for a test, and a run with made-up numbers."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs import estimate as estimates
 from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
-from pipeline.runs.outcome import outcomes_of
 from pipeline.runs.progress import LINE_EVERY_S, Progress
+from pipeline.runs.status import outcomes_of
 from pipeline.specification.spec import Spec
 from pipeline.store import commits
 from pipeline.store.run import RunDirectory

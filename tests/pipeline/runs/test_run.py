@@ -17,7 +17,7 @@ import pytest
 
 from magpend_core import load_preset, run_branches
 from pipeline import open_run
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.layout import identity

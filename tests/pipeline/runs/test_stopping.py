@@ -1,4 +1,4 @@
-"""Signals at every stage of a command: one message, nothing left behind, nobody left running."""
+"""Signals at every stage of a command, and many small tasks: nothing left behind, nobody left running."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batch scripts of coordinators, as text, and what is refused before one is sent."""
+"""Batch jobs: their scripts as text, their sizes, the batch systems that are here, and what is refused."""
 
 from __future__ import annotations
 
