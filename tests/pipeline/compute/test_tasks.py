@@ -24,7 +24,6 @@ from pipeline.compute.execute import run_tasks
 from pipeline.compute.order import Order, TaskFailedError
 from pipeline.compute.processes import Processes
 from pipeline.compute.threads import in_threads, writing_results
-
 from pipeline.runs import blocks
 from pipeline.runs.derive import AnalysedRun, derive
 from tests.pipeline.factories import wait_for
