@@ -25,7 +25,6 @@ from pipeline.runs.run import run
 from pipeline.specification.clusters import SYSTEMS, load_cluster
 from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import LOOPBACK, duffing, quietly, silent
-from tests.pipeline.runs.test_own_systems import probe
 
 SPEC = duffing(
     "frequency_hz = { start = 0.15, stop = 0.25, num = 12 }",
@@ -111,17 +110,17 @@ def test_workers__other_versions(tmp_path, environment, scheduler_file, worker):
     worker(PYTHONPATH=str(tmp_path / "none"))
     text = refusal(scheduler_file, 2)
     assert "2 of 2 workers have other programs than this process: tcp://127.0.0.1:" in text
-    assert f"numba 0.0.1, here {probe.installation()['numba']}" in text
+    assert f"numba 0.0.1, here {clients.installation()['numba']}" in text
     assert "has no magpend, or one of another version" in text
     assert "Install the same versions everywhere" in text
 
 
 def test_late_worker__other_versions():
     """One that comes later, when nobody asks it any more, refuses its tasks itself."""
-    task = probe.Fitting(lambda index: {"task": index})
+    task = clients.Fitting(lambda index: {"task": index})
     assert task(3) == {"task": 3}
-    other = probe.Fitting(task.task, {**probe.installation(), "magpend's kernel": "another"})
-    with pytest.raises(probe.MisfitError, match=r"this worker has other programs .*magpend's kernel"):
+    other = clients.Fitting(task.task, {**clients.installation(), "magpend's kernel": "another"})
+    with pytest.raises(clients.MisfitError, match=r"this worker has other programs .*magpend's kernel"):
         other(3)
 
 
@@ -151,14 +150,14 @@ def test_workers__other_files(tmp_path, scheduler_file, worker):
 
 @pytest.mark.slow
 def test_sees(tmp_path, monkeypatch):
-    monkeypatch.setattr(probe, "_LATE_S", 0.3)
+    monkeypatch.setattr(clients, "_LATE_S", 0.3)
     place, key = str(tmp_path), "commits/.probe.tmp"
-    assert probe.sees(place, key, "token") == "does not see it (No such file or directory)"
+    assert clients.sees(place, key, "token") == "does not see it (No such file or directory)"
     (tmp_path / "commits").mkdir()
     (tmp_path / key).write_text("another")
-    assert probe.sees(place, key, "token") == "sees another one by that name"
+    assert clients.sees(place, key, "token") == "sees another one by that name"
     (tmp_path / key).write_text("token")
-    assert probe.sees(place, key, "token") == ""
+    assert clients.sees(place, key, "token") == ""
     assert [path.name for path in (tmp_path / "commits").iterdir()] == [".probe.tmp"]
 
 

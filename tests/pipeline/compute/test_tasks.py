@@ -24,7 +24,6 @@ from pipeline.compute.execute import run_tasks
 from pipeline.compute.order import Order, TaskFailedError
 from pipeline.compute.processes import Processes
 from pipeline.compute.threads import in_threads, writing_results
-from pipeline.plots.style import limits
 from pipeline.runs import blocks
 from pipeline.runs.derive import AnalysedRun, derive
 from tests.pipeline.factories import wait_for
@@ -310,7 +309,7 @@ def test_workers__tasks_that_hang(faulty, scheduler, tmp_path, monkeypatch):
     # tasks that do not hang have all the time that a busy machine takes for them
     hangs = {2: 1, 4: 100}
     limit = lambda self, index, tries: 1.5 if tries <= hangs.get(index, 0) else 600.0  # noqa: E731
-    monkeypatch.setattr(limits.Limits, "limit_s", limit)
+    monkeypatch.setattr(Limits, "limit_s", limit)
     task = partial(faulty.hanging, str(tmp_path), unlucky=(2,), poison=(4,))
     lines, found = [], []
     results = run_tasks(task, range(6), seconds=lambda i: 0.05, scheduler=scheduler(), echo=lines.append)
@@ -353,7 +352,7 @@ def test_limits__learn_from_what_finished():
     found.finished(0, 100.0)
     found.finished(1, 10.0)
     assert found.limit_s(2, 1) == 1000
-    assert Limits(lambda i: 0.1).limit_s(0, 1) == limits.LEAST_S
+    assert Limits(lambda i: 0.1).limit_s(0, 1) == dispatch.LEAST_S
     assert Limits(None).limit_s(0, 1) == float("inf")
 
 
