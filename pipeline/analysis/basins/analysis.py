@@ -165,8 +165,8 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
     ids
         Result of `match` or `identify` for the cube.
     options
-        By default the defaults of `BasinOptions`. See `numbers.binomial_interval` for the intervals,
-        `boundaries.basin_entropy` for the boxes, `boundaries.uncertainty_exponent` for the scaling, and
+        By default the defaults of `BasinOptions`. See `pipeline.analysis.intervals.binomial_interval` for the
+        intervals, `boundaries.basin_entropy` for the boxes, `boundaries.uncertainty_exponent` for the scaling, and
         `wada.wada_merge_test` for radius and metric.
     changes
         Fields of `BasinOptions`, used if `options` is None.
