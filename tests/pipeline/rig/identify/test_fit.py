@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -192,6 +193,39 @@ def test_fit_local__says_that_it_has_not_converged():
     problem = make_problem()
     fit = fit_local(problem, problem.start * 0.5, max_evaluations=2)
     assert not fit.converged
+
+
+def long_problem(weight):
+    """One record as three stretches, each continuing the one before."""
+    time = np.arange(321) * 0.05
+    x = motion(TRUTH, STARTS[0], time)[:, :1] + ZERO
+    x += 5 * NOISE * np.random.default_rng(8).normal(size=x.shape)
+    bounds = [0, 100, 210, 321]
+    pieces = []
+    for k, (a, b) in enumerate(pairwise(bounds)):
+        drive = Drive(np.full(9, 1 / FREQUENCY)).window(time[a], time[b - 1] + 0.05)
+        start = [1.5, 0.0] if k == 0 else [x[a, 0] - ZERO, (x[a + 2, 0] - x[a - 2, 0]) / 0.2]
+        pieces.append(Piece(0, 0, time[a:b] - time[a], x[a:b], np.array(start), drive, k - 1))
+    unknowns = tuple(Free(n, 1.05 * TRUTH[n], 0.0, 10.0) for n in TRUTH)
+    return Problem(
+        MODEL, MODEL.load(**TRUTH), unknowns, ("x",), tuple(pieces), np.array([NOISE]), continuity=weight, rtol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_fit_local__closes_the_gaps_as_their_weight_grows():
+    gaps = []
+    for weight in (0.01, 1.0, 100.0):
+        problem = long_problem(weight)
+        fit = fit_local(problem, problem.start)
+        assert fit.converged
+        ends = [
+            motion(dict(zip(TRUTH, fit.theta, strict=True)), fit.starts[k], np.append(p.time, p.time[-1] + 0.05), t)[-1]
+            for k, (p, t) in enumerate(zip(problem.pieces, (0.0, 5.0, 10.5), strict=True))
+        ]
+        gaps.append(max(np.abs(ends[k] - fit.starts[k + 1]).max() for k in range(2)))
+    assert gaps[0] > 1.5 * gaps[1] > 100 * gaps[2], gaps
+    assert gaps[2] < 1e-3
 
 
 def test_cut__leaves_each_stretch_its_own_drive():
