@@ -40,13 +40,13 @@ def copies(runs: Path, figures: Sequence[str] = (), *, smoke: bool = False) -> P
     from pipeline.explorer.copies.export import export_page
     from pipeline.report.reproduce import reproduce
     from pipeline.report.study import load_study
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
     done = reproduce(load_study("gallery"), runs, figures=figures, smoke=smoke, workers=0)
     folder = done.folder / "copies"
     folder.mkdir(exist_ok=True)
     for place in sorted((done.folder / "runs").iterdir()):
-        export_page(Run.open(place), folder / f"{place.name}.html", force=True)
+        export_page(RunDirectory.open(place), folder / f"{place.name}.html", force=True)
     return folder
 
 

@@ -80,6 +80,7 @@ def more_sections(
         final_state=cells.final_state,
         step_size=cells.next_step,
         extremes=cells.watched if quantities is not None else None,
+        return_time=cells.return_times if system.section is not None else None,
     )
 
 

@@ -1,7 +1,7 @@
 """Number what decides the bits of results. A number is raised when results change on purpose; golden bits tell when.
 
 Every run names these numbers, and is completed only by code with the same ones. So code may be moved, renamed and
-rewritten as long as the results stay the same to the last bit (``tests/core/test_golden_bits.py``).
+rewritten as long as the results stay the same to the last bit (``tests/pipeline/runs/test_golden_bits.py``).
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from magpend_core.models import LIBRARY, load_model
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import EQUILIBRIUM
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "examples"

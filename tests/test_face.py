@@ -15,19 +15,16 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib import pyplot as plt
-from matplotlib.legend import Legend
 
 import magpend
 from magpend._plots import Plots
 from pipeline.cli import reference
-from pipeline.plots import pixels, style
+from pipeline.plots import pixels
 from pipeline.plots.style import TARGET, Target
 from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
-from pipeline.runs import python
 from pipeline.runs.arguments import in_python
-from pipeline.runs.workflows import read_given
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 
@@ -132,7 +129,7 @@ def test_run__function_returns_the_run_with_methods(run):
     assert type(run) is magpend.Run
     assert magpend.Run.open(run) is run
     assert type(magpend.Run.open(str(run.directory))) is magpend.Run
-    assert inspect.signature(magpend.run) == inspect.signature(python.run)
+    assert "smoke" in inspect.signature(magpend.run).parameters
     assert "run.plot.lyapunov(" in repr(run)
     assert run.status().complete
     assert "20 of 20 cells" in str(run.status())
@@ -185,7 +182,7 @@ def test_errors__name_arguments_at_every_door(run, tmp_path, command):
         with pytest.raises(SpecError, match="low= must be less than high="):
             call(*(["branches"] if call == run.table else []), low=0.2, high=0.1)
     (tmp_path / "other").write_text("a file")
-    for given in (lambda out: magpend.run(RESONANCE, out), lambda out: magpend.Spec.read(RESONANCE).preview(out)):
+    for given in (lambda out: magpend.run(RESONANCE, out), lambda out: magpend.preview(RESONANCE, out)):
         with pytest.raises(RefusedError, match="give another out=") as caught:
             given(tmp_path / "other")
         assert "--" not in str(caught.value)
@@ -230,7 +227,7 @@ def test_extend__opens_the_wider_run(run, tmp_path):
 def test_zoom__is_a_specification_that_run_takes(run):
     notes = []
     table = run.zoom({"frequency": (0.2, 0.28)}, num=3, echo=notes.append)
-    spec, _, _ = read_given(table)
+    spec = magpend.Spec.read(table)
     np.testing.assert_allclose(spec.axes["frequency_hz"].array(), [0.2, 0.24, 0.28])
     assert "reaches beyond the old 0.18 to 0.26" in notes[0]
 
@@ -310,6 +307,19 @@ def test_plot__refuses_a_place_that_does_not_fit(run):
 
 
 @pytest.mark.slow
+def test_plot__shows_absent_cells_below_the_given_axes(run):
+    cube = run.cube().load()
+    cube["status"][0] = 0
+    _, ax = plt.subplots()
+    assert cube.magpend.plot.bifurcation(ax=ax) is ax
+    (strip,) = ax.child_axes
+    assert strip.get_xlim() == ax.get_xlim()
+    assert cube.magpend.counts()["pending"] == 4
+    whole = cube.magpend.plot.bifurcation()  # a strip is no panel
+    assert len(whole.figure.axes) == 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bifurcation", "lyapunov", "convergence", "gallery", "attractors"])
 def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
     """What is not passed on to the caller's figure would not be seen."""
@@ -326,34 +336,12 @@ def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
 
 
 @pytest.mark.slow
-def test_plot__shows_absent_cells_below_the_given_axes(run):
-    cube = run.cube().load()
-    cube["status"][0] = 0
-    _, ax = plt.subplots()
-    assert cube.magpend.plot.bifurcation(ax=ax) is ax
-    (strip,) = ax.child_axes
-    assert strip.get_xlim() == ax.get_xlim()
-    assert cube.magpend.counts()["pending"] == 4
-    whole = cube.magpend.plot.bifurcation()  # a strip is no panel
-    assert len(whole.figure.axes) == 2
-
-
-@pytest.mark.slow
 def test_plot__counts_points_on_pixels_as_fine_as_in_files(run, monkeypatch):
     """The image of many points does not depend on the resolution of the screen."""
     monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     monkeypatch.setitem(plt.rcParams, "figure.dpi", 72.0)
     (shown,), (kept,) = run.plot.bifurcation().images, magpend.figure(run, "bifurcation").axes[0].images
     np.testing.assert_allclose(shown.get_array().shape, kept.get_array().shape, rtol=0.02)  # texts differ by pixels
-
-
-def test_legend_inside__keeps_the_first():
-    ax = style.new_figure(3.0, xr.Dataset()).add_subplot()
-    line = ax.plot([0, 1], [0, 1], label="a")
-    style.legend_inside(ax, [*line, *ax.plot([1], [1], label="b")])
-    style.legend_inside(ax, line)
-    legends = [artist for artist in ax.get_children() if isinstance(artist, Legend)]
-    assert sorted(len(legend.get_texts()) for legend in legends) == [1, 2]
 
 
 # ---- Datasets -----------------------------------------------------------------------------------

@@ -11,11 +11,11 @@ import re
 import pytest
 
 from pipeline.products.registry import ANALYSES, FIGURES
-from pipeline.report.runs import command_of
+from pipeline.report.report import command_of
 from pipeline.report.study import load_study
-from pipeline.runs.workflows import find_spec, shipped_workflows
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.files import find_spec, shipped_workflows
 from pipeline.specification.problems import validated
+from pipeline.specification.spec import Spec
 from tests.programs import ROOT, program
 
 PAGES = ROOT / "docs" / "gallery"
@@ -48,7 +48,7 @@ def test_gallery__specification_names_paper_figure_and_number(name):
     assert all(line.startswith("#") for line in head.splitlines())
     for word in ("Paper:", "Figure:", "Number:"):
         assert word in head, word
-    load_spec(path, smoke=True)
+    Spec.read(path, smoke=True)
     assert STUDY.table.runs[name].spec == path.name
     # claims are bounded, and their options exist
     figure = FIGURE[name]

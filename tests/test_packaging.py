@@ -20,7 +20,7 @@ import pytest
 import yaml
 
 from magpend_core.models import model_names
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.slow
@@ -113,7 +113,7 @@ def test_wheel__is_installed_without_a_network_and_runs(built, tmp_path):
     code = (
         "import magpend, magpend_core, pipeline, workflows, sys\n"
         "print(*(m.__path__[0] for m in (magpend, magpend_core, pipeline, workflows)), sep='\\n')\n"
-        "from pipeline.runs.workflows import shipped_workflows; print(len(shipped_workflows()))\n"
+        "from pipeline.specification.files import shipped_workflows; print(len(shipped_workflows()))\n"
         "import pipeline.cli.main, pipeline.report, pipeline.explorer\n"
         "from magpend_core.models import model_names; print(len(model_names()))\n"
     )

@@ -38,6 +38,9 @@ try:
     app(["--help"])
 except SystemExit:
     pass"""
+OPTIONS = """\
+from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, FIGURES
+assert all(p.options for r in (ANALYSES, CELL_PRODUCTS, FIGURES) for p in r.values())"""
 
 
 @pytest.mark.slow
@@ -50,10 +53,11 @@ except SystemExit:
             "import pipeline.plots",
             "numba zarr dask distributed matplotlib.pyplot pipeline.compute.execute pipeline.store.run",
         ),
+        (OPTIONS, "numba numpy xarray zarr dask matplotlib"),
         # the accessor is there once both are imported
         (ACCESSOR, ""),
     ],
-    ids=["magpend", "help", "plots", "accessor"],
+    ids=["magpend", "help", "plots", "options", "accessor"],
 )
 def test_imports__are_light(code, heavy):
     said = fresh_python(f"import sys\n{code}\nprint([m for m in {heavy.split()!r} if m in sys.modules])").stdout

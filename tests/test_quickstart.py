@@ -11,16 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import pipeline
 from magpend_core import Status
 from magpend_core.engine import lanes
 from magpend_core.models.pendulum.sides import Side
 from pipeline.analysis.sides import classify
-from pipeline.runs.workflows import shipped_workflows
-
-ROOT = Path(__file__).parents[1]
+from pipeline.specification.files import shipped_workflows
+from tests.programs import ROOT, program
 
 # see tests/core/data/README.md for where these points come from
 ORBITS = json.loads((Path(__file__).parent / "core" / "data" / "orbits.json").read_text("utf-8"))
@@ -69,21 +67,12 @@ def test_quickstart__complete(directory, ds):
     assert set(ds.direction.values) == {"up", "down"}
 
 
-def differing(one: Path, other: Path) -> float:
-    """Share of the pixels of two pictures that differ by more than a shade; 1 if their sizes differ."""
-    with Image.open(one) as a, Image.open(other) as b:
-        if a.size != b.size:
-            return 1.0
-        shades = np.abs(np.asarray(a.convert("RGB"), int) - np.asarray(b.convert("RGB"), int)).max(axis=-1)
-    return float((shades > 32).mean())
-
-
 @pytest.mark.slow
 def test_quickstart__the_docs_show_this_run(directory):
     """The README's picture is what its command draws. An older kernel's differs in 7 % of its pixels."""
     made = directory / "figures" / "bifurcation_psi1.png"
-    stale = differing(ROOT / "docs" / "quickstart.png", made)
-    assert stale < 0.005, "docs/quickstart.png is stale; make it with: magpend run quickstart --plot"
+    stale = program("docs/run_tutorials.py").is_stale(ROOT / "docs" / "quickstart.png", made)
+    assert not stale, "docs/quickstart.png is stale; make it with: magpend run quickstart --plot"
 
 
 @pytest.mark.slow

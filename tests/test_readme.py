@@ -6,17 +6,19 @@ import pkgutil
 import re
 import shlex
 import sys
+import tomllib
 
 import pytest
 from typer.main import get_command
 
 from pipeline.cli import main, reference
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from tests.programs import ROOT
 
+LATER = {"clients.py", "jobqueue.py"}
 README = (ROOT / "README.md").read_text("utf-8")
 PAGES = {page.relative_to(ROOT).as_posix(): page.read_text("utf-8") for page in reference.pages()}
 PAGES["CONTRIBUTING.md"] = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
@@ -36,9 +38,27 @@ def test_readme__example_finds_five_attractors(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "basins.png").is_file()
 
 
-def test_readme__fits_one_screen():
+def test_readme__fits_one_screen_and_leads_to_a_system_of_ones_own():
     assert len(README.splitlines()) <= 65
     assert "](docs/quickstart.png)" in README
+    links = re.findall(r"(?<!!)\[[^\]]+\]\(([^)]+)\)", README)
+    assert links[:2] == ["docs/python-start.md", "docs/own-system.md"]
+
+
+def test_install__names_extras_of_a_checkout_and_no_distribution_of_an_index():
+    """Messages of `clients.py` and `jobqueue.py` are written anew elsewhere."""
+    known = set(tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"])
+    modules = [path for path in (ROOT / "pipeline").rglob("*.py") if path.name not in LATER]
+    for text in (*PAGES.values(), *(path.read_text("utf-8") for path in modules)):
+        assert not re.search(r"pip install (-\S+ )*['\"]?magpend", text)
+    named = {
+        name
+        for text in PAGES.values()
+        for names in re.findall(r"pip install '\.\[([^\]]*)\]'", text)
+        for name in names.split(",")
+    }
+    assert named
+    assert named <= known
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import graphlib
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from magpend_core.models.text.views import DEFAULT_PRESET
 ROOT = Path(__file__).parents[1]
 PIPELINE = sorted((ROOT / "pipeline").rglob("*.py"))
 CORE = sorted((ROOT / "magpend_core").rglob("*.py"))
-MAX_FUNCTION, MAX_MODULE = 60, 480
+MAX_FUNCTION, MAX_MODULE, MAX_IMPORTS = 60, 640, 25
+LEAST_MODULE = 60
+"""Lines below which a module that one other alone imports is a fragment of it."""
 
 # every model as text has a preset of the name that is left out, which is a common word
 PRESETS = "|".join(sorted({p for name in model_names() for p in load_model(name).preset_names} - {DEFAULT_PRESET}))
@@ -40,6 +43,16 @@ KNOWS_A_PART = {
 """Files, or folders of them, that may name one part of one model, and why."""
 
 LONG_MODULES = {"magpend_core/engine/lanes.py": "the engine's template: one compiled unit"}
+
+DOORS = {"pipeline.cli.main": "lists the commands", "pipeline.face.magpend._runs": "lists the analyses"}
+"""Modules that may import more than `MAX_IMPORTS` others."""
+
+LEAVES = {
+    "magpend_core.models.text.runtime": "what generated code calls",
+    "magpend_core.models.text.writing": "the inverse of reading",
+    "pipeline.explorer.notebook": "is imported where the packages of the widget are missing",
+}
+"""Short modules with one importer that have an idea of their own."""
 
 
 def name_of(path: Path) -> str:
@@ -91,14 +104,36 @@ def test_tolerances__of_the_analyses_stand_in_one_table():
     assert [name_of(path) for path in others if own.search(path.read_text("utf-8"))] == []
 
 
-@pytest.mark.slow
-def test_imports__make_no_circle():
-    """Imports inside functions and for types count too."""
+@pytest.fixture(scope="module")
+def graph():
+    """Which modules each module imports; imports inside functions and for types count too."""
     modules = {module_of(path): path for path in (*PIPELINE, *CORE)}
-    graph: dict[str, set[str]] = {}
-    for name, path in modules.items():
-        graph[name] = set(imported_by(path, modules)) - {name}
+    return {name: set(imported_by(path, modules)) - {name} for name, path in modules.items()}
+
+
+@pytest.mark.slow
+def test_imports__make_no_circle(graph):
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError with the circle
+
+
+@pytest.mark.slow
+def test_modules__import_few_others(graph):
+    assert {name for name, others in graph.items() if len(others) > MAX_IMPORTS} == set(DOORS)
+
+
+@pytest.mark.slow
+def test_modules__are_no_fragments_of_their_one_importer(graph):
+    named = "".join(path.read_text("utf-8") for path in PIPELINE)
+    importers = Counter(name for others in graph.values() for name in others)
+    # a declaration names the module of its functions
+    alone = {name for name, n in importers.items() if n == 1 and not re.search(rf'"{name}[":]', named)}
+    short = {name for name in alone if lines_of(name) < LEAST_MODULE}
+    assert short == set(LEAVES)
+
+
+def lines_of(module: str) -> int:
+    path = ROOT / module.replace(".", "/")
+    return len((path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text("utf-8").splitlines())
 
 
 def module_of(path: Path) -> str:

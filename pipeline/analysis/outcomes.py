@@ -95,6 +95,8 @@ def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
 def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the 95 % Wilson interval of basin fractions from cell counts; NaN where the fraction is 0.
 
+    The analysis of basins has intervals at any level, see `pipeline.analysis.basins.numbers.basin_rows`.
+
     Parameters
     ----------
     count, share

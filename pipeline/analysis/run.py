@@ -1,4 +1,4 @@
-"""Define which parts of a run the analyses use."""
+"""Define which parts of a run analyses and figures use."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, Protocol
 import xarray as xr
 
 from magpend_core.models.model import Model
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 
-class Run(Protocol):
-    """The parts of a run that analyses use: specification, model, result cube and other analyses."""
+class OpenRun(Protocol):
+    """The parts of a run that analyses and figures use: specification, model, record, cube and analyses."""
 
     @property
     def spec(self) -> Spec:
@@ -24,7 +24,18 @@ class Run(Protocol):
 
     @property
     def echo(self) -> Callable[[str], None]:
-        """Function with which an analysis prints a line of text."""
+        """Function that prints a line for the user."""
+
+    @property
+    def info(self) -> Any:
+        """Record of the run (``run.json``)."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of the run's stored cells."""
+
+    def of(self, source: str) -> OpenRun:
+        """Open another run by its source, such as a run directory."""
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
         """Return the result cube of the run: a Dataset of all cells."""

@@ -30,18 +30,10 @@ _LAST_SHIFT = np.uint64(31)
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometry of the state space: which states are angles, and the scale of each state.
+    """Geometry of the state space: which states are angles, and the scale of each state."""
 
-    Attributes
-    ----------
-    is_angle : tuple of bool
-        Whether each component is an angle.
-    scales : tuple of float
-        Change of each component that counts as 1 [the states' units].
-    """
-
-    is_angle: tuple[bool, ...]
-    scales: tuple[float, ...]
+    is_angle: tuple[bool, ...]  # whether each component is an angle
+    scales: tuple[float, ...]  # change of each component that counts as 1 [the states' units]
 
     @classmethod
     def of(cls, owner: System | Model) -> Geometry:

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Classifier, Parameters
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
 
 UNKNOWN = 0

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.ragged import SET, dims_of, index_of_rows, is_ragged
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.products.product import padded
 
 FEW_POINTS = 6

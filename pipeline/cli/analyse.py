@@ -7,11 +7,10 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.analysing import show
 from pipeline.cli.common import Csv, Directory, Json, check_csv
 from pipeline.cli.groups import Groups, add_command, command_group, made, registry_group
 from pipeline.cli.options import taking
-from pipeline.cli.running import ClusterFile, Scheduler, Workers
+from pipeline.cli.running import ClusterFile, Scheduler, Workers, show
 
 
 def _groups() -> Groups:

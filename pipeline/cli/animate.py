@@ -15,7 +15,7 @@ from pipeline.cli.simulate import Frequency, ModelName, read_states
 
 if TYPE_CHECKING:
     from pipeline.runs.filming import Start
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
 
 def animate(
@@ -69,13 +69,13 @@ def animate(
     --frequency, --preset and --set choose. Give a start by the model's names: --NAME VALUE, or --NAME-deg VALUE
     for an angle or its rate; other states are 0. A periodic motion gives a film without a jump. MP4 needs ffmpeg.
     """
-    from pipeline.plots.files import save_data
-    from pipeline.plots.films import film_problems, save_animation
+    from pipeline.plots.animation import film_problems, save_animation
+    from pipeline.plots.figure import save_data
     from pipeline.runs.filming import animation
     from pipeline.specification.problems import SpecError
     from pipeline.store.files import FIGURES
     from pipeline.store.local import make_folder, refuse_links, unwritable
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
     words = list(context.args)
     if directory is not None and directory.startswith("--"):  # not a directory, but the first state's option
@@ -85,7 +85,7 @@ def animate(
     clock = {"seconds": seconds, "fps": fps, "speed": speed, "size": size, "portrait": portrait}
     options: dict[str, Any] = {k: v for k, v in clock.items() if v is not None}
     options |= {"at": points, "nearest": nearest, "degrees": degrees}
-    run = None if directory is None else Run.open(directory)
+    run = None if directory is None else RunDirectory.open(directory)
     target = out or _place(run, points, attractor, cell)
     problems = _contradictions(directory, points, attractor, cell, start)
     problems += film_problems(target, 25.0 if fps is None else fps)
@@ -155,7 +155,7 @@ def _contradictions(
     return problems
 
 
-def _place(run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
+def _place(run: RunDirectory | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
     if run is None:
         return Path("animation.gif")
     files = run.info.files

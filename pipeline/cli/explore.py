@@ -1,14 +1,16 @@
-"""Define ``magpend explore DIR``, which shows a run on an interactive page in a browser."""
+"""Define ``magpend explore`` and ``export``: the interactive page of a run in a browser, and as files."""
 
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pipeline.cli import console
 from pipeline.cli.common import Directory
+from pipeline.cli.options import FORCE
 
 
 def explore(
@@ -27,8 +29,7 @@ def explore(
     run and changes nothing. It shows the results of analyses that you have run. From another machine, tunnel
     the port: ssh -L PORT:127.0.0.1:PORT
     """
-    from pipeline.explorer.serving.browser import browser
-    from pipeline.explorer.serving.server import serve
+    from pipeline.explorer.server import browser, serve
 
     def serving(address: str) -> None:
         console.at_rest()
@@ -37,3 +38,50 @@ def explore(
 
     with contextlib.nullcontext() if no_browser else browser() as opened:
         serve(directory, port, echo=serving, opened=opened, curves=curves or None)
+
+
+def export(
+    directory: Directory,
+    page: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="One file that opens by a double click. Default: NAME.html."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT", help="Folder for a static web host instead, with the whole cube, loaded on demand."
+        ),
+    ] = None,
+    force: FORCE = False,
+    quantity: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Additional quantity of the model for the vertical axis.")
+    ] = None,
+    orbits: Annotated[int, typer.Option(min=0, help="Largest number of orbits to integrate and include.")] = 2000,
+    megabytes: Annotated[float, typer.Option(min=1, max=100, help="Largest size of the single file [MB].")] = 20.0,
+) -> None:
+    """Write the interactive page of a run as files that need no magpend server, to send or publish.
+
+    The files hold the diagram, its overlays and the orbits of attractors, but no live integration. Parts that
+    do not fit into one file are left out, and the page names them.
+    """
+    from pipeline.explorer.copies.export import export_folder, export_page
+    from pipeline.specification.problems import SpecError
+    from pipeline.store.run import RunDirectory
+
+    if page is not None and folder is not None:
+        raise SpecError("--page and --folder: give one of them.")
+    if page is not None and page.suffix.lower() not in (".html", ".htm"):
+        raise SpecError(f"--page {page}: the suffix must be .html.")
+    run, wanted = RunDirectory.open(directory), quantity or []
+    with console.progress("exporting"):
+        if folder is not None:
+            written = export_folder(run, folder, force=force, quantities=wanted, most_orbits=orbits)
+        else:
+            target = page or Path(f"{Path(run.name).resolve().name}.html")
+            written = export_page(
+                run, target, force=force, quantities=wanted, most_orbits=orbits, most_bytes=round(megabytes * 1e6)
+            )
+    for sentence in written.sentences:
+        console.note(f"note: {sentence}")
+    where = written.path / "index.html" if folder is not None else written.path
+    console.result(f"page: {where} ({written.size / 1e6:.1f} MB, {written.orbits:,} orbits)")

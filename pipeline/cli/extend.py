@@ -52,7 +52,7 @@ def extend(
     time: the same command continues. Without --out the old run is kept as DIR.before.
     """
     from pipeline.runs import extend as extending
-    from pipeline.runs.widen import Widening
+    from pipeline.runs.zoom import Widening
 
     changes: dict[str, Any] = {
         "axes": _axes(axis or []),

@@ -39,7 +39,7 @@ identify_app = command_group(
 
 
 def _identifications() -> Iterable[str]:
-    from pipeline.runs.workflows import shipped_identifications
+    from pipeline.specification.files import shipped_identifications
 
     return shipped_identifications()
 
@@ -84,12 +84,12 @@ def check(
 
     Only the initial states of a recording's pieces are fitted. Orbits are compared with the computed branches.
     """
-    from pipeline.rig.identify.check_orbits import is_table
+    from pipeline.rig.identify.validation import is_table
 
     if is_table(recording):
         _check_orbits(directory, recording, as_json)
         return
-    from pipeline.rig.identify import check as checking
+    from pipeline.rig.identify import validation as checking
     from pipeline.rig.identify.reports import judgement_lines
 
     found = checking.check(directory, recording, like=like)
@@ -132,8 +132,7 @@ def posterior(
     With --mcmc the draws come from a chain, whose convergence figures are printed. DIR keeps the chain: the same
     command goes on with a stopped one, and with more --steps it gets longer.
     """
-    from pipeline.rig.identify.posterior import Sampling
-    from pipeline.rig.identify.posterior_files import write_posterior
+    from pipeline.rig.identify.posterior import Sampling, write_posterior
 
     sampling = Sampling(walkers, steps, spec) if mcmc else None
     parameters, bifurcations, written = write_posterior(
@@ -163,8 +162,8 @@ def spread(
 
 
 def _check_orbits(directory: Path, table: Path, as_json: str | None) -> None:
-    from pipeline.rig.identify.check_orbits import check_orbits
-    from pipeline.rig.identify.orbit_reports import orbit_lines
+    from pipeline.rig.identify.measured_orbits import orbit_lines
+    from pipeline.rig.identify.validation import check_orbits
 
     found = check_orbits(directory, table)
     lines = []
@@ -181,7 +180,7 @@ def compare(
     csv: Csv = None,
 ) -> None:
     """Compare identifications by their errors on held-out pieces or orbits; the best one comes first."""
-    from pipeline.rig.identify.comparison import compare as comparing
+    from pipeline.rig.identify.validation import compare as comparing
 
     check_csv(csv)
     tell(comparing(directories), csv, as_json)

@@ -17,10 +17,8 @@ import typer
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.animate import animate
 from pipeline.cli.common import CommandError
-from pipeline.cli.console import EnoughError, visible
-from pipeline.cli.exits import Exit
-from pipeline.cli.explore import explore
-from pipeline.cli.export import export
+from pipeline.cli.console import EnoughError, Exit, visible
+from pipeline.cli.explore import explore, export
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup, add_command
 from pipeline.cli.identify import identify_app
@@ -33,9 +31,8 @@ from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
 from pipeline.cli.report import report
 from pipeline.cli.reproduce import reproduce
-from pipeline.cli.running import run, status, verify
+from pipeline.cli.running import run, status, submit, verify
 from pipeline.cli.simulate import EXTRA, simulate
-from pipeline.cli.submit import submit
 from pipeline.cli.zoom import zoom
 
 MOST_SAID, MOST_LINE = 2000, 600

@@ -103,8 +103,7 @@ def steps(
 
     Motions are classified, for example by side, with the preset's parameters.
     """
-    from pipeline.rig.measured.measuring import measure
-    from pipeline.rig.measured.tables import steps_table
+    from pipeline.rig.measured.diagram import measure, steps_table
 
     _check_targets(None, csv)
     mappings = _load(recordings, mapping)
@@ -121,8 +120,8 @@ def diagram(
 ) -> None:
     """Draw the measured bifurcation diagram, alone or with a run's diagram on the same axes."""
     from pipeline.plots import Frame
+    from pipeline.rig.measured.diagram import measure
     from pipeline.rig.measured.figures import plot_measured
-    from pipeline.rig.measured.measuring import measure
     from pipeline.runs.derive import refused
 
     _check_targets(out)
@@ -159,11 +158,10 @@ def compare(
     comparison.png, beside.png, over.png, steps.csv, edges.csv and comparison.nc to FOLDER.
     """
     from pipeline.plots import Frame
-    from pipeline.rig.measured.compare import compare_with
+    from pipeline.rig.measured.comparison import compare_with, edges_table, summary_lines
     from pipeline.rig.measured.computed import Computed, cube_and_parameters
-    from pipeline.rig.measured.measuring import measure
-    from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
-    from pipeline.rig.measured.writing import write_comparison
+    from pipeline.rig.measured.diagram import measure, steps_table
+    from pipeline.rig.measured.figures import write_comparison
     from pipeline.runs.derive import AnalysedRun, refused
 
     _check_targets(None, csv)
@@ -200,7 +198,7 @@ def series(
 ) -> None:
     """Draw a recording and the model from the same state: time series and phase portraits."""
     from pipeline.plots import Frame
-    from pipeline.rig.measured.overlays import plot_series
+    from pipeline.rig.measured.figures import plot_series
     from pipeline.rig.measured.series import series_of
     from pipeline.runs.derive import refused
 
@@ -242,10 +240,10 @@ def branch(
     Lists amplitude, frequency and their scatter over the cycles. With --over also the computed orbit of the same
     stability, the error in per cent, and the distance in units of the scatter.
     """
-    from pipeline.rig.measured_branch.comparison import amplitudes, branch_table, compare
-    from pipeline.rig.measured_branch.figure import plot_branch
-    from pipeline.rig.measured_branch.reading import read_branch
-    from pipeline.runs.workflows import find_spec
+    from pipeline.rig.measured.branch import branch_table, compare, read_branch
+    from pipeline.rig.measured.branch_computed import amplitudes
+    from pipeline.rig.measured.branch_figure import plot_branch
+    from pipeline.specification.files import find_spec
 
     _check_targets(out, csv)
     path = find_spec(source)

@@ -9,7 +9,7 @@ import typer
 
 from pipeline.cli import console
 from pipeline.cli.common import Json, tell_data
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.models import all_of, described
 from pipeline.cli.options import completing

@@ -44,8 +44,8 @@ def show(
     reads them as states of the model, checks them, and with --out draws them. The exit code is 0 whatever the
     findings are.
     """
-    from pipeline.rig.recordings.formats import read_raw
     from pipeline.rig.recordings.overview import describe_file
+    from pipeline.rig.recordings.reading import read_raw
     from pipeline.specification.problems import SpecError
 
     if out is not None:
@@ -93,7 +93,7 @@ def simulate(
 ) -> None:
     """Simulate a recording of an experiment, and write it with the mapping file that reads it."""
     from pipeline.rig.recordings.writing import SUFFIXES, write_raw
-    from pipeline.rig.simulation import load_rig, simulated
+    from pipeline.rig.virtual import load_rig, simulated
     from pipeline.specification.files import check_new_file
     from pipeline.specification.problems import SpecError
 
@@ -125,7 +125,7 @@ def drive(
 
     The command prints frequency, jitter and duty cycle. With edges, the model gives shape and amplitude.
     """
-    from pipeline.rig.driving import drive_file
+    from pipeline.rig.drive_file import drive_file
     from pipeline.specification.files import check_new_file
 
     check_new_file(out, (".csv",))

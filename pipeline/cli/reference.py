@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.specification.words import bounds_in_words, default_in_words
+from pipeline.specification.table_methods import bounds_in_words, default_in_words
 
 Row = tuple[str, str]
 ROOT = Path(__file__).parents[2]
@@ -136,7 +136,7 @@ def _options(command: Any) -> list[Row]:
 
 def exit_codes() -> str:
     """Return the Markdown table of the exit codes of all commands."""
-    from pipeline.cli.exits import Exit
+    from pipeline.cli.console import Exit
 
     return table(("code", "meaning"), ((str(int(code)), code.sentence) for code in Exit))
 
@@ -178,7 +178,7 @@ def _text(text: str) -> str:
 
 def workflows() -> str:
     """Return the Markdown table of the specifications that ship with magpend."""
-    from pipeline.runs.workflows import shipped_identifications, shipped_workflows
+    from pipeline.specification.files import shipped_identifications, shipped_workflows
 
     def title(path: Path) -> str:
         return str(tomllib.loads(path.read_text("utf-8")).get("title", ""))
@@ -232,8 +232,7 @@ def specification() -> str:
 def identification() -> str:
     """Return Markdown tables of the keys of the TOML file that describes an identification."""
     from pipeline.rig.identify import specification as tables
-    from pipeline.rig.identify.orbit_tables import BifurcationTable, OrbitsTable
-    from pipeline.rig.identify.unknowns import Identified
+    from pipeline.rig.identify.specification import BifurcationTable, Identified, OrbitsTable
 
     parts = [
         ("[identify] NAME = {...}", Identified, "NAME is a parameter of the model."),
@@ -277,20 +276,20 @@ def mapping() -> str:
 
 def findings() -> str:
     """Return the Markdown table of the defects that are searched for in recordings."""
-    from pipeline.rig.recordings.findings import KINDS
+    from pipeline.rig.recordings.channels import KINDS
 
     return table(("finding", "meaning"), ((f"`{kind}`", meaning) for kind, meaning in KINDS.items()))
 
 
 def virtual_rig() -> str:
     """Return Markdown tables of the keys of the TOML file that describes a virtual experiment."""
-    from pipeline.rig import simulation
+    from pipeline.rig import virtual
 
     parts = [
-        _keys("RIG.toml", simulation.RigTable, "", ("drive", "sensors")),
-        _keys("[drive]", simulation.DriveTable, 'Or `drive = "none"`.', ()),
-        _keys("sweep = {...}", simulation.SweepTable, "In `[drive]`.", ()),
-        _keys("[sensors.STATE]", simulation.SensorTable, "", ()),
+        _keys("RIG.toml", virtual.RigTable, "", ("drive", "sensors")),
+        _keys("[drive]", virtual.DriveTable, 'Or `drive = "none"`.', ()),
+        _keys("sweep = {...}", virtual.SweepTable, "In `[drive]`.", ()),
+        _keys("[sensors.STATE]", virtual.SensorTable, "", ()),
     ]
     return "\n\n".join(parts)
 
@@ -406,7 +405,7 @@ def public() -> str:
 def measured_branch() -> str:
     """Return Markdown tables of the keys that describe measured branches, and a virtual rig under control."""
     from pipeline.rig.control import ControlTable
-    from pipeline.rig.measured_branch.reading import MeasuredBranch, RecordedOrbit
+    from pipeline.rig.measured.branch import MeasuredBranch, RecordedOrbit
 
     parts = [
         _keys(

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.cli.options import completing
 from pipeline.cli.outputs import check_place
 

@@ -1,27 +1,35 @@
-"""Define ``magpend run``, ``magpend status`` and ``magpend verify``."""
+"""Define ``magpend run``, ``submit``, ``status`` and ``verify``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.analysing import show
-from pipeline.cli.common import Directory, Json, tell
-from pipeline.cli.exits import Exit
+from pipeline.cli.common import Json, tell, tell_data
+from pipeline.cli.outputs import check_file
+
+if TYPE_CHECKING:
+    from pipeline.compute.clients import Where
+
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from pipeline.cli.common import Directory
+from pipeline.cli.console import Exit
 from pipeline.cli.options import completing
 from pipeline.cli.plot import draw
 
 if TYPE_CHECKING:
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
 
 def workflow_names() -> Iterable[str]:
     """Return the names of the workflows (specifications) that ship with magpend."""
-    from pipeline.runs.workflows import shipped_workflows
+    from pipeline.specification.files import shipped_workflows
 
     return shipped_workflows()
 
@@ -85,10 +93,10 @@ def run(
     above 1 % a warning reports them.
     """
     from pipeline.compute.clients import Where
-    from pipeline.runs import outcome, preview
+    from pipeline.runs import preview
     from pipeline.runs import run as runs
     from pipeline.runs.derive import analyses_in
-    from pipeline.store.run import Run
+    from pipeline.runs.status import summary, warning
 
     analyses = analyses_in(analyse)
     if posterior is not None:
@@ -97,7 +105,7 @@ def run(
     if dry_run:
         console.result(*preview.describe_plan(spec, out, workers=workers, smoke=smoke))
         return
-    state = runs.run(
+    done = runs.run(
         spec,
         out,
         workers=workers,
@@ -107,10 +115,9 @@ def run(
         smoke=smoke,
         echo=console.note,
     )
-    done = Run.open(state.files)
-    console.result(f"cube: {state.files.below('cube.zarr').name}")
-    console.result(*outcome.summary(done))
-    if text := outcome.warning(done):
+    console.result(f"cube: {done.info.files.below('cube.zarr').name}")
+    console.result(*summary(done))
+    if text := warning(done):
         console.LOG.warning(text)
     where = Where(scheduler, cluster, dashboard)
     for name in analyses:
@@ -127,7 +134,7 @@ def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke
     console.result(f"runs: {folder}; their bifurcations: magpend identify spread {folder} --branches")
 
 
-def _plot(run: Run) -> None:
+def _plot(run: RunDirectory) -> None:
     """Draw the figure that shows a finished run best; if it cannot be drawn, print the reason."""
     from pipeline.products.registry import FIGURES
     from pipeline.runs.preview import figure_command, shown
@@ -181,3 +188,80 @@ def verify(
     console.result(*verification.describe(found, directory, repaired=repair))
     if not (found.sound or (repair and not found.skeleton)):
         raise typer.Exit(Exit.DAMAGED)
+
+
+def show(
+    directory: str,
+    name: str,
+    options: Any,
+    workers: int | None,
+    where: Where,
+    csv: str | None = None,
+    json: str | None = None,
+) -> None:
+    """Compute an analysis, or read it if it is stored, and print its table."""
+    from pipeline.products.product import function_of
+    from pipeline.products.registry import ANALYSES
+    from pipeline.runs.derive import derive
+    from pipeline.specification.problems import SpecError
+
+    ds = derive(directory, name, options, echo=console.note, workers=workers, scheduler=where)
+    table = function_of(ANALYSES[name].table)(ds)
+    if table.nothing:
+        raise SpecError(f"{directory}: {table.nothing}")
+    tell(table, csv, json)
+    if "source" in ds.encoding:
+        console.note(f"stored: {ds.encoding['source']}")
+
+
+def submit(
+    spec: Spec,
+    out: Out = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHICH",
+            help="slurm, pbs, torque, sge or lsf, or a TOML file whose table [cluster] describes a job. Default: "
+            "$MAGPEND_CLUSTER, or the batch system whose commands are here.",
+        ),
+    ] = None,
+    job: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--job", metavar="KEY=VALUE", help="Change a key of [cluster], such as walltime=02:00:00; several times."
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Explain the jobs and print their files; create and send nothing.")
+    ] = False,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the job file to FILE, and send nothing.")
+    ] = None,
+    smoke: Smoke = False,
+    analyse: Analyses = "",
+    json: Json = None,
+) -> None:
+    """Submit a specification as a job of SLURM, PBS, Torque, Grid Engine or LSF, and print commands to watch and cancel
+    the job.
+
+    What is not given is chosen: the batch system whose commands are here, its default queue, and cores, memory
+    and time by the measured work. The job continues where an earlier one was stopped.
+    """
+    from pipeline.runs import submit as sending
+    from pipeline.specification.problems import SpecError
+
+    if dry_run and write is not None:
+        raise SpecError("--dry-run and --write FILE: give one of them; --dry-run creates nothing.")
+    if write is not None:
+        check_file(write, "--write")
+    prepared = sending.prepare(spec, out, cluster, job or [], smoke=smoke, analyse=analyse)
+    if dry_run:
+        tell_data(sending.as_data(prepared), sending.explain(prepared), json)
+    elif prepared.complete:
+        tell_data(sending.as_data(prepared), [f"{prepared.name} is complete; nothing to send."], json)
+    elif write is not None:
+        sending.write(prepared, write)
+        tell_data(sending.as_data(prepared), sending.written(prepared, str(write)), json)
+    else:
+        sent = sending.send(prepared)
+        tell_data(sending.as_data(sent), sending.brief(sent), json)

@@ -33,18 +33,12 @@ class SchedulerError(Exception):
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a dask scheduler, with the setting from which it was read.
-
-    Attributes
-    ----------
-    source : str
-        Source of the address, for messages: the option, a variable, or a file.
-    """
+    """Address of a dask scheduler, with the setting from which it was read."""
 
     scheme: str
     host: str
     port: int
-    source: str
+    source: str  # source of the address, for messages: the option, a variable, or a file
 
     @property
     def url(self) -> str:
@@ -58,13 +52,7 @@ class Address:
 
 
 def read_address(text: str, source: str) -> Address:
-    """Read the address of a dask scheduler, such as ``tcp://host:8786``, or from the scheduler's JSON file.
-
-    Raises
-    ------
-    SpecError
-        If the text or the file has no address.
-    """
+    """Read the address of a dask scheduler, such as ``tcp://host:8786``, or from the scheduler's JSON file."""
     if text.lower().endswith(".json"):
         return _from_file(Path(text))
     match = _ADDRESS.fullmatch(text.strip())
@@ -103,10 +91,7 @@ def _from_file(path: Path) -> Address:
 def security_of(address: Address) -> Any:
     """Return dask's TLS settings for an encrypted address; None for a plain connection.
 
-    Raises
-    ------
-    SchedulerError
-        If ``tls://`` is asked for and there are no keys, or they cannot be read.
+    Raise `SchedulerError` if ``tls://`` is asked for and there are no keys, or they cannot be read.
     """
     if address.scheme != "tls":
         return None
@@ -126,13 +111,7 @@ def security_of(address: Address) -> Any:
 
 
 def ask(address: Address) -> None:
-    """Raise SchedulerError unless a dask scheduler answers at an address within seconds.
-
-    Raises
-    ------
-    SchedulerError
-        If none answers; the message says what is there instead.
-    """
+    """Raise `SchedulerError`, with what is there instead, unless a scheduler answers within seconds."""
     security = security_of(address)
     _knock(address)
     found: dict[str, Any] = {}

@@ -19,9 +19,44 @@ from functools import partial
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.compute.limits import Limits
 from pipeline.compute.order import Order, why
 from pipeline.compute.threads import Task
+
+# ---- limits of the run time ------------------------------------------------------------------------
+
+LEAST_S = 60.0
+"""Least limit of any task [s]."""
+
+FACTOR = 10.0
+"""Limit of a task in units of its estimate times the worst ratio so far of a task's time to its estimate."""
+
+SHORT_S = 1.0
+"""Shorter tasks are not compared with their estimates, since starting dominates their time [s]."""
+
+MORE = 2.0
+"""Factor of the limit from one try of a task to the next."""
+
+
+class Limits:
+    """Limits of the run time of tasks, from estimated times on one core [s], if there are any, and measured ones."""
+
+    def __init__(self, seconds: Callable[[int], float] | None) -> None:
+        self._seconds = seconds
+        self._worst = 1.0
+
+    def finished(self, index: int, took_s: float) -> None:
+        """Record how long a finished task took, to correct the estimates for the others."""
+        if self._seconds is not None and took_s > SHORT_S:
+            self._worst = max(self._worst, took_s / max(self._seconds(index), 1e-9))
+
+    def limit_s(self, index: int, tries: int) -> float:
+        """Return the time after which a task is given up [s]; it is longer for each further try."""
+        if self._seconds is None:
+            return float("inf")
+        return max(LEAST_S, FACTOR * self._worst * self._seconds(index)) * MORE ** (tries - 1)
+
+
+# ---- tasks in flight -------------------------------------------------------------------------------
 
 WINDOW = 3
 """Tasks in flight (submitted, not finished) per worker thread."""
@@ -63,18 +98,8 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 class Window:
     """Sends the tasks of an `Order` to the workers of a dask client, with a limited number of tasks at a time.
 
-    Parameters
-    ----------
-    client
-        Dask client.
-    task
-        Function that computes the task with a given index; it must be importable on the workers.
-    order
-        Queue of the tasks, which says when each may start.
-    seconds
-        Function that returns the estimated time of a task on one core [s], from its index.
-    echo
-        Function that prints a line on a problem that the window has dealt with.
+    The task's function must be importable on the workers. `seconds` estimates the time of a task on one core [s];
+    `echo` prints a line on a problem that the window has dealt with.
     """
 
     def __init__(
@@ -102,12 +127,8 @@ class Window:
     def results(self) -> Iterator[dict[str, Any]]:
         """Yield the results of tasks in the order in which the tasks finish.
 
-        Raises
-        ------
-        TaskFailedError
-            As soon as so many tasks have failed that the cause cannot lie in single tasks.
-        SchedulerError
-            If the scheduler is gone.
+        Raise `TaskFailedError` as soon as so many tasks have failed that the cause cannot lie in single tasks, and
+        `SchedulerError` if the scheduler is gone.
         """
         self._client.subscribe_topic(self._topic, self._on_start)
         self._look()
@@ -122,9 +143,7 @@ class Window:
             self._fill()
 
     def _fill(self) -> None:
-        """Send ready tasks to the workers until enough are in flight. At the end, send failed tasks again, one at a
-        time.
-        """
+        """Send ready tasks until enough are in flight; at the end send failed tasks again, one at a time."""
         wanted = WINDOW * max(self._n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:

@@ -52,7 +52,7 @@ def run_tasks(
         done.
     seconds
         Estimated time of a task on one core [s]. A dask worker that takes far longer (see
-        `pipeline.compute.limits`) is restarted, and its task runs elsewhere.
+        `pipeline.compute.dispatch`) is restarted, and its task runs elsewhere.
     workers
         Number of threads or processes of this machine, by default of its cores; 0 runs in the calling thread.
     scheduler
@@ -79,8 +79,8 @@ def run_tasks(
         with contextlib.closing(Processes(task)) as processes:
             yield from in_threads(processes, indices, after, order, n_workers)
     else:
+        from pipeline.compute.clients import Fitting
         from pipeline.compute.dispatch import Window
-        from pipeline.compute.probe import Fitting
 
         with connected(where, echo) as client:
             yield from Window(client, Fitting(task), order, seconds=seconds, echo=echo).results()

@@ -20,18 +20,8 @@ SIGMA = 5.0
 def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     """Compute the Lyapunov exponents of the cells of a task, with their errors and quality flags.
 
-    Parameters
-    ----------
-    job
-        The cells as they were integrated.
-    options
-        Options of the product.
-
-    Returns
-    -------
-    dict
-        Arrays with leading dims (branch, point). A cell without an attractor (diverged, step limit,
-        unreached) has NaN and the flag ``ABSENT``.
+    Arrays have leading dims (branch, point). A cell without an attractor (diverged, step limit, unreached) has NaN and
+    the flag ``ABSENT``.
     """
     cells, inputs, integration = job.cells, job.inputs, job.spec.integration
     branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))

@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.specification.batch_systems import SYSTEMS, TORQUE_RESOURCES
-from pipeline.specification.clusters import Cluster, hours_and_minutes, refuse_breaks
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.specification.clusters import SYSTEMS, TORQUE_RESOURCES, Cluster, hours_and_minutes, refuse_breaks
+from pipeline.specification.problems import SpecError, import_extra
 
 JOB_NAME = "magpend-worker"
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
@@ -25,13 +23,7 @@ _TARGET = "0.1 s"
 
 
 def check_means(cluster: Cluster) -> None:
-    """Raise SpecError unless batch jobs can be submitted from this machine.
-
-    Raises
-    ------
-    SpecError
-        If an extra is not installed or a command is not found; the message names it.
-    """
+    """Raise `SpecError` unless batch jobs can be submitted from this machine; it names the missing extra or command."""
     import_extra("dask_jobqueue", "cluster", cluster.kind)
     command = SYSTEMS[cluster.kind].send[0]
     if not shutil.which(command):
@@ -51,20 +43,7 @@ def jobs_folder(place: str) -> Path:
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
-    """Return the keyword arguments with which dask-jobqueue starts jobs on a cluster.
-
-    Parameters
-    ----------
-    cluster
-        Description of a job.
-    folder
-        Folder for the job logs.
-
-    Raises
-    ------
-    SpecError
-        If the folder or Python has a line break or another control character in its name.
-    """
+    """Return the keyword arguments with which dask-jobqueue starts jobs on a cluster, with logs in `folder`."""
     refuse_breaks((str(folder), cluster.python or sys.executable))
     account = "project" if cluster.kind in ("sge", "lsf") else "account"
     time = cluster.walltime if cluster.kind != "lsf" else hours_and_minutes(cluster.walltime_s)
@@ -99,18 +78,6 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
 
     The scheduler's address and the folder of its keys are known only when the coordinator runs; words in capital
     letters stand for them.
-
-    Parameters
-    ----------
-    cluster
-        Description of a job.
-    folder
-        Folder for the job logs.
-
-    Raises
-    ------
-    SpecError
-        If dask-jobqueue is not installed.
     """
     dask_jobqueue = import_extra("dask_jobqueue", "cluster", cluster.kind)
     from distributed import Security
@@ -157,14 +124,8 @@ def _keys(folder: Path) -> Any:
 def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]) -> Iterator[Any]:
     """Start a dask cluster whose workers are batch jobs, and yield it; stop it at the end of the context.
 
-    Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`,
-    readable by their owner alone, until the cluster ends. Others on the network can neither read nor send
-    anything.
-
-    Raises
-    ------
-    SchedulerError
-        If the scheduler cannot be started.
+    Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`, readable by their
+    owner alone, until the cluster ends. Others on the network can neither read nor send anything.
     """
     import dask_jobqueue
 

@@ -58,17 +58,7 @@ def why(error: BaseException) -> str:
 class Order:
     """Queue of tasks. Each task waits for its predecessor, and tasks that begin long chains come first.
 
-    Parameters
-    ----------
-    indices
-        All tasks.
-    after
-        The predecessor of a task, or None; one that is not among `indices` is done.
-
-    Raises
-    ------
-    ValueError
-        If tasks wait for one another in a circle.
+    A predecessor that is not among `indices` is done.
     """
 
     def __init__(self, indices: Sequence[int], after: Predecessor | None = None) -> None:
@@ -126,10 +116,7 @@ class Order:
     def failed(self, index: int, reason: str) -> None:
         """Record that a task failed; it is tried again after all other tasks.
 
-        Raises
-        ------
-        TaskFailedError
-            If so many failed that trying each again makes no sense.
+        Raise `TaskFailedError` if so many failed that trying each again makes no sense.
         """
         first = index not in self._failed
         self._failed[index] = reason
@@ -144,12 +131,6 @@ class Order:
             raise TaskFailedError(self._failed, note=note + "command continues when the cause is removed.")
 
     def close(self) -> None:
-        """Raise TaskFailedError if tasks failed twice.
-
-        Raises
-        ------
-        TaskFailedError
-            If failed tasks are left.
-        """
+        """Raise `TaskFailedError` if tasks failed twice."""
         if self._failed:
             raise TaskFailedError(self._failed, self._left - len(self._failed))

@@ -63,13 +63,7 @@ class Processes:
         self._is_closed = False
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Run the task in the process of this thread.
-
-        Raises
-        ------
-        ProcessError
-            If it fails there, or the process dies.
-        """
+        """Run the task in the process of this thread; raise `ProcessError` if it fails there, or the process dies."""
         process: _Process = getattr(self._own, "process", None) or self._start()
         try:
             result, reason = process.ask(self._task, index)
@@ -105,9 +99,7 @@ class Processes:
 
 
 def serve() -> NoReturn:
-    """Run tasks in this process until its standard input ends: a pickled task and an index each, answered by the result
-    and the reason of a failure.
-    """
+    """Answer pickled tasks with their index by the result and the reason of a failure, until the input ends."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a task prints must not get among the answers
     logging.disable()  # the process that sends the tasks says the same

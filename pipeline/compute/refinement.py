@@ -51,29 +51,18 @@ Integrate = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 @dataclass
 class Orbits:
-    """Periodic orbits found so far in a block of cells, numbered in the order in which they were found.
+    """Periodic orbits found so far in a block of cells, numbered in the order in which they were found."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Largest scaled distance between sections of one orbit.
-    system : System
-        Gives scales and circles of the states.
-    """
-
-    tolerance: float
-    system: System
+    tolerance: float  # largest scaled distance between sections of one orbit
+    system: System  # gives scales and circles of the states
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the number of the periodic orbit on which each cell ends; -1 (`NO_ORBIT`) if it has not closed on one.
 
-        Parameters
-        ----------
-        cells
-            `section`, shape (cell, n_keep, n_states) [SI], `status`, `orbit_period` and `turns`, shape
-            (cell, angle). Orbits are the same if their sections are the same cyclic sequence within the
-            tolerance and their turns are equal.
+        Cells have `section`, shape (cell, n_keep, n_states) [SI], `status`, `orbit_period` and `turns`, shape (cell,
+        angle). Orbits are the same if their sections are the same cyclic sequence within the tolerance and their turns
+        are equal.
         """
         section, period = cells["section"], cells["orbit_period"]
         # a model without angles has no turns
@@ -104,28 +93,12 @@ class Orbits:
 def infer(
     shape: tuple[int, ...], stride: int, integrate: Integrate, *, closure_tolerance: float, system: System
 ) -> dict[str, np.ndarray]:
-    """Return all variables of a block of initial conditions. Only cells near basin boundaries are integrated; the
-    others are inferred.
+    """Return all variables of a tile of initial conditions, in flat order. Only cells near basin boundaries are
+    integrated.
 
-    Parameters
-    ----------
-    shape
-        Cells of the tile along each grid dim.
-    stride
-        Cells between those integrated first; a power of two.
-    integrate
-        From the flat indices of some cells to their variables, cells first: those of
-        `magpend_core.run_branches`.
-    closure_tolerance
-        Closure tolerance of the run, see `SAME`.
-    system
-        System to integrate.
-
-    Returns
-    -------
-    dict
-        Arrays over all cells in flat order. An inferred cell has the status ``INFERRED``, no work, and
-        all that says where it ends (section, period, turns, exponents) from the first corner of its box.
+    `stride`, a power of two, is the distance of the cells integrated first. `integrate` gives the variables of
+    `magpend_core.run_branches` for the flat indices of some cells. An inferred cell has the status ``INFERRED``, no
+    work, and all that says where it ends (section, period, turns, exponents) from the first corner of its box.
     """
     orbits = Orbits(SAME * closure_tolerance, system)
     values: dict[str, np.ndarray] = {}
@@ -148,23 +121,11 @@ def infer(
 
 
 def refine(shape: tuple[int, ...], stride: int, classes_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Choose the cells of a block to integrate. Return for each cell the integrated cell from which it takes its
+    """Choose the cells of a tile to integrate. Return for each cell the flat index of the one from which it takes its
     result.
 
-    Parameters
-    ----------
-    shape
-        Cells along each dim, one dim or more.
-    stride
-        Cells between those integrated first.
-    classes_of
-        From flat indices of cells, in rising order and each cell once, to their classes: whole numbers,
-        negative where a cell stands for no other.
-
-    Returns
-    -------
-    ndarray of int, `shape`
-        Flat index of the cell whose result a cell takes; its own if it is integrated.
+    `classes_of` gives for flat indices of cells, in rising order and each cell once, their classes: whole numbers,
+    negative where a cell stands for no other.
     """
     known = np.full(int(np.prod(shape)), NOT_COMPUTED)
     boxes = _first_boxes(shape, stride)
@@ -211,9 +172,7 @@ def _halves(boxes: np.ndarray) -> np.ndarray:
 
 
 def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Group boxes of cells by their size. Yield each group's row numbers, and the flat indices of its cells (box,
-    cell).
-    """
+    """Group boxes by their size; yield each group's row numbers, and the flat indices of its cells (box, cell)."""
     first = np.ravel_multi_index(tuple(boxes[:, 0].T), shape)
     extents, which = np.unique(boxes[:, 1] - boxes[:, 0], axis=0, return_inverse=True)
     for i, extent in enumerate(extents):
@@ -223,9 +182,7 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each box whether all integrated cells in it and beside it end on one orbit, so that it need not be
-    halved.
-    """
+    """Return for each box whether all integrated cells in it and beside it end on one orbit."""
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -237,9 +194,7 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each cell the cell from which it takes its result: itself if it was integrated, else a corner of its
-    box.
-    """
+    """Return for each cell the one whose result it takes: itself if it was integrated, else a corner of its box."""
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Sections, Status
-from pipeline.compute.continuation import WALKED, going_on
-from pipeline.compute.integrate import Integrate, Job, integrate, watched_quantities
+from pipeline.compute.integrate import WALKED, Integrate, Job, going_on, integrate, watched_quantities
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.run import Run
+from pipeline.store.reading import read_block
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run
-from pipeline.store.task_cells import read_block
 
 Origin = tuple[str, str]
 """Directory and digest of a run that cells are taken from."""
@@ -41,18 +41,10 @@ ABSENT = (Status.PENDING, Status.INFERRED)
 
 @dataclass
 class Source:
-    """An earlier run from which a new run copies cells.
+    """An earlier run from which a new run copies cells."""
 
-    Attributes
-    ----------
-    run : Run
-        The run, with the tasks that were committed when it was opened.
-    wanted : Spec
-        Specification of the run that takes its cells.
-    """
-
-    run: Run
-    wanted: Spec
+    run: RunDirectory  # the run, with the tasks that were committed when it was opened
+    wanted: Spec  # specification of the run that takes its cells
     finder: Finder = field(init=False)
     names: list[str] = field(init=False)
     missing: list[str] = field(init=False)
@@ -81,9 +73,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read stored cells of this run. Return which of them can be used (integrated and undamaged), and their
-        variables.
-        """
+        """Read stored cells; return which of them were integrated and are undamaged, and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -104,9 +94,7 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the number of the task that contains each cell; for cells not in this run, a number beyond the last
-        task.
-        """
+        """Return the task that contains each cell; a number beyond the last task for cells not in this run."""
         plan = self.run.plan
         steps = np.unravel_index(np.maximum(place, 0), plan.shape)
         places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))
@@ -118,7 +106,7 @@ class Source:
         return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
 
 
-def same_products(run: Run, wanted: Spec) -> list[str]:
+def same_products(run: RunDirectory, wanted: Spec) -> list[str]:
     """Return those products of a specification that a run has already computed with the same options and version."""
     versions = numbered(run.info.identity)["versions"]
     return [
@@ -128,16 +116,8 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
     ]
 
 
-def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
-    """Return the reasons why a new run cannot copy the cells of an earlier run; an empty list if it can.
-
-    Parameters
-    ----------
-    run
-        Run whose cells may be copied.
-    wanted, identity
-        Specification and identity of the run that would copy them.
-    """
+def obstacles(run: RunDirectory, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
+    """Return the reasons why a new run, with its specification and identity, cannot copy the cells of another one."""
     lines = unlike(run.info.identity, identity)
     if line := _no_extension(run.spec, wanted):
         lines.append(line)
@@ -166,17 +146,9 @@ def _no_extension(old: Spec, new: Spec) -> str:
 
 
 class Pool:
-    """Earlier runs from which a new run copies cells.
+    """Earlier runs from which a new run copies cells; the first one that has a cell provides it."""
 
-    Parameters
-    ----------
-    spec
-        Specification of the run that takes the cells.
-    runs
-        Runs that hold cells; the first one that has a cell provides it.
-    """
-
-    def __init__(self, spec: Spec, runs: Sequence[Run]) -> None:
+    def __init__(self, spec: Spec, runs: Sequence[RunDirectory]) -> None:
         self.spec = spec
         self.sources = [Source(run, spec) for run in runs]
 
@@ -287,24 +259,14 @@ def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], name
 
 @lru_cache(maxsize=2)
 def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
-    """Open the earlier runs from which a run copies cells, once per worker.
+    """Open the earlier runs from which the run in a directory copies cells, once per worker.
 
-    Parameters
-    ----------
-    directory, digest
-        The run that takes them.
-    sources
-        The others.
-
-    Raises
-    ------
-    RefusedError
-        If a directory holds another run now.
+    Raise `RefusedError` if a directory holds another run now.
     """
     runs = []
     for place, expected in sources:
-        run = Run.open(place)
+        run = RunDirectory.open(place)
         if run.info.digest != expected:
             raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
         runs.append(run)
-    return Pool(kept_spec(read_run(directory).spec), runs)
+    return Pool(Spec.parse(read_run(directory).spec, KEPT), runs)

@@ -13,18 +13,8 @@ from pipeline.products.rotation import ROTATION_VARIABLES, RotationFlag, Rotatio
 def rotation(job: Job, options: RotationOptions) -> dict[str, np.ndarray]:
     """Compute the rotation numbers of the cells of a task, with their errors and quality flags.
 
-    Parameters
-    ----------
-    job
-        The cells as they were integrated.
-    options
-        Options of the product, completed for the model.
-
-    Returns
-    -------
-    dict
-        Arrays with dims (branch, point). A cell without an attractor (diverged, step limit, unreached) has NaN
-        and the flag ``ABSENT``.
+    Arrays have dims (branch, point). A cell without an attractor (diverged, step limit, unreached) has NaN and the flag
+    ``ABSENT``.
     """
     cells, inputs, integration = job.cells, job.inputs, job.spec.integration
     branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,21 +17,20 @@ import numpy as np
 from magpend_core import Status
 from magpend_core.engine.threads import using_threads
 from magpend_core.models import import_model
-from pipeline.compute.continuation import WALKED, going_on
-from pipeline.compute.integrate import Integrate, integrate
+from pipeline.compute.integrate import WALKED, Integrate, going_on, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences, identity_of
+from pipeline.layout.identity import differences, identity_of, numbered
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
+from pipeline.store.reading import read_cells
 from pipeline.store.runfile import RunInfo, read_run
-from pipeline.store.task_cells import read_cells
 
 _PREPARING = threading.Lock()
 """Lock for reading a run and those that it copies from: the first of its threads reads them for all."""
@@ -40,13 +38,11 @@ _PREPARING = threading.Lock()
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read the run that a task belongs to, once per process; raise RefusedError if this worker would compute other
-    results.
-    """
+    """Read the run of a task, once per process; raise `RefusedError` if this worker would compute other results."""
     if origin is not None:
         import_model(*origin)
     info = read_run(directory)
-    spec = kept_spec(info.spec)
+    spec = Spec.parse(info.spec, KEPT)
     plan = make_plan(spec)
     different = differences(numbered(info.identity), identity_of(spec, plan))
     if digest != info.digest or different:
@@ -67,14 +63,7 @@ def compute(
 ) -> dict[str, np.ndarray]:
     """Compute all variables of a block of cells, and return them in the block's shape.
 
-    Parameters
-    ----------
-    spec, cells, block
-        Specification, map of its cells, and the block to compute.
-    before
-        Variables of the last computed cells of branches that began in an earlier block.
-    integrate
-        Function that computes the cells.
+    `before` has variables of the last computed cells of branches that began in an earlier block.
     """
     inputs = cells.inputs(block)
     if before is not None:
@@ -104,20 +93,9 @@ def run_task(
 ) -> dict[str, Any]:
     """Compute one task of a run, and commit its results to the store.
 
-    Parameters
-    ----------
-    directory, digest, index
-        Run directory, digest of its identity, and number of the task.
-    origin
-        For a model given as a Python object: its place and folder, as named by the user who began the run.
-    sources
-        Directories and digests of runs from which cells are copied; see `compute.reuse`.
-
-    Returns
-    -------
-    dict
-        Task, cells, cells by status, and the seconds taken by the kernel and by writing; with `sources` how
-        many cells were taken.
+    `origin` is the place and folder of a model given as a Python object, as named by the user who began the run;
+    `sources` are directories and digests of runs from which cells are copied, see `compute.reuse`. Return task, cells,
+    cells by status, and the seconds taken by the kernel and by writing; with `sources` how many cells were taken.
     """
     with _PREPARING:
         info, spec, plan, cells = _prepare(directory, digest, origin)
@@ -142,9 +120,7 @@ def run_task(
 
 
 def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
-    """Read the states in which the preceding task left the branches of this task; an empty dict if there is no such
-    task.
-    """
+    """Read the states in which the preceding task, if there is one, left the branches of this task."""
     predecessor = plan.predecessor(index)
     if predecessor is None:
         return {}
@@ -161,9 +137,7 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return arguments for `compute`: a function ``integrate`` that copies cells from other runs, or none if there are
-    no such runs.
-    """
+    """Return, if there are `sources`, a function ``integrate`` for `compute` that copies cells from them."""
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of
@@ -187,5 +161,5 @@ def warm_up(spec: Spec) -> float:
         short = Inputs(short.parameters[:1, :1], short.frequency_hz[:1, :1], short.initial_states[:1])
     integration = spec.integration.model_copy(update={"n_transient": 0, "n_keep": 1})
     products = {name: CELL_PRODUCTS[name].shortest(options) for name, options in spec.products.items()}
-    integrate(replace(spec, integration=integration, products=products), short)
+    integrate(spec.replace(integration=integration, products=products), short)
     return time.perf_counter() - started

@@ -71,25 +71,12 @@ def writing_results() -> contextlib.AbstractContextManager[None]:
 def in_threads(
     task: Task, indices: Sequence[int], after: Predecessor | None, order: Order, n_threads: int
 ) -> Generator[dict[str, Any], None, None]:
-    """Run tasks on dask's threaded scheduler, and yield the results as they come.
+    """Run tasks on dask's threaded scheduler, and yield the results as they come; see
+    `pipeline.compute.execute.run_tasks`.
 
-    If the generator is closed or raises, no task writes anything after that, see `writing_results`.
-
-    Parameters
-    ----------
-    task
-        Function of an index.
-    indices, after
-        As for `pipeline.compute.execute.run_tasks`.
-    order
-        Books of the same tasks: failed ones are tried again alone, at the end.
-    n_threads
-        Number of threads.
-
-    Raises
-    ------
-    TaskFailedError
-        As soon as so many tasks have failed that the cause cannot lie in single tasks.
+    If the generator is closed or raises, no task writes anything after that, see `writing_results`. `order` has the
+    books of the same tasks: failed ones are tried again alone, at the end. Raise `TaskFailedError` as soon as so many
+    tasks have failed that the cause cannot lie in single tasks.
     """
     ended: SimpleQueue[dict[str, Any] | TaskFailedError | None] = SimpleQueue()
     gate, books = Gate(), threading.Lock()

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.models.drift.ramps import Motion, Ramp, motion_of
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
-from pipeline.motion.inputs import Inputs
-from pipeline.specification.parsing import Spec
+from pipeline.motion.steady import Inputs
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
 from pipeline.specification.tables import FREQUENCY, Range
 
@@ -40,22 +41,15 @@ class ParameterAxis:
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Initial states numbered by one flat index; a grid is stored as its axes, not as a table of all states.
+    """Initial states numbered by one flat index; a grid is stored as its axes, not as a table of all states."""
 
-    Attributes
-    ----------
-    dims, shape
-        Dims of the initial conditions in a sweep, and their sizes.
-    columns
-        Values of each state, in the model's units: one number for all, one value per row, or with `grid`
-        one value per step of the grid's dim.
-    grid
-        Index of each state's grid dim, None for a fixed state; None as a whole without a grid.
-    """
-
+    # dims of the initial conditions in a sweep, and their sizes
     dims: tuple[str, ...]
     shape: tuple[int, ...]
+    # values of each state, in the model's units: one number for all, one value per row, or with `grid` one value
+    # per step of the grid's dim
     columns: tuple[np.ndarray, ...]
+    # index of each state's grid dim, None for a fixed state; None as a whole without a grid
     grid: tuple[int | None, ...] | None = None
 
     def __len__(self) -> int:
@@ -287,3 +281,53 @@ class CellMap:
         values[down] = values[down, ::-1]
         grid = values.reshape(*others, sizes[self.path], *own)
         return np.ascontiguousarray(np.moveaxis(grid, len(others), self.path))
+
+
+def at_section(parameter: str) -> str:
+    """Return the name of the coordinate with a moving parameter's values at the sections."""
+    return f"{parameter}_at_section"
+
+
+def moving_coordinates(spec: Spec) -> list[Coordinate]:
+    """Return for each moving parameter its values at the stored sections, as a coordinate of the cube.
+
+    Its dims are the axes on which the parameter's motion depends, and the sections.
+    """
+    return [_coordinate(spec, ramp) for ramp in spec.ramps]
+
+
+def motion_over(spec: Spec, ramp: Ramp) -> tuple[tuple[ParameterAxis, ...], Motion, np.ndarray]:
+    """Return the axes on which a ramp depends, its motion at each of their points, and the drive's frequency there.
+
+    The points are in the order of the axes, the last axis varying fastest.
+    """
+    named = {FREQUENCY, ramp.parameter, *ramp.names}
+    axes = tuple(axis for axis in parameter_axes(spec) if axis.parameter in named)
+    points = np.meshgrid(*(axis.values for axis in axes), indexing="ij")
+    n = int(np.prod([len(axis.values) for axis in axes]))
+    values = {axis.parameter: grid.ravel() for axis, grid in zip(axes, points, strict=True)}
+
+    def value_of(name: str) -> np.ndarray:
+        return values[name] if name in values else np.full(n, spec.values[name])
+
+    frequency = values.get(FREQUENCY, np.full(n, np.nan if spec.frequency_hz is None else spec.frequency_hz))
+    return axes, motion_of(ramp, value_of, frequency), frequency
+
+
+def _coordinate(spec: Spec, ramp: Ramp) -> Coordinate:
+    axes, motion, frequency = motion_over(spec, ramp)
+    first, n_keep = spec.integration.n_transient + 1, spec.integration.n_keep
+    periods = np.arange(first, first + n_keep)
+    table = np.array([motion.at(i, periods / hz) for i, hz in enumerate(frequency)])
+    shape = tuple(len(axis.values) for axis in axes)
+    return Coordinate(
+        at_section(ramp.parameter),
+        (*(axis.dim for axis in axes), "period_index"),
+        table.reshape(*shape, n_keep),
+        _attrs(spec.model, ramp),
+    )
+
+
+def _attrs(model: Model, ramp: Ramp) -> dict[str, str]:
+    parameter = model.parameter(ramp.parameter)
+    return {"units": parameter.unit, "long_name": f"{parameter.meaning or parameter.name} at the section"}

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.layout.cells import InitialStates, initial_states, parameter_axes
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences
-from pipeline.motion.inputs import Inputs
+from pipeline.layout.identity import differences, numbered
+from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import NoiseTable
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 NOWHERE = -1
@@ -52,21 +51,11 @@ def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Way:
-    """Order in which a continuation visits its parameter values, and the position of a block of cells in this order.
+    """Order in which a continuation visits its parameter values, and the position of a block of cells in this order."""
 
-    Attributes
-    ----------
-    direction : str
-        ``"up"`` or ``"down"``.
-    values : ndarray
-        The whole path, in the order in which it is walked.
-    first : int
-        Number of points on the path before the block.
-    """
-
-    direction: str
-    values: np.ndarray
-    first: int
+    direction: str  # ``"up"`` or ``"down"``
+    values: np.ndarray  # the whole path, in the order in which it is walked
+    first: int  # number of points on the path before the block
 
 
 def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:

@@ -11,17 +11,21 @@ and downward branches are in different tasks.
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.layout.cells import CellMap
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
+from pipeline.products.product import Variable
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.products.variable import Variable
-from pipeline.specification.parsing import Spec
+from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 LEAST_LATTICE = 64
@@ -44,39 +48,20 @@ TASK_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class Plan:
-    """The plan of a run: cells, tasks and chunks, with estimates of size and time.
+    """The plan of a run: cells, tasks and chunks, with estimates of size and time."""
 
-    Attributes
-    ----------
-    kind : str
-        ``"sweep"`` or ``"continuation"``.
-    dims, shape : tuple
-        Cell dims of the cube, and their sizes.
-    path : int or None
-        Index of the dim that branches walk; None in a sweep.
-    block : tuple of int
-        Cells of a task, per dim.
-    variables : tuple of Variable
-        Variables of the cube.
-    sizes : dict
-        Sizes of the dims that are not cell dims.
-    seconds_per_cell : float
-        Estimated time on one core [s].
-    directions : tuple of str
-        Directions in which branches walk, each for an equal part of the branches; empty in a sweep.
-    seconds_at : ndarray or None
-        Estimated time of a cell on one core at each swept frequency [s]; None if it is not swept.
-    """
-
-    kind: str
+    kind: str  # ``"sweep"`` or ``"continuation"``
+    # cell dims of the cube, and their sizes
     dims: tuple[str, ...]
     shape: tuple[int, ...]
-    path: int | None
-    block: tuple[int, ...]
-    variables: tuple[Variable, ...]
-    sizes: Mapping[str, int]
-    seconds_per_cell: float
+    path: int | None  # index of the dim that branches walk; None in a sweep
+    block: tuple[int, ...]  # cells of a task, per dim
+    variables: tuple[Variable, ...]  # variables of the cube
+    sizes: Mapping[str, int]  # sizes of the dims that are not cell dims
+    seconds_per_cell: float  # estimated time on one core [s]
+    # directions in which branches walk, each for an equal part of the branches; empty in a sweep
     directions: tuple[str, ...] = ()
+    # estimated time of a cell on one core at each swept frequency [s]; None if it is not swept
     seconds_at: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -332,3 +317,128 @@ def _tile(shape: tuple[int, ...], stride: int, wanted: int) -> tuple[int, ...]:
         sides[least] = larger
     n_tiles = [max(1, (n + side // 2) // side) for n, side in zip(shape, sides, strict=True)]
     return tuple(min(n, -(-n // (k * stride)) * stride) for n, k in zip(shape, n_tiles, strict=True))
+
+
+MOST_BRANCHES = 10_000_000
+"""Most branches of a continuation. The cube keeps the initial state of each as coordinates."""
+
+MOST_CHUNK_BYTES = 2**31 - 1 - 16
+"""Most bytes that blosc can compress in one piece."""
+
+FILE_BYTES = 4096
+"""Most bytes that a file takes on a disk besides its content."""
+
+GO_ON = "MAGPEND_SPACE"
+"""Environment variable; ``0`` lets a run begin although the disk may be too small for it."""
+
+
+def check_plan(plan: Plan) -> None:
+    """Refuse a plan with too many tasks or branches, or with chunks that cannot be written.
+
+    Raises
+    ------
+    SpecError
+        If there is a problem; the message lists all of them.
+    """
+    problems = _task_problems(plan) + _chunk_problems(plan)
+    if plan.path is not None and plan.shape[-1] > MOST_BRANCHES:
+        problems.append(
+            f"initial_conditions: {plan.shape[-1]} branches; the limit is {MOST_BRANCHES}: begin from fewer "
+            'states, or set kind = "sweep".'
+        )
+    if problems:
+        raise SpecError(problems)
+
+
+def _task_problems(plan: Plan) -> list[str]:
+    if plan.n_tasks <= MOST_TASKS:
+        return []
+    cells = math.prod(plan.block)
+    wanted = math.ceil(cells / plan.n_points * plan.n_tasks / MOST_TASKS) if plan.path is None else 0
+    more = f"set execution.trajectories_per_task to {2 * wanted} or more" if wanted else "let tasks take more"
+    return [
+        f"execution: {plan.n_cells} cells in tasks of {cells} are {plan.n_tasks} tasks; the limit is "
+        f"{MOST_TASKS}: {more}, or use fewer cells."
+    ]
+
+
+def _chunk_problems(plan: Plan) -> list[str]:
+    problems = []
+    for variable in plan.variables:
+        chunk = plan.chunks(variable)
+        n_bytes = math.prod(chunk) * np.dtype(variable.dtype).itemsize
+        if n_bytes <= MOST_CHUNK_BYTES:
+            continue
+        cells = math.prod(chunk[: len(plan.shape)])
+        fitting = MOST_CHUNK_BYTES * cells // n_bytes
+        remedy = f"set execution.trajectories_per_task to {fitting} or less" if fitting else "keep less"
+        problems.append(
+            f"{variable.name}: {cells} cells of a task take {in_words(n_bytes)} in one piece; "
+            f"the limit of compression is {in_words(MOST_CHUNK_BYTES)}; {remedy}, or lower "
+            "integration.n_keep."
+        )
+    return problems
+
+
+def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> None:
+    """Refuse a run for which the disk may be too small.
+
+    Parameters
+    ----------
+    plan
+        Plan of the run.
+    folder
+        The run directory, which need not exist; None where the free space is unknown, as in an object
+        store.
+    n_cells
+        Number of cells that are still to be computed; by default all.
+
+    Raises
+    ------
+    SpecError
+        If bytes or files may be lacking, unless `GO_ON` is ``0``. The message states what is needed and what
+        is free.
+
+    Notes
+    -----
+    The compressed size of cells is not known beforehand. The check uses an upper bound: the uncompressed size
+    and `FILE_BYTES` per file.
+    """
+    if folder is None or os.environ.get(GO_ON) == "0":
+        return
+    share = 1.0 if n_cells is None else n_cells / plan.n_cells
+    n_files = math.ceil(share * plan.n_tasks * (len(plan.variables) + 1))
+    needed = math.ceil(share * plan.n_bytes) + n_files * FILE_BYTES
+    place = _nearest(folder)
+    free, files = shutil.disk_usage(place).free, _free_files(place)
+    lacking = []
+    if needed > free:
+        lacking.append(f"up to {in_words(needed)} (its cells before compression), and there are {in_words(free)}")
+    if files is not None and n_files > files:
+        lacking.append(f"{n_files} files, and there is room for {files}")
+    if lacking:
+        raise SpecError(
+            f"{folder}: the run needs {' and '.join(lacking)}; make room, give another --out, ask for less "
+            f"(cells, integration.n_keep), or set {GO_ON}=0 to go on as far as there is room."
+        )
+
+
+def _nearest(folder: Path) -> Path:
+    absolute = folder.absolute()
+    return next(place for place in (absolute, *absolute.parents) if place.exists())
+
+
+def _free_files(place: Path) -> int | None:
+    if not hasattr(os, "statvfs"):
+        return None
+    found = os.statvfs(place)
+    return found.f_favail if found.f_files else None
+
+
+def in_words(n_bytes: float) -> str:
+    """Format a number of bytes with a unit, such as ``1.5 GB``."""
+    units = ["bytes", "kB", "MB", "GB", "TB", "PB"]
+    while n_bytes >= 1000 and len(units) > 1:
+        n_bytes /= 1000
+        units.pop(0)
+    return f"{n_bytes:.3g} {units[0]}"

@@ -12,10 +12,9 @@ from dataclasses import replace
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.layout.period_names import periods_of
-from pipeline.products.product import Options
+from pipeline.layout.vocabulary import periods_of
+from pipeline.products.product import Options, Variable, flag_attrs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.products.variable import Variable, flag_attrs
 
 FORMAT = 3
 """Version of the run directory's layout."""

@@ -26,7 +26,6 @@ from pipeline.specification.tables import FREQUENCY
 if TYPE_CHECKING:
     import xarray as xr
 
-
 FREQUENCY_DIM = "frequency"
 """Dim of the drive frequency in a cube [Hz]."""
 
@@ -213,3 +212,41 @@ def parameters_of(ds: xr.Dataset) -> Parameters:
     if "parameters" not in ds.attrs:
         raise ValueError("The dataset has no attribute 'parameters'; it tells what was integrated.")
     return Parameters(model_of(ds), _values(ds, "parameters"))
+
+
+def letter(attractor: int) -> str:
+    """Return the letter of an attractor id: A to Z, then AA and so on; a dash for a negative id."""
+    if attractor < 0:
+        return "-"
+    text = ""
+    attractor += 1
+    while attractor:
+        attractor, digit = divmod(attractor - 1, 26)
+        text = chr(ord("A") + digit) + text
+    return text
+
+
+def period_of(model: Model | None) -> str:
+    """Return the word for the time between two section points: drive period, return or strobe period."""
+    if model is None:
+        return "drive period"
+    if model.crossing is not None:
+        return "return"
+    return "strobe period" if model.autonomous else "drive period"
+
+
+def periods_of(model: Model | None) -> str:
+    """Return the plural of the word that `period_of` returns."""
+    return f"{period_of(model)}s"
+
+
+def section_name(model: Model | None) -> str:
+    """Return the name of a model's section: stroboscopic or Poincar\u00e9."""
+    return "stroboscopic section" if model is None or model.crossing is None else "Poincar\u00e9 section"
+
+
+def once(model: Model | None) -> str:
+    """Return the phrase for the instants of section points, such as "once per drive period"."""
+    if model is None or model.crossing is None:
+        return f"once per {period_of(model)}"
+    return f"crossing of {model.crossing.sentence}"

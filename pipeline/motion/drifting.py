@@ -11,8 +11,7 @@ import numpy as np
 
 from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Parameters
-from pipeline.motion.inputs import Inputs
-from pipeline.motion.steady import Steady, Values
+from pipeline.motion.steady import Inputs, Steady, Values
 
 if TYPE_CHECKING:
     from magpend_core.models.drift.sections import Drift
@@ -21,21 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Drifting(Steady):
-    """Motion while parameters move.
+    """Motion while parameters move."""
 
-    Attributes
-    ----------
-    ramps : tuple of Ramp
-        How each parameter moves.
-    values : Parameters
-        Values of the parameters that are not swept.
-    corners : tuple of ndarray
-        Packed parameters and frequencies of cells at the ends of all axes.
-    """
-
-    ramps: tuple[Ramp, ...]
-    values: Parameters
-    corners: tuple[np.ndarray, np.ndarray]
+    ramps: tuple[Ramp, ...]  # how each parameter moves
+    values: Parameters  # values of the parameters that are not swept
+    corners: tuple[np.ndarray, np.ndarray]  # packed parameters and frequencies of cells at the ends of all axes
 
     kind: ClassVar[str] = "drifting"
     has_quantities: ClassVar[bool] = False  # the parameters are others at each section

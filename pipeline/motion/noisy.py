@@ -10,8 +10,7 @@ import numpy as np
 
 from magpend_core.models.noisy import NoisyModel
 from magpend_core.status import Status
-from pipeline.motion.inputs import Inputs
-from pipeline.motion.steady import Steady, Values
+from pipeline.motion.steady import Inputs, Steady, Values
 from pipeline.specification.noise import NoiseTable
 
 if TYPE_CHECKING:

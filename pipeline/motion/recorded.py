@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from pipeline.motion.inputs import Inputs
-from pipeline.motion.steady import Steady, Values
-from pipeline.specification.drive_files import TORQUE, RecordedDrive
+from pipeline.motion.steady import Inputs, Steady, Values
+from pipeline.specification.recorded_drive import TORQUE, RecordedDrive
 
 if TYPE_CHECKING:
     from magpend_core.sections import Sections

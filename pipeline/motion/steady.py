@@ -1,4 +1,4 @@
-"""Integrate cells at constant parameters, and define what the program asks of every kind of motion."""
+"""Define what the integration of cells begins with."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.motion.inputs import Inputs
 from pipeline.products.product import Analysis
 from pipeline.products.registry import ANALYSES
 from pipeline.specification.tables import Integration
@@ -18,6 +17,24 @@ from pipeline.specification.tables import Integration
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.sections import Sections
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Input arrays of `run_branches` for one task: parameters, frequencies and initial states of its branches."""
+
+    parameters: np.ndarray  # shape (branch, point, parameter)
+    frequency_hz: np.ndarray  # shape (branch, point)
+    initial_states: np.ndarray  # shape (branch, n_states)
+    # first step of each branch that continues an earlier task [s]; NaN for a branch that has ended. None for a task
+    # in which all branches begin, shape (branch,)
+    step_size: np.ndarray | None = None
+
+    def take(self, branches: Any) -> Inputs:
+        """Return the inputs of selected branches."""
+        step = None if self.step_size is None else self.step_size[branches]
+        return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step)
+
 
 Values = dict[str, np.ndarray]
 
@@ -48,18 +65,10 @@ NEEDS = {
 
 @dataclass(frozen=True)
 class Steady:
-    """Motion at constant parameters without noise: a state goes on in the same way whenever it is reached.
+    """Motion at constant parameters without noise: a state goes on in the same way whenever it is reached."""
 
-    Attributes
-    ----------
-    model : Model
-        Model that is integrated.
-    integration : Integration
-        The table ``[integration]``.
-    """
-
-    model: Model
-    integration: Integration
+    model: Model  # model that is integrated
+    integration: Integration  # the table ``[integration]``
 
     kind: ClassVar[str] = "steady"
     """The kind of motion that an `Analysis` is for."""

@@ -5,22 +5,16 @@ display is needed. `draw_figure` draws any figure of a run by name. `Frame` hold
 ranges of its axes.
 """
 
-from pipeline.plots.basins import plot_basins
+from pipeline.plots.basins import plot_basins, plot_manifolds
 from pipeline.plots.bifurcation import plot_bifurcation
-from pipeline.plots.branches import plot_branches
-from pipeline.plots.coexisting import plot_coexisting
+from pipeline.plots.branches import plot_branches, plot_multipliers
 from pipeline.plots.convergence import plot_convergence
-from pipeline.plots.curves import plot_curves
 from pipeline.plots.dimension import plot_dimension
-from pipeline.plots.exponent_map import plot_lyapunov_map
-from pipeline.plots.figure import draw_figure
-from pipeline.plots.files import save_data, save_figure
-from pipeline.plots.fractions import plot_fractions
+from pipeline.plots.figure import draw_figure, save_data, save_figure
+from pipeline.plots.fractions import plot_coexisting, plot_fractions
 from pipeline.plots.gallery import plot_gallery
-from pipeline.plots.lyapunov import plot_lyapunov
-from pipeline.plots.manifolds import plot_manifolds
-from pipeline.plots.multipliers import plot_multipliers
-from pipeline.plots.regimes import plot_regimes
+from pipeline.plots.lyapunov import plot_lyapunov, plot_lyapunov_map
+from pipeline.plots.regimes import plot_curves, plot_regimes
 from pipeline.plots.section import plot_section
 from pipeline.plots.style import DataFigure, Frame
 from pipeline.plots.trajectory import plot_trajectory

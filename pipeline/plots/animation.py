@@ -1,4 +1,4 @@
-"""Draw films of motions: the model's drawing, and phase portraits beside it.
+"""Draw films of motions (the model's drawing, and phase portraits beside it), and write them as GIF, WebP or MP4.
 
 The background is drawn once, and only the moving artists are drawn anew. So a frame takes a few milliseconds.
 """
@@ -6,17 +6,23 @@ The background is drawn once, and only the moving artists are drawn anew. So a f
 from __future__ import annotations
 
 import math
+import shutil
+import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image, features
 
 from magpend_core.models.model import Model
 from pipeline.layout.vocabulary import model_of
+from pipeline.layout.writing import temporary_beside, writing
 from pipeline.plots import labels, style
 from pipeline.plots.looks import MM
 from pipeline.plots.movers import Scene, Trail, moving_clock, moving_machine, moving_portrait
@@ -41,18 +47,10 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Animation:
-    """A film, whose frames are drawn when they are needed.
+    """A film, whose frames are drawn when they are needed."""
 
-    Attributes
-    ----------
-    figure : DataFigure
-        The figure; its `data` hold the numbers drawn.
-    movers : tuple
-        Moving parts; each places its artists for a given sample.
-    """
-
-    figure: style.DataFigure
-    movers: tuple[Any, ...]
+    figure: style.DataFigure  # the figure; its `data` hold the numbers drawn
+    movers: tuple[Any, ...]  # moving parts; each places its artists for a given sample
 
     @property
     def n_frames(self) -> int:
@@ -95,28 +93,10 @@ class Animation:
 def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800) -> Animation:
     """Lay out a film that shows one or more motions side by side.
 
-    Parameters
-    ----------
-    ds
-        Result of `pipeline.runs.instants.filmed`, with the attribute ``fps``.
-    degrees
-        Degrees for angles and their rates.
-    portrait
-        State whose phase portrait is shown. By default a single motion shows all portraits;
-        several motions show the model's first.
-    size
-        Width of a frame [pixels]; must be even for video encoders.
-
-    Returns
-    -------
-    Animation
-        Motions that repeat within the film show their whole path from the start. Other paths grow as the film
-        runs. Dots are section points.
-
-    Raises
-    ------
-    ValueError
-        If there is no portrait of that state, or degrees are asked for of a model without angles.
+    `ds` is from `pipeline.runs.instants.filmed`, with the attribute ``fps``; `size` is the width of a frame [pixels],
+    even for video encoders. By default a single motion shows all portraits, and several the model's first. Motions that
+    repeat within the film show their whole path from the start; other paths grow as the film runs. Dots are section
+    points. Raise ValueError if there is no portrait of that state, or degrees are asked for of a model without angles.
     """
     model = model_of(ds)
     pairs = portraits_of(model, portrait, ds.sizes["motion"], degrees)
@@ -225,9 +205,7 @@ class _Plan:
         return 2 * round(whole * SCREEN_DPI / 2) / SCREEN_DPI
 
     def boxes(self, k: int) -> list[Box]:
-        """Return the rectangles of the panels of motion `k`: the model's drawing if it has one, then phase
-        portraits.
-        """
+        """Return the rectangles of the panels of motion `k`: the model's drawing if it has one, then portraits."""
         return [self._box(*inches) for inches in (self._single() if self.n == 1 else self._column(k))]
 
     def _single(self) -> list[Box]:
@@ -263,3 +241,128 @@ def _title(fig: style.DataFigure, plan: _Plan, box: Box, text: str) -> None:
     lines = style.folded(text, room, fig.look.legend).split("\n")
     short = lines[0] if len(lines) == 1 else lines[0].rstrip(",:") + " \N{HORIZONTAL ELLIPSIS}"
     fig.text(box[0], box[1] + box[3] + 0.07 / plan.height, short, fontsize=fig.look.legend, va="bottom")
+
+
+FILM_SUFFIXES = (".gif", ".webp", ".mp4")
+MOST_GIF_FPS = 50.0
+"""GIF counts hundredths of a second, and programs that show it take 1 for "as slow as before"."""
+
+PALETTE_FRAMES, PALETTE_COLOURS = 8, 96
+
+
+def film_problems(path: Path, fps: float) -> list[str]:
+    """Return the reasons why a film cannot be written to a path, before anything is drawn."""
+    suffix = path.suffix.lower()
+    if suffix not in FILM_SUFFIXES:
+        return [f"{path}: the suffix must be one of {', '.join(FILM_SUFFIXES)}."]
+    problems = []
+    if path.is_dir():
+        problems.append(f"{path}: is a folder; name a file in it.")
+    if suffix == ".gif" and fps > MOST_GIF_FPS:
+        problems.append(f"{fps:g} frames a second: a GIF has at most {MOST_GIF_FPS:g}; take fewer, or write .webp.")
+    if suffix == ".webp" and not features.check("webp"):
+        problems.append(f"{path}: this Pillow was built without WebP; write .gif, or install another Pillow.")
+    if suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        problems.append(f"{path}: MP4 takes the program ffmpeg, and there is none; install it, or write .gif.")
+    return problems
+
+
+def save_animation(film: Animation, path: str | Path) -> Path:
+    """Write a film as GIF, WebP or MP4; the suffix of the path decides.
+
+    GIF and WebP loop for ever. The file appears only when it is complete; an existing file is replaced.
+
+    Parameters
+    ----------
+    film
+        The film.
+    path
+        File to write; the folder must exist.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be written, or the format does not take the film; see `film_problems`.
+    OSError
+        If ffmpeg fails.
+    """
+    path = Path(path)
+    if problems := film_problems(path, film.fps):
+        raise ValueError(" ".join(problems))
+    part = temporary_beside(path).with_suffix(path.suffix)  # both writers go by the suffix
+    write = {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[path.suffix.lower()]
+    try:
+        with writing(path):
+            write(film, part)
+            part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _about(film: Animation) -> str:
+    attrs = film.figure.data.attrs
+    return "magpend; " + "; ".join(
+        f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest")
+    )
+
+
+def durations(n: int, fps: float, grain_ms: int) -> list[int]:
+    """Return the duration of each frame of a film [ms]: multiples of `grain_ms` that add up to the film's length."""
+    ends = np.round(np.arange(n + 1) * (1000.0 / fps / grain_ms)).astype(int)
+    return [int(d) * grain_ms for d in np.diff(ends)]
+
+
+def _gif(film: Animation, path: Path) -> None:
+    palette = _palette(film)
+    images = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film.frames())
+    comment = _about(film).encode("utf-8")[:250]
+    _save(film, path, images, 10, optimize=False, disposal=1, comment=comment)
+
+
+def _webp(film: Animation, path: Path) -> None:
+    images = (Image.fromarray(frame) for frame in film.frames())
+    _save(film, path, images, 1, quality=75, method=4, xmp=_about(film).encode("utf-8"))
+
+
+def _save(film: Animation, path: Path, images: Iterator[Image.Image], grain_ms: int, **options: Any) -> None:
+    duration = durations(film.n_frames, film.fps, grain_ms)
+    next(images).save(path, save_all=True, append_images=images, loop=0, duration=duration, **options)
+
+
+def _palette(film: Animation) -> Image.Image:
+    """Compute one colour palette for all frames, from a sample of the frames."""
+    chosen = np.unique(np.linspace(0, film.n_frames - 1, PALETTE_FRAMES).astype(int))
+    frames = np.vstack([f for k, f in enumerate(islice(film.frames(), int(chosen[-1]) + 1)) if k in chosen])
+    inked = frames[(frames != 255).any(axis=-1)]
+    # keep the background pure white: quantisation would average it with nearly white pixels
+    found = Image.fromarray(inked[None]).quantize(PALETTE_COLOURS - 1, Image.Quantize.MEDIANCUT)
+    palette = Image.new("P", (1, 1))
+    colours = np.array((found.getpalette() or [])[: 3 * (PALETTE_COLOURS - 1)]).reshape(-1, 3)
+    # no palette colour may be so near to white that the rough search picks it for white
+    kept = colours[(colours < 248).any(axis=1)]
+    palette.putpalette([255, 255, 255, *kept.ravel().tolist()])
+    return palette
+
+
+def _mp4(film: Animation, path: Path) -> None:
+    frames = film.frames()
+    first = next(frames)
+    height, width = first.shape[:2]
+    pixels = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {film.fps:.10g} -i - -an"
+    coded = "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart -metadata"
+    command = [*f"ffmpeg -y -loglevel error {pixels} {coded}".split(), f"comment={_about(film)}", str(path)]
+    process: Any = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        for frame in chain([first], frames):
+            process.stdin.write(frame.tobytes())
+    except BrokenPipeError:
+        pass  # ffmpeg has ended; its message follows
+    _, said = process.communicate()
+    if process.returncode:
+        raise OSError(f"ffmpeg could not write {path.name}: {said.decode(errors='replace').strip()[-300:]}")

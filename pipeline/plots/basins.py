@@ -1,24 +1,38 @@
-"""Draw basins of attraction: each initial state has the colour of the attractor on which it ends."""
+"""Draw planes of initial states: basins of attraction, edge states, stable and unstable manifolds."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
+from pipeline.layout.vocabulary import (
+    EQUILIBRIUM,
+    INFERRED,
+    PERIODIC_ORBIT,
+    grid_dim,
+    is_grid_dim,
+    is_start_dim,
+    model_of,
+    periods_of,
+)
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.products.figures import BasinFigureOptions
+from pipeline.plots.bifurcation import fixed_of, with_diagram
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
+from pipeline.products.figures import BasinFigureOptions, EdgeFigureOptions, ManifoldFigureOptions
+from pipeline.products.manifolds import ManifoldOptions
+from pipeline.products.resilience import EdgeOptions
 
 _DARKEST = 0.62
 _OTHERS = -1
@@ -131,9 +145,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Return the colour code of each cell (an attractor id, or a negative code), and the number of cells of each
-    code.
-    """
+    """Return the code of each cell (an attractor id, or a negative code), and the number of cells of each code."""
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
@@ -148,9 +160,7 @@ def _codes(
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
-    """Return the RGB colour of each code, shape (codes, 3). Attractor ids come first; negative codes count from the
-    end.
-    """
+    """Return RGB by code, shape (codes, 3): attractor ids first; negative codes count from the end."""
     greys = list(reversed(palette.GREYS.values()))
     colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
     return np.array([to_rgb(c) for c in colours], dtype=np.float32)
@@ -254,10 +264,161 @@ def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Datase
     return stored
 
 
-def draw(run: Run, options: BasinFigureOptions) -> style.DataFigure:
+def draw_basins(run: OpenRun, options: BasinFigureOptions) -> style.DataFigure:
     """Draw the figure ``basins`` of a run."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")
     times = run.cube()["n_periods"] if options.shade else None
     figure = plot_basins(found, at=at, degrees=options.degrees, n_periods=times, frame=frame_of(options))
     return noted(figure, notes)
+
+
+_MARKS: dict[str, dict[str, Any]] = {
+    "edge orbit": {"marker": "D", "markersize": 7.0, "markerfacecolor": "white", "markeredgecolor": "black"},
+    "edge equilibrium": {"marker": "s", "markersize": 7.0, "markerfacecolor": "white", "markeredgecolor": "black"},
+    "edge set": {"marker": "o", "markersize": 2.6, "markerfacecolor": "white", "markeredgecolor": "black"},
+}
+"""Markers of edge states: white with a black rim, to be seen over every colour of a basin."""
+
+
+@style.drawn
+def plot_edge(
+    ds: xr.Dataset,
+    basins: style.DataFigure | None = None,
+    axes: tuple[str, str] | None = None,
+    *,
+    degrees: bool = False,
+    frame: style.Frame = style.WIDE,
+) -> style.DataFigure:
+    """Draw the section points of edge states, alone or on a figure of basins over the states `axes`.
+
+    By default these are the first two states; points are projected on their plane.
+    """
+    names = axes or tuple(str(name) for name in ds["state"].values[:2])
+    measures = [labels.state_measure(ds, name, degrees) for name in names]
+    stored = ds.assign_attrs(title="edge states")
+    fig = basins
+    if fig is None:
+        fig = style.new_figure(4.6, stored, frame)
+        style.style_axes(fig.add_subplot())
+        style.label_axes(fig.axes[0], *(measure.label for measure in measures))
+        style.caption(fig.axes[0], labels.caption(ds, with_start=False))
+    else:
+        fig.data = with_diagram(stored, fig.data)
+    ax = fig.axes[0]
+    limits = (ax.get_xlim(), ax.get_ylim()) if basins is not None else None
+    shown = _draw_points(ax, ds, names, measures)
+    if limits:
+        ax.set_xlim(limits[0])
+        ax.set_ylim(limits[1])
+    style.limits(ax, frame)
+    handles = [ax.plot([], [], linestyle="none", label=name, **_MARKS[name])[0] for name in _MARKS if name in shown]
+    if handles:
+        style.legend_inside(ax, handles)
+    style.finish(fig)
+    return fig
+
+
+def _draw_points(ax: Axes, ds: xr.Dataset, names: tuple[str, ...], measures: list[labels.Measure]) -> set[str]:
+    """Draw the section points of each edge state; return the names of the markers used."""
+    kinds = {PERIODIC_ORBIT: "edge orbit", EQUILIBRIUM: "edge equilibrium"}
+    columns = [list(ds["state"].values).index(name) for name in names]
+    shown = set()
+    # orbits last, since they are few
+    for i in np.argsort(ds["kind"].values == PERIODIC_ORBIT, kind="stable"):
+        name = kinds.get(int(ds["kind"][i]), "edge set")
+        points = ds["section"].values[i, : int(ds["n_points"][i])][:, columns]
+        x, y = (
+            measure.factor * (labels.wrapped(column) if measure.on_circle else column)
+            for measure, column in zip(measures, points.T, strict=True)
+        )
+        rim = 0.4 if name == "edge set" else 1.0
+        ax.plot(x, y, linestyle="none", markeredgewidth=rim, zorder=5.0, gid=f"{name}:{i}", **_MARKS[name])
+        shown.add(name)
+    return shown
+
+
+def draw_edge(run: OpenRun, options: EdgeFigureOptions) -> style.DataFigure:
+    """Draw the figure ``edge`` of a run, over the basins if its initial states form a grid in two states."""
+    at, notes = values_of(run, options)
+    found = run.derive("edge", **{**options.part(EdgeOptions), "at": at})
+    frame, below, axes = frame_of(options), None, None
+    cube = run.cube()
+    grid = [str(d) for d in cube["status"].dims if is_start_dim(str(d)) and is_grid_dim(str(d))]
+    if len(grid) == 2:
+        below = plot_basins(run.derive("attractors"), at=at, degrees=options.degrees, frame=frame)
+        axes = (grid[0].removesuffix("_0"), grid[1].removesuffix("_0"))
+    return noted(plot_edge(found, below, axes, degrees=options.degrees, frame=frame), notes)
+
+
+_COLOURS = {0: style.VERMILLION, 1: style.BLUE}
+_NAMES = {0: "unstable manifold", 1: "stable manifold"}
+
+
+@style.drawn
+def plot_manifolds(
+    ds: xr.Dataset, basins: style.DataFigure | None = None, *, degrees: bool = False, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
+    """Draw the manifolds of saddle orbits in the plane of the first two states, alone or over a figure of basins.
+
+    Parameters
+    ----------
+    ds
+        From `pipeline.analysis.manifolds.analysis.manifolds`.
+    basins
+        A figure of basins over the same two states, which is drawn on.
+    degrees
+        Degrees instead of radians.
+    frame
+        Width of the figure and ranges of its axes.
+    """
+    names = [str(name) for name in ds["state"].values[:2]]
+    measures = [labels.state_measure(ds, name, degrees) for name in names]
+    fig = basins
+    if fig is None:
+        fig = style.new_figure(4.6, ds.assign_attrs(title="manifolds"), frame)
+        style.style_axes(fig.add_subplot())
+        style.label_axes(fig.axes[0], *(measure.label for measure in measures))
+        style.caption(fig.axes[0], labels.caption(ds, with_start=False))
+    else:
+        fig.data = with_diagram(ds.assign_attrs(title="manifolds over basins"), fig.data)
+    ax = fig.axes[0]
+    limits = (ax.get_xlim(), ax.get_ylim()) if basins is not None else None
+    colours = _COLOURS if basins is None else {0: "black", 1: "white"}
+    _draw_lines(ax, ds, [measure.factor for measure in measures], colours)
+    if limits:
+        ax.set_xlim(limits[0])
+        ax.set_ylim(limits[1])
+    style.limits(ax, frame)
+    handles = [Line2D([], [], color=_shade(colours[k]), label=_NAMES[k], linewidth=1.2) for k in _NAMES]
+    style.legend_inside(ax, handles)
+    style.finish(fig)
+    return fig
+
+
+def _shade(colour: str) -> str:
+    return "0.75" if colour == "white" else colour
+
+
+def _draw_lines(ax: Axes, ds: xr.Dataset, scales: list[float], colours: dict[int, str]) -> None:
+    for i in range(ds.sizes["curve"]):
+        n, stable = int(ds["n_points"][i]), int(ds["stable"][i])
+        points = ds["section"].values[i, :n, :2] * scales
+        # an angle that passes its end begins again at the other side
+        jumps = np.abs(np.diff(points, axis=0)) > 0.5 * np.ptp(points, axis=0)
+        breaks = np.flatnonzero(jumps.any(axis=1)) + 1
+        points = np.insert(points, breaks, np.nan, axis=0)
+        ax.plot(*points.T, color=colours[stable], linewidth=0.8, gid=f"{_NAMES[stable]}:{i}", zorder=4.0)
+
+
+def draw_manifolds(run: OpenRun, options: ManifoldFigureOptions) -> style.DataFigure:
+    """Draw the figure ``manifolds`` of a run, over the basins if the run's initial states form a grid in two states."""
+    at, notes = values_of(run, options)
+    found = run.derive("manifolds", **options.part(ManifoldOptions))
+    found = found.assign_coords(fixed_of(at_points(run.cube(), at).squeeze()))
+    frame, below = frame_of(options), None
+    starts = [str(d) for d in run.cube()["status"].dims if is_start_dim(str(d))]
+    if len(starts) == 2:
+        attractors = run.derive("attractors")
+        below = plot_basins(attractors, at=at, degrees=options.degrees, frame=frame)
+    return noted(plot_manifolds(found, below, degrees=options.degrees, frame=frame), notes)

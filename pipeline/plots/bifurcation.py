@@ -1,8 +1,4 @@
-"""Draw bifurcation diagrams: section points over the swept parameter, coloured by class of motion.
-
-The cube is read block by block, twice: first for the range of the points and the shares of absent cells,
-then for the points. So memory does not grow with the cube.
-"""
+"""Draw bifurcation diagrams, with bands about computed orbits, and the share of cells without points below."""
 
 from __future__ import annotations
 
@@ -13,17 +9,159 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-from pipeline.layout.units import shown_unit
+from pipeline.analysis.draws import LEAST_SHARE, interval_of, stretches
+from pipeline.analysis.run import OpenRun
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bands import draw_bands, with_bands
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
-from pipeline.plots.missing_cells import absent_handles, draw_absent, say_empty
 from pipeline.plots.points import Survey, View, make_view, survey
-from pipeline.plots.selection import at_points
 from pipeline.products.figures import BifurcationOptions
+
+SHADE: dict[str, Any] = {"color": style.BLUE, "alpha": 0.3, "linewidth": 0.0, "zorder": 2.0}
+BAR: dict[str, Any] = {"color": style.BLUE, "linewidth": 2.2, "solid_capstyle": "butt", "zorder": 7.5}
+
+
+def draw_bands(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | None = None) -> list[Any]:
+    """Shade the bands about the section points of orbits, and draw the intervals of bifurcations as horizontal bars.
+
+    A bar goes through the first section point of its bifurcation. Bifurcations at which no stable orbit begins or ends
+    have none, and neither have those that fewer than half of the draws have. The limits of the axes are final. Return
+    handles for the legend.
+    """
+    edges: list[float] = []
+    levels = bands["section_level"].sel(state=measure.name).values
+    low, high = levels[0], levels[-1]
+    for _, _, chosen in stretches(bands):
+        period = int(np.isfinite(low[chosen]).any(axis=0).sum())
+        if max_period is not None and period > max_period:
+            continue
+        x = bands["parameter_value"].values[chosen]
+        for phase in range(period):
+            below, above = (measure.shown(edge[chosen, phase]) for edge in (low, high))
+            ax.fill_between(x, below, above, **SHADE, gid="band")
+            edges += [np.nanmin(low[chosen, phase]), np.nanmax(high[chosen, phase])]
+    if edges and style.figure_of(ax).frame.ylim is None and not measure.on_circle:
+        _make_room(ax, measure.shown(np.array(edges)))
+    bars = _draw_bars(ax, bands, measure, max_period)
+    handles: list[Any] = [Patch(label="95 % of the orbits", **{**SHADE, "zorder": None})] if edges else []
+    if bars:
+        handles.append(Line2D([], [], label="95 % of bifurcations", color=BAR["color"], linewidth=BAR["linewidth"]))
+    return handles
+
+
+def _make_room(ax: Axes, heights: np.ndarray) -> None:
+    """Widen the vertical axis so that it shows all heights."""
+    bottom, top = ax.get_ylim()
+    room = 0.03 * (top - bottom)
+    ax.set_ylim(min(bottom, float(heights.min()) - room), max(top, float(heights.max()) + room))
+
+
+def _draw_bars(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | None) -> int:
+    """Draw the bars of the bifurcations; return their number."""
+    n = 0
+    for k in range(bands.sizes["bifurcation"]):
+        one = bands.isel(bifurcation=k)
+        low, _, high, n_known = interval_of(one["bifurcation_value"].values)
+        too_long = max_period is not None and int(one["orbit_period"]) > max_period
+        if too_long or not bool(one["is_border"]) or n_known < LEAST_SHARE * bands.sizes["draw"]:
+            continue
+        y = measure.shown(one["bifurcation_section"].sel(state=measure.name).values)[0]
+        ax.plot([low, high], [y, y], scalex=False, scaley=False, gid="interval", **BAR)
+        n += 1
+    return n
+
+
+def with_bands(data: xr.Dataset, bands: xr.Dataset) -> xr.Dataset:
+    """Add the drawn bands to the data of a figure, under names that end in ``_bands``."""
+    plain = bands.drop_vars([k for k, v in bands.variables.items() if v.dtype == object or k == "state"])
+    plain = plain.assign({k: v.astype(np.int8) for k, v in plain.data_vars.items() if v.dtype == bool})
+    renamed = plain.rename({str(n): f"{n}_bands" for n in (*plain.variables, *plain.dims) if n != "state"})
+    return data.merge(renamed).assign_attrs(data.attrs)
+
+
+# Greys instead of hatching: some readers of SVG paint its patterns black.
+LOOKS: dict[str, dict[str, Any]] = {
+    "pending": {"facecolor": "0.92", "edgecolor": "0.6", "linewidth": 0.4},
+    "diverged": {"facecolor": "0.0", "edgecolor": "0.0", "linewidth": 0.8},
+    "failed": {"facecolor": "0.28", "edgecolor": "0.28", "linewidth": 0.8},
+    "not reached": {"facecolor": "0.62", "edgecolor": "0.62", "linewidth": 0.8},
+    "no return": {"facecolor": "0.8", "edgecolor": "0.3", "linewidth": 0.6},
+    "chatter": {"facecolor": "0.45", "edgecolor": "0.1", "linewidth": 0.6},
+    "without exponent": {"facecolor": "1.0", "edgecolor": "0.3", "linewidth": 0.6},
+}
+
+
+def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
+    """Draw in a strip below a diagram the share of cells without points, and shade values where no cell has one.
+
+    The survey counts the cells along the parameter `x`; `layers` are the indices of the directions that the axes show.
+    """
+    edges = style.edges(x)
+    cells = survey.cells[list(layers)].sum(0)
+    floor = np.zeros(cells.size)
+    for name, counts in survey.absent.items():
+        share = counts[list(layers)].sum(0) / np.maximum(cells, 1)
+        if share.any():
+            style.fill_columns(strip, edges, floor, floor + share, LOOKS[name], f"absent:{name}")
+            floor = floor + share
+    strip.set_ylim(0.0, 1.0)
+    strip.set_yticks([0.5], ["absent"])
+    strip.tick_params(axis="y", which="both", right=False, left=False)
+    strip.tick_params(axis="x", which="both", top=False)
+    shade_blank(ax, x, survey, layers)
+
+
+def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
+    """Shade a diagram at the parameter values where no cell has a point."""
+    shown = list(layers)
+    absent = sum((counts[shown].sum(0) for counts in survey.absent.values()), np.zeros(x.size, np.int64))
+    blank = (absent >= np.maximum(survey.cells[shown].sum(0), 1)).astype(float)
+    if blank.any():
+        looks = {"facecolor": "0.955", "linewidth": 0.0, "zorder": 1.5}
+        area = style.fill_columns(ax, style.edges(x), np.zeros(blank.size), blank, looks, "blank")
+        area.set_transform(ax.get_xaxis_transform())
+
+
+def absent_handles(survey: Survey) -> list[Patch]:
+    """Return legend entries for the cells that have no point in the diagram: their number for each reason."""
+    total = int(survey.cells.sum())
+    return [
+        Patch(label=f"{name}: {int(counts.sum())} of {total} cells", **LOOKS[name])
+        for name, counts in survey.absent.items()
+        if counts.any()
+    ]
+
+
+def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
+    """Write into empty axes why there is nothing to draw."""
+    n_cells = int(survey.cells.sum())
+    absent = {name: int(counts.sum()) for name, counts in survey.absent.items() if counts.any()}
+    text = f"nothing to draw: of {n_cells} cells, " + style.join(f"{n} {name}" for name, n in absent.items())
+    if not n_cells:
+        text = "nothing to draw: the cube has no cells"
+    elif absent.get("pending", 0) == n_cells:
+        text = f"nothing to draw yet: all {n_cells} cells are pending"
+    elif sum(absent.values()) < n_cells:
+        text = f"nothing to draw: no point lies {shown or 'here'}"
+    size = style.look_of(ax).label
+    width = 0.8 * style.figure_of(ax).frame.width_in
+    ax.text(
+        0.5,
+        0.5,
+        style.folded(text, width, size),
+        transform=ax.transAxes,
+        ha="center",
+        va="center",
+        fontsize=size,
+        zorder=3,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
+    )
+
 
 LAYOUTS = ("overlay", "side")
 EXTREMES = ("min", "max", "mean")
@@ -101,17 +239,11 @@ def plot_bifurcation(
 
 @dataclass(frozen=True)
 class Diagram:
-    """A bifurcation diagram that can be drawn into axes of any figure.
-
-    Attributes
-    ----------
-    measure : Measure
-        The vertical axis.
-    """
+    """A bifurcation diagram that can be drawn into axes of any figure."""
 
     view: View
     survey: Survey
-    measure: Measure
+    measure: Measure  # the vertical axis
     parameter: str
     frame: style.Frame
 
@@ -314,7 +446,7 @@ def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int,
     return panels
 
 
-def draw(run: Run, options: BifurcationOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: BifurcationOptions) -> style.DataFigure:
     """Draw the figure ``bifurcation`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

@@ -1,8 +1,8 @@
-"""Draw branches of periodic orbits over the bifurcation diagram of a run."""
+"""Draw branches of periodic orbits, their bifurcations and multipliers, and curves over maps of two parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +10,17 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bands import draw_bands, with_bands
-from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.bifurcation import Diagram, draw_bands, with_bands, with_diagram
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
-from pipeline.products.figures import BranchFigureOptions
+from pipeline.products.figures import BranchFigureOptions, MultiplierOptions
 
 KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point", "hopf", "pitchfork", "transcritical")
 MARKERS = dict(zip(KINDS, "^soDpvX", strict=True))
@@ -140,9 +141,7 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """Yield the lines of a branch to draw: one for each section point and each range of equal stability, cut where an
-    angle wraps.
-    """
+    """Yield the lines of a branch, one for each section point and range of equal stability, cut where angles wrap."""
     period = max(int(ds["orbit_period"][branch]), 1)
     x = with_located(ds, branch, ds["parameter"], ds["value"])
     both = (ds[name].sel(state=measure.name) for name in ("section", "bifurcation_section"))
@@ -218,8 +217,7 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
-    """Write labels of bifurcations where they cover neither lines nor other labels, each with a thin line to its
-    bifurcation.
+    """Label bifurcations where labels cover neither lines nor one another, each with a thin line to its place.
 
     Short periods come first. A label without room nearby is left out; its marker remains.
     """
@@ -312,7 +310,7 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
     ]
 
 
-def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
+def draw_branches(run: OpenRun, options: BranchFigureOptions) -> style.DataFigure:
     """Draw the figure ``branches`` of a run, over its own bifurcation diagram or that of another run."""
     other = run.of(options.over) if options.over else run
     at, notes = values_of(other, options)
@@ -333,3 +331,203 @@ def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
         frame=frame_of(options),
     )
     return noted(figure, notes)
+
+
+DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)), (0, (8, 1.5, 1, 1.5, 1, 1.5)))
+"""Line styles that can be told apart."""
+
+_ON_MAP = dict(zip(KINDS[:3], DASHES[:3], strict=True))
+_STYLE_NAMES = dict(zip(KINDS[:3], ("solid:", "dashed:", "dotted:"), strict=True))
+
+POINT_NAMES = {
+    "cusp": "CP",
+    "generalised_doubling": "GPD",
+    "chenciner": "CH",
+    "r1": "R1",
+    "r2": "R2",
+    "r3": "R3",
+    "r4": "R4",
+    "fold_flip": "LPPD",
+    "fold_neimark_sacker": "LPNS",
+    "doubling_neimark_sacker": "PDNS",
+    "double_neimark_sacker": "NSNS",
+}
+"""Short names of points of codimension two, as MatContM writes them."""
+
+
+ROOM = (0.045, 0.045)
+"""Room that a short name takes, in units of the axes."""
+
+
+def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> bool:
+    """Reserve the place of a short name on axes. Return False if it would overlap a name already placed."""
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    here = np.array([(at[0] - left) / (right - left), (at[1] - bottom) / (top - bottom)])
+    if any((np.abs(here - other) < ROOM).all() for other in taken):
+        return False
+    taken.append(here)
+    return True
+
+
+def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: str) -> None:
+    """Draw bifurcation curves in black over panels that show a parameter plane, whose horizontal axis is `x`.
+
+    Points of codimension two have their names if there is one panel; several are too small.
+    """
+    along, across = ("first", "second") if str(ds.attrs["first_parameter"]) == x else ("second", "first")
+    halo = [withStroke(linewidth=2.2, foreground="white")]
+    for ax in axes:
+        low, high = ax.get_xlim(), ax.get_ylim()
+        for i in range(ds.sizes["curve"]):
+            n, kind = int(ds["n_points"][i]), KINDS[int(ds["kind"][i])]
+            ax.plot(
+                ds[along].values[i, :n],
+                ds[across].values[i, :n],
+                color="black",
+                linewidth=1.0 if len(axes) == 1 else 0.7,
+                linestyle=_ON_MAP[kind],
+                path_effects=halo if len(axes) == 1 else None,
+                gid=f"curve:{i}",
+                zorder=4.0,
+            )
+        ax.set_xlim(low)
+        ax.set_ylim(high)
+        mark_points(ax, ds, along, across, fig.look.tick, named=len(axes) == 1)
+
+
+def line_note(ds: xr.Dataset) -> str:
+    """Return a text on which line style stands for which kind of bifurcation."""
+    present = {KINDS[int(kind)] for kind in ds["kind"].values}
+    return ", ".join(f"{_STYLE_NAMES[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
+
+
+def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
+    """Mark points of codimension two by dots and, if `named`, by short names such as CP (cusp) and R1.
+
+    A name that would lie over another one is left out.
+    """
+    names = str(ds["special_kind"].attrs["flag_meanings"]).split()
+    halo = [withStroke(linewidth=2.0, foreground="white")]
+    taken: list[np.ndarray] = []
+    for k in range(ds.sizes["special"]):
+        at = float(ds[f"special_{along}"][k]), float(ds[f"special_{across}"][k])
+        ax.plot(*at, marker="o", markersize=3.2, color="black", markeredgecolor="white", markeredgewidth=0.5, zorder=6)
+        if not (named and take_room(ax, at, taken)):
+            continue
+        ax.annotate(
+            POINT_NAMES[names[int(ds["special_kind"][k])]],
+            at,
+            (3.0, 3.0),
+            textcoords="offset points",
+            fontsize=size,
+            path_effects=halo,
+            annotation_clip=True,
+            zorder=7,
+        )
+
+
+MOST_MODULUS = 2.0
+"""Multipliers beyond this modulus are left out."""
+
+
+@style.drawn
+def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
+    """Draw the Floquet multipliers along a branch in the complex plane, with the unit circle.
+
+    Parameters
+    ----------
+    ds
+        From `pipeline.analysis.branches`.
+    branch
+        Number of the branch.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        Multipliers of modulus beyond `MOST` are left out, and their number is stated. Its `data` hold
+        ``real`` and ``imaginary`` parts and the ``parameter`` of each point of the branch.
+
+    Raises
+    ------
+    ValueError
+        If there is no such branch.
+    """
+    if not 0 <= branch < ds.sizes["branch"]:
+        raise ValueError(f"branch = {branch} is out of bounds: there are branches 0 to {ds.sizes['branch'] - 1}.")
+    n = int(ds["n_points"][branch])
+    z = (ds["multiplier_real"] + 1j * ds["multiplier_imag"]).values[branch, :n]
+    x = np.repeat(ds["parameter"].values[branch, :n, None], z.shape[1], axis=1)
+    fig = style.new_figure(4.8, _multipliers(ds, branch, z, x[:, 0]), frame)
+    ax = fig.add_subplot()
+    style.style_axes(ax)
+    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor="0.5", linewidth=0.8))
+    shown = np.abs(z) <= MOST_MODULUS
+    points = ax.scatter(z.real[shown], z.imag[shown], c=x[shown], s=6.0, linewidths=0.0, zorder=3)
+    here = np.flatnonzero(ds["of_branch"].values == branch)
+    handles = _crossings(ax, ds, here)
+    for axis in (ax.axhline, ax.axvline):
+        axis(0.0, color="0.8", linewidth=0.5, zorder=0)
+    reach = max(1.15, float(np.abs(np.stack([z.real[shown], z.imag[shown]])).max(initial=0.0)) * 1.05)
+    style.limits(ax, frame, (-reach, reach), (-reach, reach))
+    ax.set_aspect("equal")
+    style.label_axes(ax, r"Re $\mu$", r"Im $\mu$")
+    missing = int((~shown).sum())
+    title = f"branch {branch}, period {int(ds['orbit_period'][branch])}"
+    fixed = labels.caption(ds, with_start=False)
+    style.caption(ax, style.join([title, fixed, f"{missing} beyond |μ| = {MOST_MODULUS:g}" if missing else ""]))
+    label = labels.swept_label(str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"]))
+    style.style_bar(fig.colorbar(points, ax=ax, pad=0.015, aspect=32), label)
+    if frame.compact:
+        style.legend_below(fig, handles)
+    elif handles:
+        fig.legend(
+            handles=handles,
+            loc="outside right upper",
+            frameon=False,
+            fontsize=fig.look.tick,
+            handletextpad=0.2,
+            borderpad=0.2,
+        )
+    style.finish(fig)
+    return fig
+
+
+def _multipliers(ds: xr.Dataset, branch: int, z: np.ndarray, x: np.ndarray) -> xr.Dataset:
+    units = str(ds.attrs["parameter_units"])
+    return xr.Dataset(
+        {
+            "real": (("point", "multiplier"), z.real.copy(), {"units": "1"}),
+            "imaginary": (("point", "multiplier"), z.imag.copy(), {"units": "1"}),
+            "parameter": ("point", x, {"units": units, "long_name": str(ds.attrs["parameter"])}),
+        },
+        attrs={"title": "Floquet multipliers", "branch": branch, "orbit_period": int(ds["orbit_period"][branch])},
+    )
+
+
+def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
+    """Mark the multipliers on the unit circle at bifurcations, and return legend entries for these bifurcations."""
+    critical = (ds["critical_real"] + 1j * ds["critical_imag"]).values[here]
+    look: dict[str, Any] = {
+        "markerfacecolor": "none",
+        "markeredgecolor": style.VERMILLION,
+        "linestyle": "none",
+        "zorder": 4,
+    }
+    handles = []
+    for i in np.argsort(ds["value"].values[here], kind="stable"):
+        kind, mu = KINDS[int(ds["kind"][here[i]])], critical[i]
+        turning = kind == "neimark_sacker"
+        for value in {mu, mu.conjugate()} if turning else {mu}:
+            ax.plot(value.real, value.imag, marker=MARKERS[kind], markersize=5.5, markeredgewidth=1.0, **look)
+        text = f"{SHORT[kind]} {float(ds['value'][here[i]]):.4f}"
+        text += f", {np.degrees(np.angle(mu)):.0f}°" if turning else ""
+        handles.append(Line2D([], [], marker=MARKERS[kind], markersize=5.0, label=text, **look))
+    return handles
+
+
+def draw_multipliers(run: OpenRun, options: MultiplierOptions) -> style.DataFigure:
+    """Draw the figure ``multipliers`` of a run."""
+    found = run.derive("branches", **options.part(BranchOptions))
+    return plot_multipliers(found, options.branch, frame=frame_of(options))

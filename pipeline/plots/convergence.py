@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.chaos.lyapunov import GOOD, Motion, period_seconds, pooled_mean, summarise
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
-from pipeline.layout.period_names import period_of, periods_of
-from pipeline.layout.vocabulary import model_of, split_dims
+from pipeline.layout.vocabulary import model_of, period_of, periods_of, split_dims
 from pipeline.plots import labels, style
-from pipeline.plots.exponents import UNITS, left_out
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
+from pipeline.plots.lyapunov import UNITS, left_out
 from pipeline.products.figures import ConvergenceOptions
 
 MOST_LINES = 24
@@ -228,7 +228,7 @@ def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour:
     ax.plot(x, middle, color=colour, linestyle=_DASHES[kind], linewidth=1.2, gid=gid)
 
 
-def draw(run: Run, options: ConvergenceOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: ConvergenceOptions) -> style.DataFigure:
     """Draw the figure ``convergence`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

@@ -7,10 +7,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.analysis.ragged import SET, dims_of, is_ragged
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.figures import DimensionFigureOptions
 
@@ -23,7 +24,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ----------
     ds
         Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
-        `pipeline.analysis.chaos.correlation.section_dimension` for one parameter point. In the latter
+        `pipeline.analysis.chaos.analysis.section_dimension` for one parameter point. In the latter
         case the attractor with the most cells is drawn, among those with a dimension.
     frame
         Width of the figure; ranges of the radius and the correlation sum.
@@ -147,7 +148,7 @@ def _correlation(ds: xr.Dataset) -> xr.Dataset:
     )
 
 
-def draw(run: Run, options: DimensionFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: DimensionFigureOptions) -> style.DataFigure:
     """Draw the figure ``dimension`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_hex
 
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tipping.delay import moving_parameter
-from pipeline.layout.moving import at_section
+from pipeline.layout.cells import at_section
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.selection import at_points
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.products.figures import DriftFigureOptions
 
 DARKEST, LIGHTEST = 0.0, 0.85
@@ -38,32 +38,9 @@ def plot_drift(
 ) -> style.DataFigure:
     """Draw the section points of all cells over the value that a moving parameter has there.
 
-    Parameters
-    ----------
-    ds
-        Cube of a run whose parameters move.
-    parameter
-        The moving parameter.
-    below
-        Cube that sweeps the parameter at constant values; its sections are drawn grey below.
-    state
-        State on the vertical axis; by default the first.
-    at
-        Values of swept numbers; at most one axis may be left, and gives the colours.
-    degrees
-        Degrees for angles and their rates.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Its `data` hold ``value``, the state, and the parameter's values over cells and sections.
-
-    Raises
-    ------
-    ValueError
-        If several axes are left, or `below` does not sweep the parameter.
+    `below` is a cube that sweeps the parameter at constant values; its sections are drawn grey below. `at` leaves at
+    most one swept axis, which gives the colours. The figure's `data` hold ``value``, the state, and the parameter's
+    values over cells and sections. Raise ValueError if several axes are left, or `below` does not sweep the parameter.
     """
     part = at_points(ds, at)
     dims, _ = split_dims(part["status"])
@@ -149,7 +126,7 @@ def _label(part: xr.Dataset, parameter: str) -> str:
     return labels.with_unit(f"{name} at the section", one.unit)
 
 
-def draw(run: Run, options: DriftFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: DriftFigureOptions) -> style.DataFigure:
     """Draw the figure ``drift`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

@@ -1,6 +1,4 @@
-"""Draw all attractors of one parameter point, with their phase portraits and the path of a point of the model's
-drawing.
-"""
+"""Draw all attractors of one parameter point: phase portraits, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
@@ -14,13 +12,12 @@ from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.outcomes import left_out
 from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import once
-from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, once, parameters_of, told_by
 from pipeline.plots import labels, palette, style
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
+from pipeline.plots.figure import frame_of, noted, values_of
+from pipeline.plots.trajectory import Motion, draw_path, draw_portrait, equalise, fixed_handles
 from pipeline.products.product import FigureOptions
 
 MAX_ROWS = 8
@@ -43,7 +40,7 @@ def plot_gallery(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match`; gives colours and names.
     portraits
-        Result of `pipeline.analysis.attractors.describing.portraits.portraits` for one of its parameter points.
+        Result of `pipeline.analysis.attractors.portraits.portraits` for one of its parameter points.
     degrees
         Degrees instead of radians.
     frame
@@ -216,9 +213,9 @@ def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
     return [] if drawing is None else fixed_handles(drawing, _parameters(data), shown)
 
 
-def draw(run: Run, options: FigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``gallery`` of a run; the motion on each attractor is integrated for it."""
-    from pipeline.analysis.attractors.describing.portraits import portraits
+    from pipeline.analysis.attractors.portraits import portraits
 
     at, notes = values_of(run, options)
     found = run.derive("attractors")

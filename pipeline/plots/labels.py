@@ -16,7 +16,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
 
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import axis_name, model_of, overrides_of
 from pipeline.plots.style import check_choice, join
 
@@ -32,25 +32,13 @@ MATH_SPACE = r"\ "
 
 @dataclass(frozen=True)
 class Measure:
-    """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit.
-
-    Attributes
-    ----------
-    symbol : str
-        For an axis: between dollar signs, or the plain name.
-    unit : str
-        Unit on the axis.
-    factor : float
-        Factor from the stored unit to the unit on the axis.
-    on_circle : bool
-        Whether values that differ by full turns are the same.
-    """
+    """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit."""
 
     name: str
-    symbol: str
-    unit: str
-    factor: float = 1.0
-    on_circle: bool = False
+    symbol: str  # for an axis: between dollar signs, or the plain name
+    unit: str  # unit on the axis
+    factor: float = 1.0  # factor from the stored unit to the unit on the axis
+    on_circle: bool = False  # whether values that differ by full turns are the same
 
     @property
     def label(self) -> str:
@@ -81,19 +69,8 @@ def raised(unit: str) -> str:
 def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
     """Return how a state is shown on an axis: its symbol, its unit and the factor to this unit.
 
-    Parameters
-    ----------
-    ds
-        Dataset of a run, from which the model is read.
-    state
-        Name of the state; by default the first one whose values differ between section points.
-    degrees
-        Degrees for angles and their rates.
-
-    Raises
-    ------
-    ValueError
-        If the model has no such state, or degrees are asked for of one that is no angle.
+    The default state is the first one whose values differ between section points. Raise ValueError if the model has no
+    such state, or `degrees` are asked for of one that is no angle.
     """
     model = model_of(ds)
     state = state or model.section_states[0]
@@ -203,17 +180,10 @@ def swept_label(name: str, units: str) -> str:
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
-    """Return a caption with the fixed values of a figure: the axes' values, the parameters that the specification sets
-    in place of its preset's, then the initial state.
+    """Return a caption with the fixed values of a figure: parameters, then the initial state.
 
-    Parameters
-    ----------
-    ds
-        Drawn data; scalar coordinates and dims of size 1 are the fixed values.
-    drop
-        Dims that the figure shows on its axes.
-    with_start
-        Whether to name initial states.
+    Fixed values are scalar coordinates and dims of size 1, except the dims in `drop`, and the parameters that the
+    specification sets in place of its preset's.
     """
     along = (axis_name(str(ds.attrs.get(f"{role}parameter", ""))) for role in ("", "first_", "second_"))
     axes, states = {*drop, *along}, set(model_of(ds).state_names)

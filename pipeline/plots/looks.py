@@ -158,30 +158,15 @@ def sizes() -> Sizes:
 
 @dataclass(frozen=True)
 class Look:
-    """A look while it is applied.
+    """A look while it is applied."""
 
-    Attributes
-    ----------
-    rc : dict
-        Its rcParams that differ from matplotlib's defaults; empty in axes of the user.
-    width_mm : float
-        Width of figures for which none is given.
-    dpi : float
-        Resolution of files.
-    asked_dpi : float, optional
-        Resolution for which the user asked.
-    line : float
-        Width of lines [pt] that have the width 1 in magpend's style.
-    colours : tuple of str
-        Colours of data, each once.
-    """
-
+    # its rcParams that differ from matplotlib's defaults; empty in axes of the user
     rc: Mapping[str, Any] = field(default_factory=dict)
-    width_mm: float = WIDE_MM
-    dpi: float = DPI
-    asked_dpi: float | None = None
-    line: float = 1.0
-    colours: tuple[str, ...] = PALETTE
+    width_mm: float = WIDE_MM  # width of figures for which none is given
+    dpi: float = DPI  # resolution of files
+    asked_dpi: float | None = None  # resolution for which the user asked
+    line: float = 1.0  # width of lines [pt] that have the width 1 in magpend's style
+    colours: tuple[str, ...] = PALETTE  # colours of data, each once
 
 
 _PLAIN = Look()
@@ -193,13 +178,7 @@ _GIVEN: ContextVar[tuple[Style, float | None]] = ContextVar("_GIVEN", default=("
 
 
 def use(style: Style) -> None:
-    """Change the rcParams by a style, or by each of a list.
-
-    Raises
-    ------
-    SpecError
-        If matplotlib does not know the style, or one of its rcParams.
-    """
+    """Change the rcParams by a style, or by each of a list; raise SpecError for what matplotlib does not know."""
     for one in style if isinstance(style, list | tuple) else [style]:
         if one == "":
             continue
@@ -245,21 +224,8 @@ def given(style: Style, dpi: float | None) -> Iterator[None]:
 def look(style: Style = "", dpi: float | None = None, width_mm: float = WIDE_MM, guest: bool = False) -> Iterator[Look]:
     """Apply the look of a figure, in which it is drawn.
 
-    Parameters
-    ----------
-    style
-        Style that changes magpend's or, in axes of the user, theirs.
-    dpi
-        Resolution; by default that of the style.
-    width_mm
-        Width of the figure; the default stands for that of the style.
-    guest
-        Whether the figure is drawn into axes of the user.
-
-    Raises
-    ------
-    SpecError
-        See `use`.
+    The style changes magpend's or, if the figure is drawn into axes of the user (`guest`), theirs. The default
+    resolution is that of the style; the default width stands for that of the style.
     """
     style, dpi = style or _GIVEN.get()[0], dpi or _GIVEN.get()[1]
     with LOCK, rc_context():

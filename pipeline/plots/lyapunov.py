@@ -1,4 +1,4 @@
-"""Draw Lyapunov exponents below the bifurcation diagram of a run."""
+"""Draw Lyapunov exponents over one swept parameter, or the largest as colours over two."""
 
 from __future__ import annotations
 
@@ -9,19 +9,178 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
-from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents
+from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents, period_seconds
+from pipeline.analysis.run import OpenRun
+from pipeline.layout.vocabulary import model_of, period_of
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bifurcation import Diagram, swept_parameter, with_diagram
-from pipeline.plots.exponent_map import plot_lyapunov_map, swept_pair
-from pipeline.plots.exponents import UNITS, exponent_values, rate_unit
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
-from pipeline.plots.motions import motions_of
-from pipeline.plots.points import Survey
-from pipeline.plots.selection import at_points
+from pipeline.plots.bifurcation import (
+    Diagram,
+    absent_handles,
+    draw_absent,
+    shade_blank,
+    swept_parameter,
+    swept_parameters,
+    with_diagram,
+)
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
+from pipeline.plots.palette import motion_codes, motions_of
+from pipeline.plots.points import ABSENT, DRAWN, Survey
 from pipeline.products.figures import LyapunovFigureOptions
+
+UNITS = ("s", "period")
+"""Units of time that exponents are given per."""
+
+
+def left_out(part: xr.Dataset) -> str:
+    """Return a text on how many cells have no Lyapunov exponent, and why; an empty text if all have one."""
+    status = part["status"]
+    missing = part["lyapunov"].isel(exponent=0, drop=True).isnull().transpose(*status.dims)
+    counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}
+    counts["without exponent"] = int((missing & status.isin(DRAWN)).sum())
+    listed = style.join(f"{n} {name}" for name, n in counts.items() if n)
+    return f"left out of {status.size} cells: {listed}" if listed else ""
+
+
+def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
+    """Return the Lyapunov exponents and their errors per second or per period, with flags and classes of motion."""
+    scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
+    chosen = part if spectrum else part.isel(exponent=slice(1))
+    dims = chosen["lyapunov"].dims
+    variables = {
+        "exponent_value": (chosen["lyapunov"] * scale).transpose(*dims),
+        "exponent_stderr": (chosen["lyapunov_stderr"] * scale).transpose(*dims),
+        "lyapunov_flag": part["lyapunov_flag"],
+    }
+    if motions_of(part).told:
+        variables["motion"] = motion_codes(part)
+    data = xr.Dataset(variables).load()
+    for name in ("exponent_value", "exponent_stderr"):
+        data[name].attrs.update(
+            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model_of(part))
+        )
+    # NetCDF cannot store object labels; the numbers of branches and starts suffice
+    keep = {"exponent", *data["lyapunov_flag"].dims}
+    keep |= {str(c) for c, v in data.coords.items() if not v.ndim and v.dtype.kind == "f"}
+    return data.drop_vars([c for c in data.coords if c not in keep]).assign_attrs(title="Lyapunov exponents")
+
+
+def rate_unit(data: xr.Dataset) -> str:
+    """Return the unit of the Lyapunov exponents, for an axis label."""
+    per = str(data["exponent_value"].attrs["per"])
+    return "1/s" if per == "unit time" else f"1/{per.split()[-1]}"
+
+
+_NO_EXPONENT = "0.8"
+_SHOWN = 0.98
+"""Share of the points whose exponents the scale holds, so that a few do not pale all others."""
+
+
+@style.drawn
+def plot_lyapunov_map(
+    ds: xr.Dataset, *, per: str = "s", at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
+    """Draw the largest Lyapunov exponent as colours in the plane of two swept parameters.
+
+    Parameters
+    ----------
+    ds
+        Cube with the product ``lyapunov`` over two swept parameters.
+    per
+        ``s``: per unit time [1/s]; ``period``: per drive period or return.
+    at
+        Values of further swept parameters.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        Each point shows the largest exponent among its cells, so chaos shows wherever one of the
+        coexisting attractors is chaotic. White is 0; equal distances from 0 have the same depth of colour
+        on both sides. A point is grey where no cell has an exponent. The line above says how many cells
+        have none, and why. Its `data` hold ``exponent_value`` and
+        ``chaotic_share``, the share of cells whose exponent is positive.
+
+    Raises
+    ------
+    ValueError
+        If there are no exponents, if an option is unknown, or if not exactly two parameters are left.
+    """
+    style.check_choice("unit (per)", per, UNITS)
+    check_exponents(ds)
+    part = at_points(ds, at)
+    swept = swept_pair(part, "draw a diagram with plot_lyapunov")
+    values = exponent_values(part, per, spectrum=False)
+    largest = values["exponent_value"].isel(exponent=0, drop=True)
+    cells = [d for d in largest.dims if d not in swept]
+    data = xr.Dataset(
+        {
+            "exponent_value": largest.max(cells, keep_attrs=True).transpose(swept[1], swept[0]),
+            "chaotic_share": (largest > 0).mean(cells).transpose(swept[1], swept[0]),
+        },
+        attrs={"title": "largest Lyapunov exponent, maximum over the cells of each point"},
+    )
+    fig = style.new_figure(4.4, data, frame)
+    ax = fig.add_subplot()
+    style.style_axes(ax, inside=False)
+    _draw_map(fig, ax, data, part, swept)
+    style.caption(ax, style.join([labels.caption(part, drop=swept), left_out(part)]))
+    style.limits(ax, frame, *(style.span(part[d].values) for d in swept))
+    style.finish(fig)
+    return fig
+
+
+def swept_pair(part: xr.Dataset, instead: str) -> list[str]:
+    """Return the names of the two swept parameters of a result cube; raise ValueError if there are not two.
+
+    `instead` says what to do if there are fewer.
+    """
+    swept = [d for d in swept_parameters(part) if part.sizes[d] > 1]
+    if len(swept) != 2:
+        raise ValueError(
+            f"a map is drawn over two swept parameters, and {len(swept)} are left ({', '.join(swept) or 'none'}); "
+            + ("choose values of the others with --at" if len(swept) > 2 else instead)
+        )
+    return swept
+
+
+def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Dataset, swept: list[str]) -> None:
+    grid = data["exponent_value"].values
+    x, y = (style.edges(part[d].values.astype(np.float64)) for d in swept)
+    norm, extend = _scale(grid)
+    ax.set_facecolor(_NO_EXPONENT)
+    image = ax.pcolormesh(x, y, np.ma.masked_invalid(grid), cmap="PuOr_r", norm=norm, rasterized=True)
+    image.set_gid("map")
+    style.label_axes(ax, *(labels.parameter_label(part[d]) for d in swept))
+    if not np.isfinite(grid).all():
+        style.legend_above(fig, [Patch(facecolor=_NO_EXPONENT, label="no cell has an exponent")])
+    bar = fig.colorbar(ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7))
+    text = f"largest exponent [{rate_unit(data)}]\nmaximum over the cells of each point"
+    style.style_bar(bar, text)
+
+
+def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
+    """Return a colour scale that is symmetric about 0, and a word for the ends at which values lie outside it."""
+    known = grid[np.isfinite(grid)]
+    most = float(np.abs(known).max(initial=0.0))
+    half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0
+    half = half if half > 0.0 else most or 1.0
+    if most <= 1.5 * half:
+        half = most or 1.0
+    ends = (bool((known < -half).any()), bool((known > half).any()))
+    return Normalize(-half, half), {
+        (False, False): "neither",
+        (True, False): "min",
+        (False, True): "max",
+        (True, True): "both",
+    }[ends]
+
 
 EXPONENT_COLOURS = ("#332288", style.ORANGE, style.SKY, "#882255", "#5B3A1E", "#999933", "#44AA99", "#AA4499")
 """Others than those of the motions in the panel above; a ninth begins again."""
@@ -190,7 +349,7 @@ def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
     return joined
 
 
-def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: LyapunovFigureOptions) -> style.DataFigure:
     """Draw the figure ``lyapunov`` of a run: over one parameter, or as colours in the plane of two."""
     cube = run.cube()
     at, notes = values_of(run, options)

@@ -19,7 +19,7 @@ from magpend_core.models.model import Drawing
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
 from pipeline.plots.labels import Measure
-from pipeline.plots.portrait import Motion, draw_portrait
+from pipeline.plots.trajectory import Motion, draw_portrait
 
 TRAIL_S = 0.8
 """Seconds of film that what moves leaves a trail for."""
@@ -29,22 +29,12 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trail:
-    """Trail behind a moving point, which fades. In a film that repeats, it goes on from the end to the start.
+    """Trail behind a moving point, which fades. In a film that repeats, it goes on from the end to the start."""
 
-    Attributes
-    ----------
-    n, length : int
-        Samples of the film, and of the trail.
-    repeats : bool
-        Whether the film does.
-    closed : int
-        Samples until the motion repeats; 0 if it does not repeat within the film.
-    """
-
-    n: int
+    n: int  # n, length: samples of the film, and of the trail
     length: int
-    repeats: bool
-    closed: int
+    repeats: bool  # whether the film does
+    closed: int  # samples until the motion repeats; 0 if it does not repeat within the film
 
     @classmethod
     def of(cls, one: xr.Dataset) -> Trail:
@@ -151,16 +141,10 @@ def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Scene:
-    """Part of the plane that contains the model's drawing in all motions of a film.
-
-    Attributes
-    ----------
-    low, high : ndarray
-        Corners that hold everything at all times.
-    """
+    """Part of the plane that contains the model's drawing in all motions of a film."""
 
     drawing: Drawing
-    low: Floats
+    low: Floats  # low, high: corners that hold everything at all times
     high: Floats
 
     @classmethod

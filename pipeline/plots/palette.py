@@ -1,4 +1,4 @@
-"""Give each attractor a colour, a letter and a name, which are the same in every figure of a run.
+"""Give each class of motion and each attractor a colour and a name, which are the same in every figure of a run.
 
 The attractors with the most cells have the colours of the style; the others share one more. The twelve of magpend's
 style come from Okabe & Ito (https://jfly.uni-koeln.de/color/) and five chosen for their distance from them: any two,
@@ -23,8 +23,7 @@ from scipy.ndimage import distance_transform_edt
 from pipeline.analysis import outcomes
 from pipeline.analysis.ragged import N_IDS, SET, is_ragged
 from pipeline.analysis.sets import rows_by_number
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import period_of
+from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import (
     ABSENT,
     ATTRACTS,
@@ -38,9 +37,61 @@ from pipeline.layout.vocabulary import (
     TORUS,
     TRANSIENT,
     UNSTABLE,
+    letter,
     model_of,
+    period_of,
 )
 from pipeline.plots import style
+
+MOTION_COLOURS = (
+    style.BLUE,
+    style.VERMILLION,
+    style.GREEN,
+    style.PURPLE,
+    style.ORANGE,
+    style.SKY,
+    "#5B3A1E",
+    "#332288",
+)
+"""Of the words of a classifier, in their order; a ninth begins again."""
+
+PLAIN = "#1A3A5C"
+"""Colour of all motions where nothing tells them apart."""
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Names and colours of the classes of motion of a run, by code."""
+
+    words: tuple[str, ...]
+    colours: tuple[str, ...]
+    drawn: tuple[int, ...]  # codes in the order of legends: motions, then what is neutral
+
+    @property
+    def told(self) -> bool:
+        """Whether the model distinguishes classes of motion."""
+        return len(self.words) > 1
+
+
+def motions_of(ds: xr.Dataset) -> Motions:
+    """Return the names and colours of a model's classes of motion; a model without a classifier has one class."""
+    classifier = model_of(ds).classifier
+    if classifier is None:
+        plain = PLAIN if style.colours() == style.PALETTE else style.colours()[0]
+        return Motions(("motion",), (plain,), (0,))
+    own = [c for c in range(1, len(classifier.words)) if c not in classifier.neutral]
+    colours = [style.GREY] * len(classifier.words)
+    for k, code in enumerate(own):
+        colours[code] = style.as_hex(MOTION_COLOURS[k % len(MOTION_COLOURS)])
+    neutral = [c for c in range(1, len(classifier.words)) if c in classifier.neutral]
+    return Motions(classifier.words, tuple(colours), (*own, *neutral))
+
+
+def motion_codes(cells: xr.Dataset) -> xr.DataArray:
+    """Return the class of motion of each cell, as a code."""
+    found = classify(cells)
+    return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found
+
 
 COLOURS = style.PALETTE
 OTHERS = "#C8E6C0"
@@ -89,36 +140,19 @@ def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cast:
-    """Colours and names of the attractors (and other sets) of a run.
+    """Colours and names of the attractors (and other sets) of a run."""
 
-    Attributes
-    ----------
-    colours : dict
-        Colour by id; of a set that attracts nowhere the grey of its stability.
-    names : dict
-        Name by id, such as ``A: period 1, left``.
-    main : tuple of int
-        Ids with a colour of their own: attractors.
-    order : tuple of int
-        All ids as legends list them: by rising period, then tori, chaotic sets and others.
-    """
-
-    colours: dict[int, str]
-    names: dict[int, str]
-    main: tuple[int, ...]
-    order: tuple[int, ...]
+    colours: dict[int, str]  # colour by id; of a set that attracts nowhere the grey of its stability
+    names: dict[int, str]  # name by id, such as ``A: period 1, left``
+    main: tuple[int, ...]  # ids with a colour of their own: attractors
+    order: tuple[int, ...]  # all ids as legends list them: by rising period, then tori, chaotic sets and others
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     """Choose colours and names for the attractors (and other sets) of a run.
 
-    Parameters
-    ----------
-    attractors
-        Result of `pipeline.analysis.attractors.attractors.match` for the whole run, so that a colour does not
-        change with what is selected of it.
-    part
-        Part of the dataset that the names describe; by default all of it.
+    `attractors` are those of the whole run, so that a colour does not change with what is selected of it; `part` is
+    what the names describe, by default all.
     """
     sets = _sets(attractors)
     attracts = [one["stability"].values == ATTRACTS for one in sets]
@@ -240,16 +274,7 @@ def new_panel(
 ) -> tuple[style.DataFigure, Axes]:
     """Make a figure with one panel, and a legend beside it (or below it in a narrow figure).
 
-    Parameters
-    ----------
-    data
-        Data to draw.
-    entries
-        Lines of the legend.
-    frame
-        Width of the figure.
-    height
-        Minimum height [in] at full width; the figure grows with the legend.
+    `height` is the least one [in] at full width; the figure grows with the legend.
     """
     look = style.sizes()
     room = frame.width_in * (1.0 if frame.compact else 0.33) - 0.35
@@ -302,14 +327,8 @@ def percent(share: float) -> str:
 def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> None:
     """Write the letter of each attractor into the widest part of its area in an image, if the letter fits there.
 
-    Parameters
-    ----------
-    ax
-        Axes that the codes fill, at their final place.
-    codes
-        Ids on a raster of equal cells, rows from below; some 400 each way are enough.
-    attractors
-        Ids to be written.
+    The axes are at their final place. `codes` are ids on a raster of equal cells, rows from below; some 400 each way
+    are enough.
     """
     box = ax.get_window_extent()
     sampling = np.array([box.height / codes.shape[0], box.width / codes.shape[1]]) / ax.figure.dpi

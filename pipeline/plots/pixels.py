@@ -14,9 +14,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.plots import style
-from pipeline.plots.motions import Motions
+from pipeline.plots.palette import Motions
 from pipeline.plots.points import Points, Range, View
 
 MARKER_LIMIT = 200_000
@@ -28,21 +28,11 @@ TINT = 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """Marker style for the points of one direction of a continuation.
+    """Marker style for the points of one direction of a continuation."""
 
-    Attributes
-    ----------
-    diameter : float
-        [pt]
-    tint : float
-        Share of white in its colour.
-    faintest : float
-        Opacity of a pixel of an image that holds a single point, where others hold many.
-    """
-
-    diameter: float
-    tint: float = 0.0
-    faintest: float = 0.5
+    diameter: float  # [pt]
+    tint: float = 0.0  # share of white in its colour
+    faintest: float = 0.5  # opacity of a pixel of an image that holds a single point, where others hold many
 
 
 def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
@@ -62,16 +52,9 @@ class Panel:
 
 
 def draw_points(panels: Sequence[Panel], view: View, diameter: float) -> xr.Dataset:
-    """Draw the points of a `View` into axes whose positions and limits are final.
+    """Draw the points of a `View` into panels of equal size, whose positions and limits are final.
 
-    Parameters
-    ----------
-    panels
-        Panels of equal size and limits.
-    view
-        The points.
-    diameter
-        Diameter of the marker of a single layer [pt].
+    `diameter` is that of the marker of a single layer [pt].
 
     Returns
     -------
@@ -201,9 +184,7 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Spread the count of each pixel over the disc of a marker, for every direction of continuation and class of
-    motion.
-    """
+    """Spread the count of each pixel over the disc of a marker, for every direction and class of motion."""
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -219,18 +200,8 @@ def paint(
 ) -> None:
     """Paint points into an image. Each pixel has the colour of the class of motion that has most points there.
 
-    Parameters
-    ----------
-    picture
-        RGB from 0 to 1, shape (row, column, 3); changed in place.
-    spread
-        Counts by code of motion.
-    look
-        Marker style of the layer.
-    colours
-        Colours by code.
-    reference
-        Count of points at which a pixel is fully dark.
+    The image is RGB from 0 to 1, shape (row, column, 3), and changed in place. `spread` are counts by code of motion; a
+    pixel with `reference` points is fully dark.
     """
     if not spread:
         return
@@ -248,9 +219,7 @@ def paint(
 
 
 def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarray:
-    """Return opacities that grow with the logarithm of the counts, from `faintest` for one point to 1 for `reference`
-    points.
-    """
+    """Return opacities that grow with the logarithm of counts, from `faintest` for 1 to 1 for `reference`."""
     if reference <= 1.0:
         return np.ones(counts.size, dtype=np.float32)
     depth = np.log(counts.astype(np.float32)) / np.float32(math.log(reference))

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout import vocabulary
-from pipeline.plots.motions import Motions, motion_codes, motions_of
+from pipeline.plots.palette import Motions, motion_codes, motions_of
 from pipeline.products.reporting import track
 
 DRAWN = (vocabulary.PERIODIC, vocabulary.BOUNDED, vocabulary.INFERRED)
@@ -58,26 +58,13 @@ broadcasts to it."""
 
 @dataclass(frozen=True)
 class View:
-    """Description of what is drawn of a result cube: its variables, a function that computes points, and colours.
-
-    Attributes
-    ----------
-    ds : Dataset
-    names : tuple of str
-        Variables that are read.
-    coordinates : callable
-    n_points : int
-        Number of points if no cell is absent.
-    layers : tuple of str
-        Directions that lie on one another; a single empty one where there are none.
-    motions : Motions
-    """
+    """Description of what is drawn of a result cube: its variables, a function that computes points, and colours."""
 
     ds: xr.Dataset
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # variables that are read
     coordinates: Coordinates
-    n_points: int
-    layers: tuple[str, ...]
+    n_points: int  # number of points if no cell is absent
+    layers: tuple[str, ...]  # directions that lie on one another; a single empty one where there are none
     motions: Motions
 
     def blocks(self) -> Iterator[xr.Dataset]:
@@ -131,24 +118,13 @@ def make_view(ds: xr.Dataset, names: tuple[str, ...], coordinates: Coordinates) 
 
 @dataclass
 class Survey:
-    """Ranges of the points to draw, the classes of motion that occur, and the numbers of cells.
+    """Ranges of the points to draw, the classes of motion that occur, and the numbers of cells."""
 
-    Attributes
-    ----------
-    x, y : tuple of float
-        Range of the points.
-    classes : set
-        Pairs of layer and motion that occur.
-    cells : ndarray, (layer, position)
-        Numbers of cells.
-    absent : dict
-        Numbers of those without a point, by what became of them.
-    """
-
-    x: Range = (math.inf, -math.inf)
+    x: Range = (math.inf, -math.inf)  # x, y: range of the points
     y: Range = (math.inf, -math.inf)
-    classes: set[tuple[int, int]] = field(default_factory=set)
-    cells: np.ndarray = field(default_factory=lambda: np.zeros((1, 1), np.int64))
+    classes: set[tuple[int, int]] = field(default_factory=set)  # pairs of layer and motion that occur
+    cells: np.ndarray = field(default_factory=lambda: np.zeros((1, 1), np.int64))  # (layer, position); numbers of cells
+    # numbers of those without a point, by what became of them
     absent: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -171,17 +147,9 @@ def _joined(known: Range, values: np.ndarray) -> Range:
 
 
 def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Range | None = None) -> Survey:
-    """Read a result cube once to find the ranges of its points, the classes of motion that occur, and the cells without
-    points.
+    """Find the ranges of the points to draw, the classes of motion that occur, and the cells without points.
 
-    Parameters
-    ----------
-    view
-        Points to draw.
-    along
-        Dim along which absent cells are counted; by default all in one.
-    xlim, ylim
-        Ranges of the axes.
+    Absent cells are counted along the dim `along`, by default all in one.
     """
     size = view.ds.sizes[along] if along else 1
     shape = (len(view.layers), size)

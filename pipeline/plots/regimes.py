@@ -1,4 +1,4 @@
-"""Draw regime maps in the plane of two swept parameters: coexisting attractors, their periods, or their number."""
+"""Draw maps of regimes and bifurcation curves in the plane of two parameters."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.analysis.sets import rows_by_number
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, parameter_name
+from pipeline.layout.conventions import shown_unit
+from pipeline.layout.vocabulary import ATTRACTS, letter, parameter_name
 from pipeline.plots import labels, palette, style
-from pipeline.plots.curve_lines import draw_over, line_note
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.products.figures import RegimeOptions
+from pipeline.plots.branches import DASHES, KINDS, NAMES, draw_over, line_note, mark_points
+from pipeline.plots.figure import frame_of, noted, values_of
+from pipeline.products.branches import CurveOptions
+from pipeline.products.figures import CurveFigureOptions, RegimeOptions
 
 BESIDE = 0.85
 """Share of the figure's width for the caption of a map with a legend beside it."""
 
-KINDS = ("periods", "attractors", "number")
+SHOWN = ("periods", "attractors", "number")
 SHARE_LIMIT = 0.05
 """Share of cells without an attractor from which a point of the map is marked."""
 
@@ -65,7 +67,7 @@ def plot_regimes(
     at
         Values of further swept parameters.
     curves
-        Bifurcation curves in the plane of the map, drawn over it (`pipeline.analysis.branches.curves_dataset`).
+        Bifurcation curves in the plane of the map, drawn over it (`pipeline.analysis.branches.curves`).
     frame
         Width of the figure and ranges of its axes.
 
@@ -88,7 +90,7 @@ def plot_regimes(
     ValueError
         For an unknown `show`, if there are not two swept parameters left, and for curves in another plane.
     """
-    style.check_choice("show", show, KINDS)
+    style.check_choice("show", show, SHOWN)
     x, y = _axes(attractors, at)
     keep = (x, y, *start_dims(attractors))
     part = choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}")
@@ -317,7 +319,7 @@ def _rank(name: str) -> tuple[bool, list[tuple[float, str]]]:
     return name == "none", [(float(m) if m.isdigit() else math.inf, f"{len(m)}{m}") for m in members]
 
 
-def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
+def draw_regimes(run: OpenRun, options: RegimeOptions) -> style.DataFigure:
     """Draw the figure ``regimes`` of a run."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")
@@ -325,7 +327,7 @@ def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
     return noted(plot_regimes(found, show=options.show, at=at, curves=curves, frame=frame_of(options)), notes)
 
 
-def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
+def _curves_of(run: OpenRun, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
     """Compute the bifurcation curves of a run in the plane of a regime map, within the map's ranges."""
     x, y = _axes(attractors, at)
     axis = _swept_of(run, x, y)
@@ -342,7 +344,66 @@ def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.
     )
 
 
-def _swept_of(run: Run, x: str, y: str) -> str:
+def _swept_of(run: OpenRun, x: str, y: str) -> str:
     """Return the parameter along which branches are followed: `x` or `y`, whichever the run sweeps."""
     swept = [name for name in (x, y) if run.cube().sizes.get(name, 1) > 1]
     return swept[0] if len(swept) == 1 else x
+
+
+_CURVE_COLOURS = dict(zip(KINDS[:4], (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE), strict=True))
+
+
+@style.drawn
+def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
+    """Draw bifurcation curves and points of codimension two in the plane of two parameters.
+
+    Parameters
+    ----------
+    ds
+        From `pipeline.analysis.branches.curves`.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        The colour shows the kind, the dashes show the period. Points of codimension two have a dot and their
+        short name. Its `data` are the curves.
+    """
+    stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])
+    fig = style.new_figure(4.4, stored.assign_attrs(title="curves of bifurcations"), frame)
+    ax = fig.add_subplot()
+    style.style_axes(ax)
+    periods = sorted({int(p) for p in ds["orbit_period"].values})
+    seen: dict[tuple[int, str], Line2D] = {}
+    for i in range(ds.sizes["curve"]):
+        n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), KINDS[int(ds["kind"][i])]
+        (line,) = ax.plot(
+            ds["first"].values[i, :n],
+            ds["second"].values[i, :n],
+            color=_CURVE_COLOURS[kind],
+            linestyle=DASHES[periods.index(period) % len(DASHES)],
+            linewidth=1.2,
+            label=f"{NAMES[kind]}, period {period}",
+        )
+        seen.setdefault((period, kind), line)
+    style.label_axes(
+        ax,
+        labels.swept_label(str(ds.attrs["first_parameter"]), shown_unit(ds["first"].attrs)),
+        labels.swept_label(str(ds.attrs["second_parameter"]), shown_unit(ds["second"].attrs)),
+    )
+    style.limits(ax, frame)
+    mark_points(ax, ds, "first", "second", fig.look.tick)
+    style.caption(ax, labels.caption(ds, with_start=False))
+    style.legend_above(fig, [seen[key] for key in sorted(seen)], size=fig.look.tick)
+    style.finish(fig)
+    return fig
+
+
+def draw_curves(run: OpenRun, options: CurveFigureOptions) -> style.DataFigure:
+    """Draw the figure ``curves`` of a run, alone or over the regime map of another run."""
+    found = run.derive("curves", **options.part(CurveOptions))
+    if not options.over:
+        return plot_curves(found, frame=frame_of(options))
+    below = run.of(options.over).derive("attractors")
+    return plot_regimes(below, show=options.show, curves=found, frame=frame_of(options))

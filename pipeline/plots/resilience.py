@@ -11,14 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import ATTRACTS, model_of
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, periods_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.selection import at_points
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.products.figures import ResilienceFigureOptions
 from pipeline.products.resilience import ResilienceOptions
 
@@ -29,31 +27,12 @@ _LOOK: dict[str, Any] = {"linewidth": 0.9, "markersize": 4.0, "capsize": 2.0, "e
 def plot_resilience(
     ds: xr.Dataset, attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw how attractors respond to shocks, in three panels: basin stability, smallest shocks, arrival times.
+    """Draw how attractors respond to shocks: basin stability, smallest shocks, arrival times.
 
-    Parameters
-    ----------
-    ds
-        Result of the analysis ``resilience``.
-    attractors
-        Attractors of the run, for colours and names.
-    at
-        Values of the swept parameters, except one at most.
-    frame
-        Width of the figure and range of its horizontal axis.
-
-    Returns
-    -------
-    DataFigure
-        Bars are intervals. In the middle panel filled markers are the smallest critical shock of the chosen states,
-        open ones the distance to the boundary in any direction; triangles stand for sizes up to which no shock led
-        away. In the lower panel filled markers are means with standard errors, open ones the longest times. Its
-        `data` are the numbers drawn.
-
-    Raises
-    ------
-    ValueError
-        If more than one swept parameter is left.
+    Bars are intervals. In the middle panel filled markers are the smallest critical shock of the chosen states, open
+    ones the distance to the boundary in any direction; triangles stand for sizes up to which no shock led away. In the
+    lower panel filled markers are means with standard errors, open ones the longest times. Raise ValueError if more
+    than one swept parameter is left.
     """
     part, along = _selected(ds, at or {})
     cast = palette.cast_of(attractors)
@@ -160,7 +139,7 @@ def _dress(panels: Any, part: xr.Dataset, along: str, letters: list[str]) -> Non
     style.caption(panels[0], style.join([labels.caption(part, with_start=False), *about]))
 
 
-def draw(run: Run, options: ResilienceFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: ResilienceFigureOptions) -> style.DataFigure:
     """Draw the figure ``resilience`` of a run."""
     at, notes = values_of(run, options)
     cube = at_points(run.cube(), at)

@@ -12,11 +12,12 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.branches.table import fixed_of
+from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT, STABLE, UNSTABLE, stretches, with_located
-from pipeline.plots.figure import Run, frame_of
+from pipeline.plots.figure import frame_of
 from pipeline.plots.labels import Measure
 from pipeline.products.figures import ResponseFigureOptions
 from pipeline.products.response import ResponseOptions
@@ -215,7 +216,7 @@ def read_points(path: str | Path, parameter: str) -> dict[str, np.ndarray]:
     return {"parameter": found.pop(name), **found}
 
 
-def draw(run: Run, options: ResponseFigureOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: ResponseFigureOptions) -> style.DataFigure:
     """Draw the figure ``response`` of a run."""
     points = read_points(options.points, options.parameter) if options.points else None
     found = run.derive("response", **options.part(ResponseOptions))

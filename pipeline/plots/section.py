@@ -12,16 +12,14 @@ import xarray as xr
 from magpend_core.models.model import Model
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense, dims_of, isel
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
-from pipeline.layout.period_names import section_name
-from pipeline.layout.vocabulary import model_of, split_dims
+from pipeline.layout.vocabulary import model_of, section_name, split_dims
 from pipeline.plots import labels, palette, pixels, style
-from pipeline.plots.bifurcation import fixed_of
-from pipeline.plots.figure import Run, frame_of, noted, values_of
-from pipeline.plots.missing_cells import absent_handles, say_empty
-from pipeline.plots.motions import Motions
+from pipeline.plots.bifurcation import absent_handles, fixed_of, say_empty
+from pipeline.plots.figure import at_points, frame_of, noted, values_of
+from pipeline.plots.palette import Motions
 from pipeline.plots.points import View, make_view, survey
-from pipeline.plots.selection import at_points
 from pipeline.products.figures import SectionOptions
 
 _MOST_PT, _LEAST_PT = 1.7, 0.45
@@ -167,7 +165,7 @@ def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     return replace(view, ds=marked, motions=motions)
 
 
-def draw(run: Run, options: SectionOptions) -> style.DataFigure:
+def draw(run: OpenRun, options: SectionOptions) -> style.DataFigure:
     """Draw the figure ``section`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)

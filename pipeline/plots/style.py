@@ -143,21 +143,12 @@ STRIP = "<strip>"
 
 @dataclass
 class Target:
-    """Function that makes the next figure, and the figure that it has made.
+    """Function that makes the next figure, and the figure that it has made."""
 
-    Attributes
-    ----------
-    make : callable
-        ``make(figsize=..., layout=..., dpi=...)`` returns the empty figure; `dpi` may be None.
-    is_guest : bool
-        Whether it lies in axes or a figure of the caller, who sets its look.
-    made : DataFigure, optional
-        The figure, once it is made.
-    """
-
+    # ``make(figsize=..., layout=..., dpi=...)`` returns the empty figure; `dpi` may be None.
     make: Callable[..., DataFigure]
-    is_guest: bool = False
-    made: DataFigure | None = None
+    is_guest: bool = False  # whether it lies in axes or a figure of the caller, who sets its look
+    made: DataFigure | None = None  # the figure, once it is made
 
 
 TARGET: ContextVar[Target | None] = ContextVar("TARGET", default=None)
@@ -169,18 +160,8 @@ def new_figure(
 ) -> DataFigure:
     """Make an empty figure that holds the data to be drawn in it.
 
-    Parameters
-    ----------
-    height
-        [in] of a figure of full width; narrow ones are lower, but not in proportion.
-    data
-        Data that will be drawn.
-    frame
-        Width of the figure and ranges of its axes.
-    arranged
-        Whether `finish` finds the places of axes, labels and legends.
-    exact
-        Whether the height holds whatever the width.
+    `height` [in] is that of a figure of full width; narrow ones are lower, but not in proportion, unless it is `exact`.
+    `arranged` says whether `finish` finds the places of axes, labels and legends.
     """
     share = 1.0 if exact else min(frame.width / WIDE_MM, 1.0)
     size = (frame.width_in, height * (share + 0.3 * (1.0 - share)))
@@ -228,17 +209,7 @@ def finish(figure: DataFigure) -> None:
 
 
 def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
-    """Place the ticks of axes, unless they are the user's.
-
-    Parameters
-    ----------
-    ax
-        The axes.
-    inside
-        Ticks as in the style, inside on all four sides; else outside, where they do not lie on an image.
-    minor
-        Whether to have ticks between the ticks.
-    """
+    """Place the ticks of axes, unless they are the user's: `inside` as in the style, or outside of an image."""
     if is_guest():
         return
     if not inside:
@@ -406,13 +377,7 @@ def tinted(colour: str, tint: float) -> tuple[float, float, float]:
 
 
 def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
-    """Raise ValueError unless a value is among the allowed ones.
-
-    Raises
-    ------
-    ValueError
-        Naming the value, the allowed values and the nearest of them.
-    """
+    """Raise ValueError, with the allowed values and the nearest of them, unless a value is allowed."""
     if value in allowed:
         return
     near = difflib.get_close_matches(str(value), allowed, n=1)
@@ -421,13 +386,7 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def limits(ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
-    """Set the ranges of the axes to those of the `Frame` or, if it has none, to the given ones.
-
-    Raises
-    ------
-    ValueError
-        If a range is empty.
-    """
+    """Set the ranges of the axes to those of the `Frame` or else to the given ones; ValueError if one is empty."""
     for axis, asked, own in (("x", frame.xlim, x), ("y", frame.ylim, y)):
         chosen = asked or own
         if chosen is not None:
@@ -443,9 +402,7 @@ def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]
 
 
 def edges(x: np.ndarray) -> np.ndarray:
-    """Return the edges of the columns that are centred on given parameter values; there is one more edge than
-    values.
-    """
+    """Return the edges of the columns that are centred on parameter values, one more than there are values."""
     if x.size == 1:
         width = 0.05 * abs(float(x[0])) or 0.5
         return np.array([x[0] - width, x[0] + width])

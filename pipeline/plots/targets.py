@@ -87,14 +87,8 @@ def width_of(host: Host) -> float:
 class GuestFigure(DataFigure):
     """A figure whose panels, legends and texts lie in axes or a figure of the caller; it is not shown itself.
 
-    Parameters
-    ----------
-    host
-        The caller's axes, figure or subfigure.
-    figsize
-        Width and height [in] of a figure of its own; places in a figure count in these units.
-    arranged
-        Whether the layout of the caller's figure finds the places of panels and legends.
+    Places in the caller's figure count in units of `figsize` [in]. `arranged` says whether the layout of that figure
+    finds the places of panels and legends.
     """
 
     def __init__(self, host: Host, figsize: tuple[float, float], *, arranged: bool = True) -> None:

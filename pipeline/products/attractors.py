@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from pipeline.products.product import Analysis, Options, option
 
-_ROOM = "pipeline.analysis.attractors.product"
+_ROOM = "pipeline.analysis.attractors.analysis"
 
 
 class IdentifyOptions(Options):
@@ -70,7 +70,7 @@ ATTRACTORS = Analysis(
     run itself. Basin fractions are fractions of the cells that end on attractors, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
-    table="pipeline.analysis.attractors.table:attractors_table",
+    table="pipeline.analysis.attractors.analysis:attractors_table",
     builds_on=("identified",),
     figure="attractors",
 )
@@ -79,9 +79,9 @@ HYSTERESIS = Analysis(
     "hysteresis",
     "List where a continuation follows different attractors upwards and downwards, and where it jumps.",
     Options,
-    compute="pipeline.analysis.attractors.hysteresis_product:hysteresis",
-    table="pipeline.analysis.attractors.hysteresis_table:hysteresis_table",
-    needs="pipeline.analysis.attractors.hysteresis_product:needs_directions",
+    compute="pipeline.analysis.attractors.hysteresis:hysteresis",
+    table="pipeline.analysis.attractors.hysteresis:hysteresis_table",
+    needs="pipeline.analysis.attractors.hysteresis:needs_directions",
     builds_on=("attractors",),
     figure="attractors",
 )
@@ -93,7 +93,7 @@ SETTLING = Analysis(
     The option budget of the attractors says for how long a sample of their cells is integrated.
     Transient lifetimes are in drive periods or returns.""",
     Options,
-    compute="pipeline.analysis.attractors.settling_product:settling",
-    table="pipeline.analysis.attractors.settling_table:settling_table",
+    compute="pipeline.analysis.attractors.settling:settling",
+    table="pipeline.analysis.attractors.settling:settling_table",
     builds_on=("attractors",),
 )

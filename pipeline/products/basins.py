@@ -6,7 +6,7 @@ from typing import Literal
 
 from pipeline.products.product import Analysis, Options, option
 
-_ROOM = "pipeline.analysis.basins.product"
+_ROOM = "pipeline.analysis.basins.analysis"
 
 
 class BasinOptions(Options):
@@ -32,7 +32,7 @@ BASINS = Analysis(
     The last three need starts on a grid.""",
     BasinOptions,
     compute=f"{_ROOM}:basins",
-    table="pipeline.analysis.basins.table:basins_table",
+    table="pipeline.analysis.basins.analysis:basins_table",
     needs=f"{_ROOM}:needs_starts",
     builds_on=("attractors",),
     figure="basins",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.products.product import Analysis, Options, option
 
-_ROOM = "pipeline.analysis.branches.product"
+_ROOM = "pipeline.analysis.branches.analysis"
 
 
 class BranchOptions(Options):
@@ -64,7 +64,7 @@ BRANCHES = Analysis(
     the option that includes them.""",
     BranchOptions,
     compute=f"{_ROOM}:branches",
-    table="pipeline.analysis.branches.table:branches_table",
+    table="pipeline.analysis.branches.analysis:branches_table",
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
@@ -77,7 +77,7 @@ CURVES = Analysis(
     Starts from the bifurcations that `branches` locates.""",
     CurveOptions,
     compute=f"{_ROOM}:curves",
-    table="pipeline.analysis.branches.table:curves_table",
+    table="pipeline.analysis.branches.analysis:curves_table",
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
@@ -90,9 +90,9 @@ BANDS = Analysis(
     Newton's method carries each orbit and each bifurcation from the run's parameters to those of a draw. The columns
     median, low and high are those of the draws that have the bifurcation.""",
     BandOptions,
-    compute="pipeline.analysis.branches.bands_product:bands",
-    table="pipeline.analysis.branches.bands_product:bands_table",
-    settle="pipeline.analysis.branches.bands_product:settle_bands",
+    compute="pipeline.analysis.branches.bands:bands",
+    table="pipeline.analysis.branches.bands:bands_table",
+    settle="pipeline.analysis.branches.bands:settle_bands",
     builds_on=("branches",),
     figure="branches",
     # the digest says which draws
@@ -109,4 +109,29 @@ ORBITS = Analysis(
     compute="pipeline.analysis.branches.orbit_search:orbits",
     table="pipeline.analysis.branches.orbit_search:orbits_table",
     needs="pipeline.analysis.branches.orbit_search:needs_point",
+)
+
+
+_ROOM = "pipeline.analysis.branches.tongues"
+
+
+class TongueOptions(CurveOptions):
+    """Options for finding Arnold tongues and following their edges."""
+
+    max_denominator: int = option(5, "Largest q of the tongues p/q.", ge=1, le=64, flag="--denominator")
+    at: dict[str, float] = option({}, "Value of a further axis of the run: the row on which tongues are searched.")
+
+
+TONGUES = Analysis(
+    "tongues",
+    """Find the Arnold tongues p/q of a plane: where motions lock to the drive, p turns in q drive periods.
+
+    Searches one row of cells with rotation numbers for all fractions up to a denominator. Continues the folds at
+    the edges of each tongue in the plane of two parameters.""",
+    TongueOptions,
+    compute=f"{_ROOM}:tongues",
+    table=f"{_ROOM}:tongues_table",
+    needs=f"{_ROOM}:needs_rotation",
+    settle=f"{_ROOM}:settle_tongues",
+    figure="tongues",
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.products.product import Analysis, Options, option
 
-_ROOM = "pipeline.analysis.chaos.product"
+_ROOM = "pipeline.analysis.chaos.analysis"
 
 
 class ChaosOptions(Options):
@@ -36,7 +36,7 @@ CHAOS = Analysis(
     lyapunov in the run's specification. The 0-1 test needs 200 sections.""",
     ChaosOptions,
     compute=f"{_ROOM}:chaos",
-    table="pipeline.analysis.chaos.table:chaos_table",
+    table="pipeline.analysis.chaos.analysis:chaos_table",
     builds_on=("attractors",),
     figure="lyapunov",
     by_point=True,
@@ -51,7 +51,7 @@ DIMENSION = Analysis(
     of sections.""",
     DimensionOptions,
     compute=f"{_ROOM}:dimension",
-    table="pipeline.analysis.chaos.table:dimension_table",
+    table="pipeline.analysis.chaos.analysis:dimension_table",
     needs=f"{_ROOM}:needs_dimension",
     settle=f"{_ROOM}:settle_dimension",
     builds_on=("attractors",),

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pipeline.products.product import CellProduct, Options, option
-from pipeline.products.variable import Variable
+from pipeline.products.product import CellProduct, Options, Variable, option
 
 KINDS = ("min", "max", "mean")
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pipeline.products.branches import BranchOptions, CurveOptions
+from pipeline.products.branches import BranchOptions, CurveOptions, TongueOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
-from pipeline.products.product import Figure, FigureOptions, StateOptions, option
+from pipeline.products.product import Figure, FigureOptions, Options, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
-from pipeline.products.tongues import TongueOptions
 
 Per = Literal["s", "period"]
 
@@ -170,7 +169,7 @@ ATTRACTORS = Figure(
     "attractors",
     "Draw all coexisting attractors over the swept parameter, with the hysteresis of a continuation.",
     StateOptions,
-    "pipeline.plots.coexisting:draw",
+    "pipeline.plots.fractions:draw_coexisting",
 )
 
 GALLERY = Figure(
@@ -187,21 +186,21 @@ BASINS = Figure(
     "basins",
     "Draw basins of attraction: the attractor on which each initial state of a grid ends.",
     BasinFigureOptions,
-    "pipeline.plots.basins:draw",
+    "pipeline.plots.basins:draw_basins",
 )
 
 FRACTIONS = Figure(
     "fractions",
     "Draw basin fractions over the swept parameter, as stacked bands.",
     FigureOptions,
-    "pipeline.plots.fractions:draw",
+    "pipeline.plots.fractions:draw_fractions",
 )
 
 REGIMES = Figure(
     "regimes",
     "Draw a map of two swept parameters: coexisting periods or attractors, or their number.",
     RegimeOptions,
-    "pipeline.plots.regimes:draw",
+    "pipeline.plots.regimes:draw_regimes",
     panels="either",
 )
 
@@ -234,33 +233,33 @@ BRANCHES = Figure(
     "branches",
     "Draw branches of periodic orbits over the bifurcation diagram: solid stable, dashed unstable.",
     BranchFigureOptions,
-    "pipeline.plots.branches:draw",
+    "pipeline.plots.branches:draw_branches",
 )
 
 MULTIPLIERS = Figure(
     "multipliers",
     "Draw the Floquet multipliers along a branch in the complex plane, with the unit circle.",
     MultiplierOptions,
-    "pipeline.plots.multipliers:draw_multipliers",
+    "pipeline.plots.branches:draw_multipliers",
 )
 
 CURVES = Figure(
     "curves",
     "Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.",
     CurveFigureOptions,
-    "pipeline.plots.curves:draw",
+    "pipeline.plots.regimes:draw_curves",
 )
 
 ROTATION = Figure(
     "rotation",
     "Draw rotation numbers over a parameter, with the steps p/q (the devil's staircase), or as a map over two.",
     FigureOptions,
-    "pipeline.plots.rotation:draw",
+    "pipeline.plots.tongues:draw_rotation",
 )
 
 RESPONSE = Figure(
     "response",
-    "Draw amplitude and phase along a parameter: stable solid, unstable dashed, one colour for each level of the force.",
+    "Draw amplitude and phase along a parameter: stable solid, unstable dashed, one colour for each level of force.",
     ResponseFigureOptions,
     "pipeline.plots.response:draw",
     panels="several",
@@ -270,15 +269,15 @@ TONGUES = Figure(
     "tongues",
     "Draw the edges of the Arnold tongues p/q in a plane, over the map of rotation numbers if the run spans it.",
     TongueFigureOptions,
-    "pipeline.plots.tongues:draw",
-    needs="pipeline.analysis.branches.tongues_product:needs_rotation",
+    "pipeline.plots.tongues:draw_tongues",
+    needs="pipeline.analysis.branches.tongues:needs_rotation",
 )
 
 MANIFOLDS = Figure(
     "manifolds",
     "Draw the stable and unstable manifolds of saddle orbits, over the basins of a run on a grid of two states.",
     ManifoldFigureOptions,
-    "pipeline.plots.manifolds:draw",
+    "pipeline.plots.basins:draw_manifolds",
 )
 
 DRIFT = Figure(
@@ -295,7 +294,7 @@ RESILIENCE = Figure(
     Attractors stand side by side if nothing is swept. Bars show intervals.""",
     ResilienceFigureOptions,
     "pipeline.plots.resilience:draw",
-    needs="pipeline.analysis.resilience.product:needs_sweep",
+    needs="pipeline.analysis.resilience.analysis:needs_sweep",
     panels="several",
 )
 
@@ -303,8 +302,8 @@ EDGE = Figure(
     "edge",
     "Draw the edge states between two attractors, over the basins of a run on a grid of two states.",
     EdgeFigureOptions,
-    "pipeline.plots.edge:draw",
-    needs="pipeline.analysis.resilience.edge_product:needs_pair",
+    "pipeline.plots.basins:draw_edge",
+    needs="pipeline.analysis.resilience.edge:needs_pair",
 )
 
 ESCAPES = Figure(
@@ -313,7 +312,7 @@ ESCAPES = Figure(
 
     Over the strength σ of the noise, the horizontal axis is 1/σ².""",
     EscapeFigureOptions,
-    "pipeline.plots.escapes:draw",
+    "pipeline.plots.noise:draw_escapes",
     needs="pipeline.analysis.noise.escapes:needs_set",
     unless=("show", "paths"),
 )
@@ -322,6 +321,23 @@ DENSITY = Figure(
     "density",
     "Draw the density of noisy section points, over an axis with its peaks: a stochastic bifurcation diagram.",
     DensityFigureOptions,
-    "pipeline.plots.density:draw",
+    "pipeline.plots.noise:draw_density",
     panels="either",
 )
+
+
+MOST_FRAMES = 5000
+"""Most frames of a film; it takes some minutes to draw, and some hundred megabytes as GIF."""
+
+
+class AnimationOptions(Options):
+    """Options of an animation of a run."""
+
+    at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point to show.")
+    nearest: bool = option(False, "Use the axes' values nearest to --at, and print them; otherwise --at must match.")
+    degrees: bool = option(False, "Use degrees instead of radians.")
+    portrait: str = option("", "State whose phase portrait is shown.")
+    seconds: float = option(8.0, "Length of the film.", unit="s", gt=0.0, le=600.0)
+    fps: float = option(25.0, "Frames per second.", unit="1/s", gt=0.0, le=120.0)
+    speed: float | None = option(None, "Seconds of the model per second of film.", gt=0.0)
+    size: int = option(800, "Width of a frame.", unit="pixels", ge=200, le=4000)

@@ -8,8 +8,7 @@ import math
 from enum import IntEnum
 from typing import Any
 
-from pipeline.products.product import CellProduct, Options, option
-from pipeline.products.variable import Variable, flag_attrs
+from pipeline.products.product import CellProduct, Options, Variable, flag_attrs, option
 
 TANGENT_COST, MORE_COST, FEW = 2.0, 1.8, 4
 """Cost of a period with up to `FEW` tangent vectors, and of each further vector, in plain periods.

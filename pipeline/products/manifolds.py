@@ -5,7 +5,7 @@ from __future__ import annotations
 from pipeline.products.branches import OrbitOptions
 from pipeline.products.product import Analysis, option
 
-_ROOM = "pipeline.analysis.manifolds.product"
+_ROOM = "pipeline.analysis.manifolds.analysis"
 
 
 class ManifoldOptions(OrbitOptions):

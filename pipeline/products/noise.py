@@ -41,7 +41,7 @@ ESCAPES = Analysis(
     begins in, by the model's classifier. Over an axis of a strength, rates are fitted by Kramers' law.""",
     EscapeOptions,
     compute=f"{_ROOM}.escapes:escapes",
-    table=f"{_ROOM}.table:escapes_table",
+    table=f"{_ROOM}.escapes:escapes_table",
     needs=f"{_ROOM}.escapes:needs_set",
     figure="escapes",
     motion="noisy",
@@ -56,7 +56,7 @@ DENSITY = Analysis(
     Over an axis this is a stochastic bifurcation diagram.""",
     DensityOptions,
     compute=f"{_ROOM}.density:density",
-    table=f"{_ROOM}.table:density_table",
+    table=f"{_ROOM}.density:density_table",
     figure="density",
     motion="noisy",
 )

@@ -71,7 +71,7 @@ ANALYSES: Registry[Analysis] = Registry(
             "bands": ("branches", "a posterior of magpend identify"),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
-            "tongues": ("tongues", _ROTATION),
+            "tongues": ("branches", _ROTATION),
             "manifolds": ("manifolds", _POINT),
             "tangency": ("manifolds", _POINT + ", and two states"),
         },

@@ -21,9 +21,9 @@ RESPONSE = Analysis(
     peak; a phase is the lag behind the drive. Where a stable orbit ends, a trajectory is integrated on beyond to see
     where it lands.""",
     ResponseOptions,
-    compute="pipeline.analysis.response.response:response",
-    table="pipeline.analysis.response.table:response_table",
-    settle="pipeline.analysis.branches.product:settle_branches",
+    compute="pipeline.analysis.response.analysis:response",
+    table="pipeline.analysis.response.analysis:response_table",
+    settle="pipeline.analysis.branches.analysis:settle_branches",
     builds_on=("branches",),
     figure="response",
 )

@@ -8,8 +8,7 @@ import math
 from enum import IntEnum
 from typing import Any
 
-from pipeline.products.product import CellProduct, Options, option
-from pipeline.products.variable import Variable, flag_attrs
+from pipeline.products.product import CellProduct, Options, Variable, flag_attrs, option
 
 
 class RotationOptions(Options):

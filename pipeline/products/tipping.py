@@ -45,9 +45,9 @@ TIPPING = Analysis(
     For runs with a table [drift]. Every trajectory is integrated on at the final parameters, where attractors are found
     as by `attractors`. Where neighbouring values of the swept number lead to different attractors, it is bisected.""",
     TippingOptions,
-    compute=f"{_ROOM}.product:tipping",
-    table=f"{_ROOM}.table:tipping_table",
-    needs=f"{_ROOM}.product:needs_drift",
+    compute=f"{_ROOM}.analysis:tipping",
+    table=f"{_ROOM}.analysis:tipping_table",
+    needs=f"{_ROOM}.analysis:needs_drift",
     figure="drift",
     motion="drifting",
 )

@@ -1,9 +1,10 @@
-"""Define the estimate that every measure of a study returns, and the results that measures can read."""
+"""Define the estimate that every measure of a study returns, and judge claims by it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pipeline.runs.derive import AnalysedRun
@@ -11,36 +12,21 @@ from pipeline.runs.derive import AnalysedRun
 if TYPE_CHECKING:
     import xarray as xr
 
+
 NOWHERE = math.nan
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured value with its 95 % confidence interval.
+    """A measured value with its 95 % confidence interval."""
 
-    Attributes
-    ----------
-    value : float
-        The estimate; NaN if nothing could be measured.
-    low, high : float
-        95 % interval; NaN if nothing could be measured.
-    text : str
-        A phrase on the counted or located objects.
-    step : float or None
-        Largest step of the axis there, if it limits the resolution.
-    n : int or None
-        Number of independent cells, curves or periods behind the estimate.
-    missing : str
-        Reason why nothing could be measured; otherwise empty.
-    """
-
-    value: float
-    low: float
+    value: float  # the estimate; NaN if nothing could be measured
+    low: float  # low, high: 95 % interval; NaN if nothing could be measured
     high: float
-    text: str = ""
-    step: float | None = None
-    n: int | None = None
-    missing: str = ""
+    text: str = ""  # a phrase on the counted or located objects
+    step: float | None = None  # largest step of the axis there, if it limits the resolution
+    n: int | None = None  # number of independent cells, curves or periods behind the estimate
+    missing: str = ""  # reason why nothing could be measured; otherwise empty
 
 
 def absent(why: str, step: float | None = None) -> Estimate:
@@ -59,3 +45,42 @@ class Results(Protocol):
 
     def torques(self, name: str) -> Any:
         """Return the fit of the study's torque readings by name."""
+
+
+class Verdict(Enum):
+    """Verdict on a claim: met, not met, undecided, or used for calibration.
+
+    A claim on which parameters were calibrated tests nothing. It has its own verdict, whatever the result.
+    """
+
+    MET = "met"
+    NOT_MET = "not met"
+    UNDECIDED = "undecided"
+    CALIBRATED = "calibrated on this, so no test"
+
+    @property
+    def words(self) -> str:
+        """Verdict in words, for people."""
+        return self.value
+
+    @property
+    def css(self) -> str:
+        """CSS class of the block that shows this verdict on a page."""
+        return self.name.lower().replace("_", "-")
+
+    def __str__(self) -> str:
+        return self.value
+
+
+def judged(low: float, high: float, least: float, most: float) -> Verdict:
+    """Judge a claim: met if the confidence interval lies inside the claimed range, not met if outside, else undecided.
+
+    A claimed range is infinite on a side without a bound; the interval is NaN if nothing was measured.
+    """
+    if not low <= high:  # NaN too
+        return Verdict.UNDECIDED
+    if low >= least and high <= most:
+        return Verdict.MET
+    if high < least or low > most:
+        return Verdict.NOT_MET
+    return Verdict.UNDECIDED

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.report.verdicts import Verdict
+from pipeline.report.estimates import Verdict
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -33,28 +33,14 @@ MOST_ROWS = 60
 
 @dataclass(frozen=True)
 class Picture:
-    """Block of a page: a picture with its caption.
+    """Block of a page: a picture with its caption."""
 
-    Attributes
-    ----------
-    png : bytes
-        Content of the PNG file.
-    width, height : int
-        Size [pixels].
-    alt : str
-        Description for readers who do not see the picture.
-    caption : str
-        Caption below the picture.
-    command : str
-        Command that draws the picture.
-    """
-
-    png: bytes
-    width: int
+    png: bytes  # content of the PNG file
+    width: int  # width, height: size [pixels]
     height: int
-    alt: str
-    caption: str = ""
-    command: str = ""
+    alt: str  # description for readers who do not see the picture
+    caption: str = ""  # caption below the picture
+    command: str = ""  # command that draws the picture
     kind: str = "picture"
 
     @property
@@ -65,30 +51,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class Grid:
-    """Block of a page: a table.
+    """Block of a page: a table."""
 
-    Attributes
-    ----------
-    columns : sequence of str
-        Names of the columns.
-    rows : sequence of sequences of str
-        Cells of each row.
-    caption : str
-        Caption of the table.
-    command : str
-        Command that lists all rows.
-    n_more : int
-        Number of rows that are left out.
-    stacked : bool
-        Whether each row becomes several lines on a narrow screen, for tables with sentences.
-    """
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
-    command: str = ""
-    n_more: int = 0
-    stacked: bool = False
+    columns: Sequence[str]  # names of the columns
+    rows: Sequence[Sequence[str]]  # cells of each row
+    caption: str = ""  # caption of the table
+    command: str = ""  # command that lists all rows
+    n_more: int = 0  # number of rows that are left out
+    stacked: bool = False  # whether each row becomes several lines on a narrow screen, for tables with sentences
     kind: str = "grid"
 
 
@@ -128,33 +98,15 @@ class Source:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Block of a page: a claim, the measured result, and the verdict.
+    """Block of a page: a claim, the measured result, and the verdict."""
 
-    Attributes
-    ----------
-    statement : str
-        The claim, paraphrased.
-    source : str
-        Author and place of the claim.
-    found : str
-        The measured result with its interval.
-    verdict : str
-        See `pipeline.report.verdicts`.
-    reason : str
-        Reason for the verdict, if the numbers alone do not show it.
-    required : bool
-        Whether the command fails if the claim is contradicted.
-    command : str
-        Command that computes the result.
-    """
-
-    statement: str
-    source: str
-    found: str
-    verdict: Verdict
-    reason: str = ""
-    required: bool = False
-    command: str = ""
+    statement: str  # the claim, paraphrased
+    source: str  # author and place of the claim
+    found: str  # the measured result with its interval
+    verdict: Verdict  # see `pipeline.report.estimates`
+    reason: str = ""  # reason for the verdict, if the numbers alone do not show it
+    required: bool = False  # whether the command fails if the claim is contradicted
+    command: str = ""  # command that computes the result
     kind: str = "outcome"
 
 
@@ -172,24 +124,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a report page: its title, summary and sections.
+    """Content of a report page: its title, summary and sections."""
 
-    Attributes
-    ----------
-    title : str
-        Title of the page.
-    summary : sequence of blocks
-        Blocks above the sections.
-    parts : sequence of Part
-        Sections of the page.
-    made_by : str
-        Program and version.
-    """
-
-    title: str
-    summary: Sequence[Block]
-    parts: Sequence[Part]
-    made_by: str
+    title: str  # title of the page
+    summary: Sequence[Block]  # blocks above the sections
+    parts: Sequence[Part]  # sections of the page
+    made_by: str  # program and version
 
 
 def render(page: Page) -> str:

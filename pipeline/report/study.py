@@ -1,17 +1,27 @@
-"""Read a study (reproduction of a paper) from TOML: its runs, its figures, and its claims."""
+"""Read the file of a study, and compute its results, each once: runs, simulated recordings, fits of torque readings."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
+from pipeline.layout.writing import write_atomically
 from pipeline.products.registry import FIGURES
-from pipeline.specification.files import STUDY, read_toml, shipped_files
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.run import run
+from pipeline.specification.files import STUDY, find_spec, read_toml, shipped_files
 from pipeline.specification.problems import SpecError, problems_of, unknown_name, validated
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import Table
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.rig.virtual import Rig
 
 
 class RunTable(Table):
@@ -94,9 +104,7 @@ class ClaimTable(Table):
 
 
 class FigureTable(Table):
-    """Table ``[[figures]]`` of a study's file: figures of the paper, with the pictures and claims that reproduce
-    them.
-    """
+    """Table ``[[figures]]`` of a study's file: figures of the paper, with pictures and claims."""
 
     number: str = Field(description="Number of the figure, or several numbers; a name without spaces may replace it.")
     title: str = Field(description="Title of the figure.")
@@ -136,17 +144,7 @@ class StudyTable(Table):
 
 
 class Study:
-    """A study: its name, the path of its TOML file and the content of this file.
-
-    Parameters
-    ----------
-    name
-        Name of the study.
-    path
-        Path of the study's file.
-    table
-        Content of the file.
-    """
+    """A study: its name, the path of its TOML file and the content of this file."""
 
     def __init__(self, name: str, path: Path, table: StudyTable) -> None:
         self.name, self.path, self.table = name, path, table
@@ -162,13 +160,7 @@ def shipped_studies() -> dict[str, Path]:
 
 
 def load_study(name: str | Path) -> Study:
-    """Read a study, given by its TOML file or by the name of a study that ships with the package.
-
-    Raises
-    ------
-    SpecError
-        If keys, names or measures are wrong; the message lists all problems.
-    """
+    """Read a study, given by its file or the name of one that ships; raise SpecError with all its problems."""
     path, shipped = Path(name), shipped_studies()
     if not path.suffix and str(name) in shipped:
         path = shipped[str(name)]
@@ -215,3 +207,109 @@ def _plot_problems(at: str, picture: PictureTable) -> list[str]:
     except SpecError as error:
         return error.problems
     return []
+
+
+Echo = Callable[[str], None]
+
+
+class Results:
+    """Results of a study in a folder; each is computed when it is first needed, in small sizes if `smoke`.
+
+    Runs lie in ``runs/`` and are completed, not repeated. Recordings and fits take seconds and are computed
+    again, with the same numbers.
+    """
+
+    def __init__(self, study: Study, folder: Path, *, smoke: bool, workers: int | None, echo: Echo) -> None:
+        self.study, self.folder, self.smoke = study, folder, smoke
+        self._workers, self._echo = workers, echo
+        self._runs: dict[str, AnalysedRun] = {}
+        self._recordings: dict[str, xr.Dataset] = {}
+        self._torques: dict[str, Any] = {}
+
+    def prepare(self, names: set[str]) -> None:
+        """Check the inputs of the results that are needed, then compute the runs among them.
+
+        Raise SpecError with all problems of specifications, rigs and headers, before anything is computed.
+        """
+        self._check(names)
+        for name in self.study.table.runs:
+            if name in names:
+                self.run(name)
+
+    def _check(self, names: set[str]) -> None:
+        """Read all needed specifications and headers; raise a SpecError that lists all problems."""
+        table, problems = self.study.table, []
+        checks: list[tuple[str, Callable[[str], Any]]] = [
+            *((name, lambda name: Spec.read(self.spec(name), smoke=self.smoke)) for name in table.runs),
+            *((name, self.rig) for name in table.recordings),
+            *((name, self._measurement) for name in table.torques),
+        ]
+        for name, check in checks:
+            if name in names:
+                try:
+                    check(name)
+                except SpecError as error:
+                    problems += [f"{name}: {problem}" for problem in error.problems]
+        if problems:
+            raise SpecError(problems)
+
+    def spec(self, name: str) -> Path:
+        """Return the path of the specification of one of the study's runs."""
+        given = self.study.table.runs[name].spec
+        return self.study.file(given) if given.endswith(".toml") else find_spec(given)
+
+    def _measurement(self, name: str) -> Any:
+        from pipeline.report.torque_curves import measured
+
+        return measured(self.study.table.torques[name].header, self.study.path.parent)
+
+    def run(self, name: str) -> AnalysedRun:
+        """Compute the missing cells of one of the study's runs, and return the run."""
+        if name not in self._runs:
+            place = self.folder / "runs" / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            self._echo(f"{name}: {self.spec(name).name}")
+            run(self.spec(name), place, workers=self._workers, smoke=self.smoke, echo=self._echo)
+            self._runs[name] = AnalysedRun.of(place, self._echo)
+        return self._runs[name]
+
+    def computed(self) -> dict[str, AnalysedRun]:
+        """Return the runs of the study that are computed so far, by name."""
+        return dict(self._runs)
+
+    def rig(self, name: str) -> Rig:
+        """Return the simulated test rig that makes a recording of the study."""
+        from pipeline.rig.virtual import load_rig
+
+        return load_rig(self.study.file(self.study.table.recordings[name].rig))
+
+    def recording(self, name: str) -> xr.Dataset:
+        """Return a recording of a simulated test rig by name; it is computed at the first call."""
+        if name not in self._recordings:
+            from pipeline.rig.recordings import read_recording
+            from pipeline.rig.recordings.writing import write_raw
+            from pipeline.rig.virtual import simulated
+
+            self._echo(f"{name}: recording of a virtual rig")
+            raw, mapping = simulated(self.rig(name), is_csv=True)
+            place = self.folder / "recordings" / f"{name}.csv"
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_raw(raw, place)
+            write_atomically(place.with_suffix(".toml"), mapping.toml())
+            self._recordings[name] = read_recording(place, mapping)
+        return self._recordings[name]
+
+    def series(self, name: str, n_periods: int) -> xr.Dataset:
+        """Return a recording's time series, and that of the model integrated from the same state."""
+        from pipeline.rig.measured.series import series_of
+
+        return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)
+
+    def torques(self, name: str) -> Any:
+        """Return a fit of the study's torque readings by name; it is computed at the first call."""
+        if name not in self._torques:
+            from pipeline.report.torque_curves import fitted
+
+            self._echo(f"{name}: fit of torque readings")
+            self._torques[name] = fitted(self._measurement(name))
+        return self._torques[name]

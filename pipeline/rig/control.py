@@ -18,7 +18,7 @@ from pydantic import Field
 
 from magpend_core import rates
 from magpend_core.models.model import Parameters
-from pipeline.rig.simulation import rig_parameters
+from pipeline.rig.virtual import rig_parameters
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, checked, unknown_key, unknown_name
 from pipeline.specification.tables import Table
@@ -41,32 +41,15 @@ SURE = 2.0
 
 @dataclass(frozen=True)
 class Controlled:
-    """Settings of a virtual rig under feedback control: model, drive, gains, noise and measuring times.
+    """Settings of a virtual rig under feedback control: model, drive, gains, noise and measuring times."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        The rig's; the value of `drive` does not matter.
-    frequency_hz : float
-        Drive frequency [Hz].
-    state : str
-        Controlled state; its rate is measured as well.
-    drive : str
-        Parameter that is the amplitude of the drive, a cosine.
-    gains : tuple of float
-        Of the state and of its rate [the drive's unit per theirs].
-    noise : float
-        Standard deviation of the measured state; that of its rate is larger by the angular frequency.
-    n_settle, n_measure : int
-        Drive periods for which the rig settles after each change of the target, and that are then measured.
-    """
-
-    parameters: Parameters
+    parameters: Parameters  # the rig's; the value of `drive` does not matter
     frequency_hz: float
-    state: str
-    drive: str
-    gains: tuple[float, float] = (2.0, 1.0)
-    noise: float = 0.0
+    state: str  # controlled state; its rate is measured as well
+    drive: str  # parameter that is the amplitude of the drive, a cosine
+    gains: tuple[float, float] = (2.0, 1.0)  # of the state and of its rate [the drive's unit per theirs]
+    noise: float = 0.0  # standard deviation of the measured state; that of its rate is larger by the angular frequency
+    # drive periods for which the rig settles after each change of the target, and that are then measured
     n_settle: int = 12
     n_measure: int = 8
     seed: int = 0
@@ -74,37 +57,23 @@ class Controlled:
 
 @dataclass(frozen=True)
 class TracedOrbits:
-    """Traced orbits of the rig, one per target: median and standard deviation over the measured drive periods.
+    """Traced orbits of the rig, one per target: median and standard deviation over the measured drive periods."""
 
-    Attributes
-    ----------
-    drive : ndarray, (target,)
-        Amplitude of the drive.
-    amplitude, amplitude_sd : ndarray, (target,)
-        Half of the peak-to-peak value of the state.
-    residue : ndarray, (target,)
-        Largest further harmonic of the controller's output, in units of the first.
-    stable : tuple of str
-        ``yes`` where the drive grows along the branch, ``no`` where it falls, ``unknown`` where its scatter hides it.
-    """
-
-    drive: np.ndarray
+    drive: np.ndarray  # (target,) amplitude of the drive
+    # (target,) half of the peak-to-peak value of the state
     amplitude: np.ndarray
     amplitude_sd: np.ndarray
-    residue: np.ndarray
+    residue: np.ndarray  # (target,) largest further harmonic of the controller's output, in units of the first
+    # ``yes`` where the drive grows along the branch, ``no`` where it falls, ``unknown`` where its scatter hides it
     stable: tuple[str, ...]
 
 
 def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbits:
-    """Trace a branch: find one orbit for each amplitude of the target's first harmonic. Each orbit has a separate
-    virtual rig.
+    """Trace a branch: find one orbit for each amplitude of the target's first harmonic, each with a virtual rig of its
+    own.
 
-    Raises
-    ------
-    SpecError
-        If the state has no rate, the drive is no parameter that acts on it as a cosine, or a target is not positive.
-    ArithmeticError
-        If control fails: a rig diverges.
+    Raise `SpecError` if the state has no rate, the drive is no parameter that acts on it as a cosine, or a target is
+    not positive, and `ArithmeticError` if control fails: a rig diverges.
     """
     sizes = np.asarray(targets, np.float64)
     plant = _Plant.of(rig, sizes)
@@ -162,9 +131,7 @@ class _Plant:
     def run(
         self, state: np.ndarray, target: np.ndarray, n_periods: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Integrate the controlled rigs for some drive periods. Return the final states, and the measured state and the
-        controller's output at each sample.
-        """
+        """Integrate the rigs for some periods; return final states, and measured state and output at each sample."""
         period = 1.0 / self.rig.frequency_hz
         step, omega = period / SAMPLES, 2.0 * np.pi * self.rig.frequency_hz
         orders = np.arange(N_HARMONICS + 1)
@@ -197,9 +164,7 @@ class _Plant:
 
 
 def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray:
-    """Return the change of the rates under a drive of amplitude 1 at phase 0; raise SpecError unless the drive is a
-    cosine.
-    """
+    """Return the change of the rates under a drive of amplitude 1 at phase 0; raise SpecError unless it is a cosine."""
     shares = np.array([0.0, 0.125, 0.25, 0.5])
     states = np.stack([np.zeros(len(still.model.state_names)), 0.3 * np.asarray(still.model.scales)])
     found = np.array(
@@ -227,9 +192,7 @@ def _harmonics(signal: np.ndarray) -> np.ndarray:
 
 
 def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) -> tuple[str, ...]:
-    """Return ``yes``, ``no`` or ``unknown`` for the stability of each orbit, from the slope of the drive's amplitude
-    along the branch.
-    """
+    """Return the stability of each orbit, from the slope of the drive's amplitude along the branch."""
     if len(targets) < 2:
         return ("unknown",) * len(targets)
     order = np.argsort(targets)
@@ -244,9 +207,7 @@ def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) ->
 
 
 class ControlTable(Table):
-    """Table ``[control]`` of a virtual rig: controlled state, drive, gains, noise, and the range of target
-    amplitudes.
-    """
+    """Table ``[control]`` of a virtual rig: controlled state, drive, gains, noise, and range of the target."""
 
     state: str = Field(description="Controlled state; its rate is measured as well.")
     drive: str = Field(description="Parameter that is the amplitude of the drive, a cosine; control acts through it.")
@@ -263,13 +224,9 @@ class ControlTable(Table):
 
 
 def load_control(path: str | Path) -> tuple[Controlled, np.ndarray]:
-    """Read the specification of a virtual rig with the table ``[control]``. Return the settings and the target
-    amplitudes.
+    """Read a virtual rig with the table ``[control]``; return the settings and the target amplitudes.
 
-    Raises
-    ------
-    SpecError
-        With all problems at once; also if the file cannot be read.
+    Raise `SpecError` with all problems at once.
     """
     path, problems = Path(path), []
     data = read_toml(path)

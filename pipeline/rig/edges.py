@@ -36,50 +36,32 @@ class Timing(NamedTuple):
     """Frequency, jitter and duty cycle of a drive signal, from a line through the times of its rising edges.
 
     Errors are standard errors.
-
-    Attributes
-    ----------
-    jitter_s : float
-        Root mean square distance of the edges from the line [s].
-    duty_cycle, duty_cycle_error : float
-        Fraction of the period in the high state; NaN if no falling edge lies between rising ones.
-    n_periods : int
-        Number of periods from the first edge to the last.
     """
 
     frequency_hz: float
     frequency_error_hz: float
-    jitter_s: float
+    jitter_s: float  # root mean square distance of the edges from the line [s]
+    # fraction of the period in the high state; NaN if no falling edge lies between rising ones
     duty_cycle: float
     duty_cycle_error: float
-    n_periods: int
+    n_periods: int  # number of periods from the first edge to the last
 
 
 @dataclass(frozen=True)
 class Edges:
-    """The times at which a drive signal crosses the middle between its two levels.
+    """The times at which a drive signal crosses the middle between its two levels."""
 
-    Attributes
-    ----------
-    rising, falling : ndarray
-        Times of the edges [s], in rising order.
-    resolution_s : float
-        Sampling interval if the signal switches between two samples, so that an edge is only known to lie
-        between them [s]; 0 if samples lie on the flanks.
-    noise_s : float
-        Standard error of an edge's time from the signal's noise on its flanks [s].
-    """
-
+    # times of the edges [s], in rising order
     rising: Floats
     falling: Floats
+    # sampling interval if the signal switches between two samples, so that an edge is only known to lie between them
+    # [s]; 0 if samples lie on the flanks
     resolution_s: float = 0.0
-    noise_s: float = 0.0
+    noise_s: float = 0.0  # standard error of an edge's time from the signal's noise on its flanks [s]
 
     @property
     def error_s(self) -> float:
-        """Standard error of an edge's time [s] from sampling and measurement noise; the jitter of the drive is not
-        included.
-        """
+        """Standard error of an edge's time [s] from sampling and noise, without the jitter of the drive."""
         return math.hypot(self.resolution_s / math.sqrt(12), self.noise_s)
 
     def between(self, start_s: float, end_s: float) -> Edges:
@@ -91,14 +73,10 @@ class Edges:
         """Fit a line through the times of the rising edges against their numbers; return frequency, jitter and duty
         cycle.
 
-        Missing edges are counted by the median distance of neighbours. The standard errors assume independent
-        jitter. They include the rounding to samples: if edges fall on the same few places between samples,
-        their scatter does not reveal an offset of up to half a sampling interval.
-
-        Raises
-        ------
-        SpecError
-            If there are fewer than three rising edges, or they scatter by more than a fifth of a period.
+        Missing edges are counted by the median distance of neighbours. The standard errors assume independent jitter.
+        They include the rounding to samples: if edges fall on the same few places between samples, their scatter does
+        not reveal an offset of up to half a sampling interval. Raise `SpecError` if there are fewer than three rising
+        edges, or they scatter by more than a fifth of a period.
         """
         rising = self.rising
         if rising.size < 3:
@@ -119,9 +97,7 @@ class Edges:
         return Timing(1 / period, error / period**2, jitter, duty, duty_error, int(number[-1]))
 
     def _duty_cycle(self, fitted: Floats, period: float, jitter: float) -> tuple[float, float]:
-        """Return the mean duty cycle and its standard error; each falling edge is paired with the last rising edge
-        before it.
-        """
+        """Return the mean duty cycle and its error; a falling edge is paired with the last rising edge before it."""
         before = np.searchsorted(self.rising, self.falling, side="right") - 1
         high = np.where(before >= 0, self.falling - self.rising[before], np.inf)
         before, high = before[high < period], high[high < period]
@@ -136,12 +112,8 @@ class Edges:
     def common_error(self, fitted: Floats, scatter: float) -> float:
         """Return the standard error [s] of the time offset of a line fitted through the edges.
 
-        Parameters
-        ----------
-        fitted
-            Times of the rising edges on the line [s].
-        scatter
-            Root mean square distance of the edges from it [s].
+        `fitted` are the times of the rising edges on the line [s], `scatter` the root mean square distance of the edges
+        from it [s].
         """
         return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
 
@@ -169,49 +141,23 @@ class Edges:
 
 
 def find_edges(time: npt.ArrayLike, drive: npt.ArrayLike, *, hysteresis: float | None = None) -> Edges:
-    """Return the times at which a drive signal crosses the middle between its two levels.
+    """Return the times at which a drive signal crosses the middle between its two levels, by linear interpolation.
 
-    Parameters
-    ----------
-    time
-        Times of the samples [s], rising, shape (n,).
-    drive
-        Signal or torque in any unit, shape (n,); finite.
-    hysteresis
-        Width of the band about the middle that an edge must cross completely, in the signal's unit; by
-        default half the distance of the levels.
+    An edge must cross a band about the middle, of the width `hysteresis` (by default half the distance of the levels),
+    completely. If noise crosses the middle several times on one flank, the mean of the first and the last crossing
+    counts. A crossing inside a gap of the sampling is left out.
 
-    Returns
-    -------
-    Edges
-        Times by linear interpolation at the middle. If noise crosses the middle several times on one flank,
-        the mean of the first and the last crossing counts. A crossing inside a gap of the sampling is left
-        out.
-
-    Raises
-    ------
-    SpecError
-        If lengths differ, a value is not finite, time does not rise, or the band is not inside the levels;
-        also for a constant drive, which has no two levels above its noise.
+    Raise `SpecError` if lengths differ, a value is not finite, time does not rise, or the band is not inside the
+    levels; also for a constant drive, which has no two levels above its noise.
     """
     t, x = _checked(time, drive)
     return _found([(t, x)], _switch(x, hysteresis))
 
 
 def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges:
-    """Return the edges of the drive signal in all pieces of a recording. Edges in gaps between the pieces are left out.
+    """Return the edges of the drive signal in all pieces of a recording; edges in gaps between the pieces are left out.
 
-    Parameters
-    ----------
-    recording
-        Recording from `pipeline.rig.recordings.read_recording`, with a drive.
-    hysteresis
-        Width of the band about the middle; see `find_edges`.
-
-    Raises
-    ------
-    SpecError
-        If the recording has no drive, or no piece of it has an edge.
+    Raise `SpecError` if the recording has no drive, or no piece of it has an edge. See `find_edges`.
     """
     if DRIVE not in recording:
         name = recording.attrs.get("file", "the recording")
@@ -228,9 +174,7 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
 
 @dataclass(frozen=True)
 class _Switch:
-    """Two-level signal: middle and distance of its levels, width of the hysteresis band about the middle, and noise of
-    a sample.
-    """
+    """Two-level signal: middle and distance of its levels, width of the hysteresis band, and noise of a sample."""
 
     middle: float
     span: float
@@ -239,9 +183,7 @@ class _Switch:
 
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
-    """Estimate the two levels of a drive signal and its noise. Raise SpecError if the difference of the levels is
-    within the noise.
-    """
+    """Estimate the levels of a drive signal and its noise; raise SpecError if the noise hides their difference."""
     low, high, noise = _levels(x)
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
@@ -256,9 +198,7 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
 
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
-    """Return the edges of a drive signal, in order. The signal is a sequence of stretches, each a pair of arrays
-    (sample times, values).
-    """
+    """Return the edges of a drive signal, in order, from its stretches (sample times, values)."""
     instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
@@ -306,18 +246,14 @@ def _levels(x: Floats) -> tuple[float, float, float]:
 
 
 def _crossing(t: Floats, above: Floats) -> float:
-    """Return the time of a sign change, by linear interpolation. If there are several sign changes, return the mean of
-    the first and the last.
-    """
+    """Return the time of a sign change by linear interpolation; of several, the mean of the first and the last."""
     at = np.flatnonzero((above[:-1] > 0) != (above[1:] > 0))[[0, -1]]
     share = above[at] / (above[at] - above[at + 1])
     return float((t[at] + share * (t[at + 1] - t[at])).mean())
 
 
 def _numbers(rising: Floats) -> Floats:
-    """Return the number of each rising edge, counted in drive periods from the first. Missing edges are counted as
-    well.
-    """
+    """Return the number of each rising edge from the first, counted in drive periods, missing edges included."""
     gaps = np.diff(rising)
     steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
     return np.concatenate([[0.0], np.cumsum(steps)])

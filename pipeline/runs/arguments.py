@@ -11,7 +11,6 @@ from typing import Any, ParamSpec, TypeVar
 
 from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, FIGURES
-from pipeline.specification.problems import shown, unknown_key
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -78,32 +77,6 @@ def names_arguments(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **kwargs)
 
     return called
-
-
-def knows_its_keys(method: Callable[P, T]) -> Callable[P, T]:
-    """Wrap a method of `Spec`, or its constructor, so that an unknown keyword raises a TypeError that says what is
-    right.
-    """
-    path = method.__qualname__.removesuffix(".__init__").rpartition(".")[2]
-
-    @wraps(method)
-    def called(*args: P.args, **kwargs: P.kwargs) -> T:
-        parameters = inspect.signature(method).parameters
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-            keys = list(parameters)[1:]
-            unknown = [_unknown(path, key, value, keys) for key, value in kwargs.items() if key not in keys]
-            if unknown:
-                raise TypeError("\n".join(unknown))
-        return method(*args, **kwargs)
-
-    return called
-
-
-def _unknown(path: str, key: str, value: Any, keys: list[str]) -> str:
-    hint = (
-        f" A parameter of the model is given by overrides={{{key!r}: {shown(value)}}}." if "overrides" in keys else ""
-    )
-    return unknown_key(f"{path}.{key}", key, keys) + hint
 
 
 def in_python(text: str, kinds: Kinds, flags: Mapping[str, str]) -> str:

@@ -22,7 +22,7 @@ from magpend_core.models import import_model
 from magpend_core.models.imported import origin
 from magpend_core.models.model import Model
 from pipeline.analysis.ragged import isel, joined
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.compute import clients, execute
 from pipeline.compute.clients import Where
 from pipeline.compute.threads import writing_results
@@ -32,11 +32,10 @@ from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import report
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.versions import current, key_of
-from pipeline.specification.parsing import Spec
-from pipeline.store.blocks import read_block, write_block
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files
-from pipeline.store.products import BLOCKS
+from pipeline.store.products import BLOCKS, read_block, write_block
 
 WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 8192
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
@@ -48,9 +47,9 @@ PlacedRun = Any
 
 @dataclass(frozen=True)
 class Part:
-    """A run of which only a block of parameter points is analysed, see `pipeline.analysis.run.Run`."""
+    """A run of which only a block of parameter points is analysed, see `pipeline.analysis.run.OpenRun`."""
 
-    run: Run
+    run: OpenRun
     block: Block
     known: dict[str, xr.Dataset] = field(default_factory=dict)
 

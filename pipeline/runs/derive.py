@@ -14,7 +14,7 @@ A run has one set of attractors, on which its other analyses and its figures res
 last sought are in ``derived/attractors.json`` (`pipeline.runs.versions.attractor_options`); results that rest on
 others are stale.
 
-To add an analysis see `pipeline.products.product`.
+CONTRIBUTING.md tells how to add an analysis.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from pipeline.layout.conventions import conventional
 from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
-from pipeline.runs import notebook
 from pipeline.runs.naming import named
+from pipeline.runs.progress import bar_in_notebook
 from pipeline.runs.versions import OF_ATTRACTORS, attractor_options, current, key_of
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
@@ -48,7 +48,7 @@ from pipeline.store.products import (
     remove_product,
     write_product,
 )
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
-Source = str | Path | Run
+Source = str | Path | RunDirectory
 
 _LEFTOVER_SECONDS = 3600.0
 
@@ -66,31 +66,22 @@ def _silent(_: str) -> None:
 
 
 @dataclass(frozen=True, repr=False)
-class AnalysedRun(Run):
-    """An opened run for analyses; an analysis gets from it the results of other analyses.
+class AnalysedRun(RunDirectory):
+    """An opened run for analyses; an analysis gets from it the results of other analyses."""
 
-    Attributes
-    ----------
-    echo : callable
-        Function that prints a line.
-    workers : int, optional
-        Number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`;
-        of threads of the engine for an analysis without blocks.
-    where : Where, optional
-        Place of the computation of blocks.
-    """
-
-    echo: Echo = _silent
+    echo: Echo = _silent  # function that prints a line
+    # number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`; of
+    # threads of the engine for an analysis without blocks
     workers: int | None = None
-    where: Where | None = None
+    where: Where | None = None  # place of the computation of blocks
 
     @classmethod
     def of(cls, source: Source, echo: Echo | None = None, **places: Any) -> AnalysedRun:
         """Open a run directory for analyses, or convert a run that is open already."""
-        run = Run.open(source)
+        run = RunDirectory.open(source)
         if isinstance(run, AnalysedRun) and echo is None and not places:
             return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent, **places)
+        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)}, echo=echo or _silent, **places)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of an analysis of this run, computed now or read if it is stored."""
@@ -172,7 +163,7 @@ def derive(
     why = unwritable(place.local.parent) if place.local is not None else ""
     if why:
         run.echo(f"{why}: the result of {name} is shown but not kept")
-    with notebook.progress():
+    with bar_in_notebook():
         computed = _compute(run, analysis, wanted, can_keep=not why)
         others = {k: value for k, value in computed.attrs.items() if k not in key}
         result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))
@@ -229,7 +220,7 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
     lazy
         Whether numbers are read when they are used.
     """
-    run = Run.open(source)
+    run = RunDirectory.open(source)
     folder = run.info.files.below(DERIVED)
     places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
     if not places:
@@ -249,7 +240,7 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
         yield result
 
 
-def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
+def _changed_options(run: RunDirectory, name: str, attrs: Mapping[str, Any]) -> int:
     try:
         defaults = attractor_options(run) if name == "attractors" else validated(ANALYSES[name].options, {})
         options = prepared(AnalysedRun.of(run), ANALYSES[name], defaults).plain()
@@ -286,7 +277,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
     return options
 
 
-def _keep(run: Run, options: Options) -> None:
+def _keep(run: RunDirectory, options: Options) -> None:
     with contextlib.suppress(OSError):  # a folder that is read alone keeps its attractors
         run.info.files.below(DERIVED).write(OF_ATTRACTORS, json.dumps(options.plain()).encode())
 
@@ -348,10 +339,10 @@ def stale(source: Source) -> list[str]:
     process that was killed. Leftovers younger than an hour may belong to a running process and are not
     listed. Blocks of results that are not complete are listed.
     """
-    return [place.name for place in _stale(Run.open(source))]
+    return [place.name for place in _stale(RunDirectory.open(source))]
 
 
-def _stale(run: Run) -> list[Files]:
+def _stale(run: RunDirectory) -> list[Files]:
     folder = run.info.files.below(DERIVED)
 
     def is_stale(place: Files) -> bool:
@@ -368,7 +359,7 @@ def _stale(run: Run) -> list[Files]:
 
 def prune(source: Source) -> list[str]:
     """Remove the stored results that `stale` lists, and return their paths."""
-    found = _stale(Run.open(source))
+    found = _stale(RunDirectory.open(source))
     for place in found:
         remove_product(place)
     return [place.name for place in found]

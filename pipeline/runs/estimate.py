@@ -18,9 +18,9 @@ import numpy as np
 
 from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
 """Size of a sample: branches (two groups of lanes or more), most branches, points of each branch."""
@@ -46,21 +46,11 @@ FILE_S = 0.004
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated computing time of a run on one core of this machine.
+    """Estimated computing time of a run on one core of this machine."""
 
-    Attributes
-    ----------
-    core_seconds : float
-        Time of all cells on one core [s].
-    how : str
-        Phrase on how it was measured.
-    compiled_s : float
-        Time spent on compiling [s].
-    """
-
-    core_seconds: float
-    how: str
-    compiled_s: float
+    core_seconds: float  # time of all cells on one core [s]
+    how: str  # phrase on how it was measured
+    compiled_s: float  # time spent on compiling [s]
 
 
 def estimate(spec: Spec, plan: Plan) -> Estimate:
@@ -75,7 +65,7 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
     most, products = periods_per_cell(spec)
     # products that the engine computes while integrating are measured with it
     watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].watches(o)}
-    spec = replace(spec, products=watched)
+    spec = spec.replace(products=watched)
     products -= periods_per_cell(spec)[1]
     inputs = _sample(spec, plan, np.random.default_rng(0), BRANCHES, pairs=False)
     ratio, measured, seconds = _speed(spec, inputs, most)
@@ -202,7 +192,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
         update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": NEVER_CLOSES}
     )
     started = time.process_time()
-    values = integrate(replace(spec, integration=integration), inputs)
+    values = integrate(spec.replace(integration=integration), inputs)
     seconds = time.process_time() - started
     ends = values["section"][:, -1, -1]
     a_period = spec.motion.seconds_per_period(inputs.frequency_hz)
@@ -227,7 +217,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
             cap = int(min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))
             integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})
         started = time.process_time()
-        values = integrate(replace(spec, integration=integration), inputs)
+        values = integrate(spec.replace(integration=integration), inputs)
         left -= time.process_time() - started
         periods = values["n_periods"]
         found = np.append(found, periods[:, 1::2] if periods.shape[1] > 1 else periods)

@@ -15,51 +15,38 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.layout.cells import CellMap
-from pipeline.layout.domains import check_starts
+from pipeline.layout.evaluation import check_starts, with_sizes
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import with_sizes
 from pipeline.layout.writing import sync_folder
 from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size
 from pipeline.runs.run import Echo, carry_out, identity_here
 from pipeline.runs.status import State, state
-from pipeline.runs.widen import Widening, widened
-from pipeline.runs.workflows import find_spec
-from pipeline.runs.zoom import derived_toml
-from pipeline.specification.parsing import Spec, load_spec
+from pipeline.runs.zoom import Widening, derived_toml, widened
+from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files
-from pipeline.store.places import open_files
-from pipeline.store.run import Run
+from pipeline.store.objects import open_files
+from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import is_run
 
 
 @dataclass(frozen=True)
 class Extension:
-    """Plan of a wider run, with the earlier runs from which it copies cells.
+    """Plan of a wider run, with the earlier runs from which it copies cells."""
 
-    Attributes
-    ----------
-    spec, text, plan, identity
-        The wider run.
-    runs : tuple of Run
-        Runs whose cells are reused.
-    counts : tuple of int
-        Number of reused cells of each.
-    notes : tuple of str
-        Remarks on runs that are incomplete or have no suitable cells.
-    """
-
+    # the wider run
     spec: Spec
     text: str
     plan: Plan
     identity: Mapping[str, Any]
-    runs: tuple[Run, ...]
-    counts: tuple[int, ...]
-    notes: tuple[str, ...]
+    runs: tuple[RunDirectory, ...]  # runs whose cells are reused
+    counts: tuple[int, ...]  # number of reused cells of each
+    notes: tuple[str, ...]  # remarks on runs that are incomplete or have no suitable cells
 
     @property
     def reused(self) -> int:
@@ -78,7 +65,7 @@ class Extension:
         left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
         return left / self.plan.n_cells
 
-    def _more(self, run: Run) -> float:
+    def _more(self, run: RunDirectory) -> float:
         """Return the fraction of a cell's periods that must still be integrated after it is copied."""
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
@@ -116,7 +103,7 @@ def plan_extension(
     RefusedError
         If no cell can be reused; the message lists the reasons.
     """
-    runs = [Run.open(source) for source in sources]
+    runs = [RunDirectory.open(source) for source in sources]
     wide, text = _wide(runs[0], spec, widening or Widening())
     check_starts(wide)
     plan = make_plan(wide)
@@ -132,13 +119,13 @@ def plan_extension(
     return Extension(wide, text, plan, identity, tuple(fitting), tuple(counts), tuple(notes))
 
 
-def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
+def _wide(run: RunDirectory, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
     """Return the specification of the wider run, as an object and as text."""
     if spec is None and not widening:
         raise SpecError("extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM.")
     if spec is not None:
         path = find_spec(spec)
-        parsed = with_sizes(load_spec(path), run.spec)
+        parsed = with_sizes(Spec.read(path), run.spec)
         if not widening:
             return parsed, path.read_text("utf-8")
         wide, origin = widened(parsed, widening), f"specification {path.name}"
@@ -148,7 +135,9 @@ def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, 
     return wide, derived_toml("Extended", origin, wide)
 
 
-def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tuple[list[Run], list[str]]:
+def _fitting(
+    runs: Sequence[RunDirectory], wide: Spec, identity: Mapping[str, Any]
+) -> tuple[list[RunDirectory], list[str]]:
     """Select the earlier runs whose cells can be copied, with notes on the others."""
     from pipeline.compute.reuse import obstacles
 
@@ -167,7 +156,7 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
     return fitting, notes
 
 
-def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
+def _census(wide: Spec, plan: Plan, runs: Sequence[RunDirectory]) -> list[int]:
     from pipeline.compute.reuse import Pool
 
     pool, cells = Pool(wide, runs), CellMap(wide)
@@ -178,7 +167,7 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
     return counts
 
 
-def _strangers(run: Run, wide: Spec) -> list[str]:
+def _strangers(run: RunDirectory, wide: Spec) -> list[str]:
     """Return why none of the cells of an earlier run can be copied, although its settings fit."""
     if not run.commits:
         return [f"{run.name}: it has no committed cells"]
@@ -269,7 +258,7 @@ def extend(
     extension = plan_extension((source, *also), spec, widening)
     if not in_place:
         return _build(extension, built, **how)
-    old = Run.open(first)
+    old = RunDirectory.open(first)
     if extension.digest == old.info.digest:
         return _as_it_is(old, echo)
     _refuse_loss(old, extension.spec)
@@ -328,7 +317,7 @@ def _aside(directory: Path) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def _as_it_is(run: Run, echo: Echo) -> State:
+def _as_it_is(run: RunDirectory, echo: Echo) -> State:
     if not run.complete:
         raise RefusedError(
             f"{run.name}: this is its own specification, and the run is not complete; complete it with: "
@@ -338,7 +327,7 @@ def _as_it_is(run: Run, echo: Echo) -> State:
     return state(run)
 
 
-def _refuse_loss(run: Run, wide: Spec) -> None:
+def _refuse_loss(run: RunDirectory, wide: Spec) -> None:
     """Raise RefusedError if the wider run lacks cells or products of the run that it would replace."""
     cells, finder, lost = CellMap(run.spec), Finder(wide), 0
     for index in run.commits:

@@ -11,7 +11,7 @@ import numpy as np
 
 from magpend_core.models.sectioned import of_flow
 from pipeline.layout.vocabulary import model_attribute, section_attributes
-from pipeline.products.animation import MOST_FRAMES, AnimationOptions
+from pipeline.products.figures import MOST_FRAMES, AnimationOptions
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
@@ -34,56 +34,27 @@ MOST_SAMPLES = 2_000_000
 
 @dataclass(frozen=True)
 class Moving:
-    """A motion to animate: parameters, initial state, section points, period, name and colour.
+    """A motion to animate: parameters, initial state, section points, period, name and colour."""
 
-    Attributes
-    ----------
-    name, colour : str
-        Title of its frame, and colour of its lines.
-    parameters : Parameters
-        Parameters of its model.
-    frequency_hz : float
-        Drive frequency [Hz]; any positive number for a flow.
-    start : ndarray
-        State at time 0, the time of a section.
-    section : ndarray
-        Section points (k, n_states) to be shown; k may be 0.
-    period_s : float
-        Period [s]; NaN if the motion does not repeat, 0 if it rests.
-    """
-
+    # title of its frame, and colour of its lines
     name: str
     colour: str
-    parameters: Parameters
-    frequency_hz: float
-    start: np.ndarray
-    section: np.ndarray
-    period_s: float = math.nan
+    parameters: Parameters  # parameters of its model
+    frequency_hz: float  # drive frequency [Hz]; any positive number for a flow
+    start: np.ndarray  # state at time 0, the time of a section
+    section: np.ndarray  # section points (k, n_states) to be shown; k may be 0
+    period_s: float = math.nan  # period [s]; NaN if the motion does not repeat, 0 if it rests
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Timing of an animation: speed, duration, frames, and samples between frames.
+    """Timing of an animation: speed, duration, frames, and samples between frames."""
 
-    Attributes
-    ----------
-    speed : float
-        Seconds of the model per second of film.
-    duration : float
-        Time of the model that the film shows [s].
-    n_frames : int
-        Number of frames.
-    substeps : int
-        Number of samples from frame to frame.
-    repeats : bool
-        Whether the frame after the last would be the first.
-    """
-
-    speed: float
-    duration: float
-    n_frames: int
-    substeps: int
-    repeats: bool
+    speed: float  # seconds of the model per second of film
+    duration: float  # time of the model that the film shows [s]
+    n_frames: int  # number of frames
+    substeps: int  # number of samples from frame to frame
+    repeats: bool  # whether the frame after the last would be the first
 
     @property
     def times(self) -> np.ndarray:

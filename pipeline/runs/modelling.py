@@ -9,12 +9,12 @@ import numpy as np
 
 from magpend_core.models.model import Model, Parameters
 from pipeline.layout.cells import CellMap
-from pipeline.layout.domains import check_starts, check_states
-from pipeline.runs.workflows import find_spec
+from pipeline.layout.evaluation import check_starts, check_states
 from pipeline.specification.files import check_new_file, read_toml, write_new
 from pipeline.specification.models import find_model, is_model_file
-from pipeline.specification.parsing import KINDS, Spec, load_spec
+from pipeline.specification.parsing import KINDS
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 from pipeline.store.local import refuse_place
 
@@ -56,7 +56,7 @@ def examine(name: str) -> tuple[Model, Description]:
 def _specification(name: str) -> Spec | None:
     if not is_model_file(name) or read_toml(name).get("kind") not in KINDS:
         return None
-    return load_spec(find_spec(name))
+    return Spec.read(name)
 
 
 def _near_zero(model: Model) -> tuple[Parameters, float, np.ndarray]:

@@ -14,12 +14,12 @@ from pipeline.specification.tables import FREQUENCY
 if TYPE_CHECKING:
     import xarray as xr
 
-    from pipeline.store.run import Run
+    from pipeline.store.run import RunDirectory
 
 DEGREES = "_deg"
 
 
-def named(run: Run, options: Options) -> Options:
+def named(run: RunDirectory, options: Options) -> Options:
     """Translate the names of axes, parameters and states in some options to those of the run.
 
     ``at`` accepts ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
@@ -58,7 +58,7 @@ def named(run: Run, options: Options) -> Options:
     return options.model_copy(update=changes)
 
 
-def _swept(run: Run, others: Iterable[str]) -> str:
+def _swept(run: RunDirectory, others: Iterable[str]) -> str:
     """Return the one parameter that a run sweeps besides `others`, or the drive frequency if it sweeps none; raise
     SpecError if it sweeps several.
     """

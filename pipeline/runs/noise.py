@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.layout.cells import CellMap
-from pipeline.motion.inputs import Inputs
 from pipeline.motion.noisy import Noisy
+from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import STEPS, NoiseTable
-from pipeline.specification.parsing import Spec
 from pipeline.specification.problems import SpecError
-from pipeline.store.files import Files
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 
 SAMPLE, PERIODS = 32, 4
 """Cells and periods of the sample that is integrated before a run begins."""
@@ -60,11 +59,12 @@ def check_steps(spec: Spec) -> None:
         )
 
 
-def warn_of_steps(spec: Spec, files: Files, echo: Callable[[str], None]) -> None:
+def warn_of_steps(spec: Spec, run: RunDirectory, echo: Callable[[str], None]) -> None:
     """Print a warning if cells of a finished run have a strong error above ``noise.tolerance``."""
-    if not isinstance(spec.motion, Noisy):
+    motion = spec.motion
+    if not isinstance(motion, Noisy):
         return
-    error, tolerance = Run.open(files).cube()["strong_error"].values, spec.motion.table.tolerance
+    error, tolerance = run.cube()["strong_error"].values, motion.table.tolerance
     n_above, n = int((error > tolerance).sum()), int(np.isfinite(error).sum())
     if n_above:
         echo(

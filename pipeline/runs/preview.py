@@ -8,30 +8,25 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pipeline.layout.domains import check_starts
-from pipeline.layout.limits import check_space
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import size_remarks
-from pipeline.layout.units import unit_remarks
+from pipeline.layout.conventions import unit_remarks
+from pipeline.layout.evaluation import size_remarks
+from pipeline.layout.plan import Plan, check_space, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
-from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
-from pipeline.runs.run import identity_here
-from pipeline.runs.scaling import in_scales
-from pipeline.runs.workflows import read_given
-from pipeline.specification.parsing import Spec
+from pipeline.runs.run import identity_here, ready
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
-from pipeline.store.places import open_files
-from pipeline.store.run import Run
+from pipeline.store.objects import open_files
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import check
 
 MANY_SECTIONS = 500
 """Fewest kept sections for which the section of a single parameter point is drawn."""
 
 
-def first_figure(run: Run) -> str:
+def first_figure(run: RunDirectory) -> str:
     """Return the name of the figure that gives the best overview of a run; the run can draw it."""
     plan = run.plan
     swept, grid = _long(plan)
@@ -50,14 +45,14 @@ def first_figure(run: Run) -> str:
     return "bifurcation" if any(not is_start_dim(d) for d in plan.dims) else "gallery"
 
 
-def figure_command(run: Run) -> str:
+def figure_command(run: RunDirectory) -> str:
     """Return the ``magpend plot`` command that draws the best overview of a run."""
     name, options = needed(run)
     points = "".join(f" --at {axis}={value:.10g}" for axis, value in options.get("at", {}).items())
     return f"magpend plot {name} {run.name}" + (" --map" if "as_map" in options else "") + points
 
 
-def needed(run: Run, name: str = "") -> tuple[str, dict[str, Any]]:
+def needed(run: RunDirectory, name: str = "") -> tuple[str, dict[str, Any]]:
     """Return the name of a figure, by default `first_figure`, and the options without which it cannot show the run: a
     value in the middle of each axis that it has not.
     """
@@ -79,7 +74,7 @@ def _long(plan: Plan) -> tuple[list[str], list[str]]:
     return [d for d in long if not is_start_dim(d)], [d for d in long if is_grid_dim(d)]
 
 
-def shown(run: Run) -> tuple[str, dict[str, Any], str]:
+def shown(run: RunDirectory) -> tuple[str, dict[str, Any], str]:
     """Return the figure that ``magpend run --plot`` draws: its name, its options, and a note on what it leaves out.
 
     Returns
@@ -202,7 +197,7 @@ class Preview:
 
 
 def preview(
-    spec: str | Path | Mapping[str, Any],
+    spec: str | Path | Mapping[str, Any] | Spec,
     out: str | Path | None = None,
     *,
     workers: int | None = None,
@@ -220,11 +215,9 @@ def preview(
     SpecError, RefusedError
         See `pipeline.runs.run.run`.
     """
-    parsed, _, default = read_given(spec, smoke=smoke)
-    check_starts(parsed)
-    files = open_files(out if out is not None else default)
-    parsed = in_scales(parsed, files)
-    check_steps(parsed)
+    parsed = Spec.read(spec, smoke=smoke)
+    files = open_files(out if out is not None else parsed.directory)
+    parsed = ready(parsed, files)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}
@@ -233,7 +226,11 @@ def preview(
 
 
 def describe_plan(
-    spec: str | Path | Mapping[str, Any], out: str | Path | None, *, workers: int | None = None, smoke: bool = False
+    spec: str | Path | Mapping[str, Any] | Spec,
+    out: str | Path | None,
+    *,
+    workers: int | None = None,
+    smoke: bool = False,
 ) -> Iterator[str]:
     """Yield the text lines that a dry run prints, the measured time last. See `preview`."""
     yield from preview(spec, out, workers=workers, smoke=smoke).lines

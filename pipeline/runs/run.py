@@ -11,31 +11,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
-from pipeline.layout.domains import check_starts
+from pipeline.layout.conventions import unit_remarks
+from pipeline.layout.evaluation import check_starts, size_remarks, with_sizes
 from pipeline.layout.identity import identity_of
-from pipeline.layout.limits import check_plan, check_space
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.scales import size_remarks
-from pipeline.layout.units import unit_remarks
-from pipeline.runs.mending import sound_commits
+from pipeline.layout.plan import Plan, check_plan, check_space, make_plan
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
-from pipeline.runs.scaling import in_scales
-from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
-from pipeline.runs.workflows import read_given
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import log_timing, sweep
-from pipeline.store.errors import IncompleteError
+from pipeline.store.commits import Packer, log_timing, scan, sweep, withdraw
+from pipeline.store.errors import DamagedError, IncompleteError, RefusedError
 from pipeline.store.files import Files
-from pipeline.store.packing import Packer
-from pipeline.store.places import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
-from pipeline.store.runfile import RunInfo
+from pipeline.store.run import RunDirectory
+from pipeline.store.runfile import RunInfo, is_run, read_run
 from pipeline.store.setup import check, establish
+from pipeline.store.view import VERIFY, checks_chunks
 
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
@@ -48,7 +43,7 @@ Sources = Sequence[tuple[str, str]]
 
 
 def run(
-    spec: str | Path | Mapping[str, Any],
+    spec: str | Path | Mapping[str, Any] | Spec,
     out: str | Path | None = None,
     *,
     workers: int | None = None,
@@ -57,8 +52,8 @@ def run(
     dashboard: bool = False,
     smoke: bool = False,
     echo: Echo = print,
-) -> State:
-    """Compute the tasks of a specification that its run directory lacks, and return the state of the run.
+) -> RunDirectory:
+    """Compute the tasks of a specification that its run directory lacks, and open the finished run.
 
     Damaged ``run.json``, metadata or coordinates are rebuilt from the specification. Committed cells that fit
     their records stay.
@@ -82,8 +77,8 @@ def run(
 
     Returns
     -------
-    State
-        State of the finished run.
+    RunDirectory
+        The finished run.
 
     Raises
     ------
@@ -102,20 +97,40 @@ def run(
     """
     from pipeline.compute.clients import Where
 
-    parsed, text, default = read_given(spec, smoke=smoke)
-    files = open_files(out if out is not None else default)
+    parsed = Spec.read(spec, smoke=smoke)
+    text = parsed.text
+    files = open_files(out if out is not None else parsed.directory)
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
-    check_starts(parsed)
-    parsed = in_scales(parsed, files)
-    check_steps(parsed)
+    parsed = ready(parsed, files)
     for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
     for line in size_remarks(parsed):
         echo(line)
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
-    warn_of_steps(parsed, files, echo)
-    return state(files)
+    finished = RunDirectory.open(files)
+    warn_of_steps(parsed, finished, echo)
+    return finished
+
+
+def ready(spec: Spec, files: Files) -> Spec:
+    """Check what a specification computes, and return it with the sizes of its states.
+
+    The sizes are those that the run in the directory keeps, if there is one.
+
+    Raises
+    ------
+    SpecError
+        If the equations have no value at the starts, or if steps of noise are too long.
+    """
+    check_starts(spec)
+    try:
+        kept = read_run(files).parsed_spec() if is_run(files) else None
+    except (DamagedError, RefusedError, OSError):
+        kept = None
+    spec = with_sizes(spec, kept)
+    check_steps(spec)
+    return spec
 
 
 def carry_out(
@@ -162,7 +177,7 @@ def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
     Raises
     ------
     SpecError
-        If the run is too large, see `limits.check_plan`.
+        If the run is too large, see `check_plan`.
     """
     check_plan(plan)
     return identity_of(spec, plan)
@@ -243,3 +258,44 @@ def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
         )
     sweep(info, plan, commits, echo)
     write_copy(info, plan, commits)
+
+
+_LONG_SECONDS = 5.0
+_NAMED = 10
+
+
+def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
+    """Return the commit records of all undamaged tasks; damaged tasks are discarded, to be computed again.
+
+    Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
+    environment only sizes are compared. Files without a record are removed. Only the holder of the lock may
+    call this.
+
+    Parameters
+    ----------
+    info, plan
+        The run and its plan.
+    echo
+        Function that prints a line about each task that is computed again, with the reason.
+    alone
+        Whether no other process can be writing here. Otherwise files without a record stay, since another
+        process may be about to commit them.
+    """
+    started = time.perf_counter()
+    contents = checks_chunks()
+    records, damaged = damaged_records(info, plan, contents=contents)
+    seconds = time.perf_counter() - started
+    if contents and seconds > _LONG_SECONDS:
+        echo(
+            f"{len(records)} committed tasks compared with their records in {duration(seconds)} ({VERIFY}=0 skips this)"
+        )
+    for problem in list(damaged.values())[:_NAMED]:
+        echo(f"{problem}: computed again")
+    if len(damaged) > _NAMED:
+        echo(f"and {len(damaged) - _NAMED} more")
+    if damaged:
+        withdraw(info, damaged)
+        records, _ = scan(info, plan)
+    if alone:
+        sweep(info, plan, records, echo)
+    return records

@@ -1,4 +1,4 @@
-"""Send a run to the batch system of a cluster, for ``magpend submit``."""
+"""Send a run to the batch system of a cluster, for ``magpend submit``, and explain what is sent."""
 
 from __future__ import annotations
 
@@ -11,28 +11,21 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from pipeline.compute.jobqueue import jobs_folder, worker_script
-from pipeline.layout.domains import check_starts
-from pipeline.layout.plan import make_plan
 from pipeline.layout.writing import write_atomically
-from pipeline.runs.batch import coordinator_script, is_whole
-from pipeline.runs.choosing import Choice, choose, no_command
+from pipeline.runs.batch_systems import Choice, answer, choose, no_command
 from pipeline.runs.derive import analyses_in
-from pipeline.runs.noise import check_steps
-from pipeline.runs.run import identity_here
-from pipeline.runs.scaling import in_scales
-from pipeline.runs.sizing import Work, complete, measure
-from pipeline.runs.workflows import default_directory, find_spec
-from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import Cluster, cluster_of
-from pipeline.specification.inputs import toml_of
-from pipeline.specification.parsing import load_spec
+from pipeline.runs.jobs import Work, complete, coordinator_script, is_whole, measure, remarks, resources
+from pipeline.runs.preview import preview
+from pipeline.runs.progress import size, whole
+from pipeline.specification.clusters import SYSTEMS, Cluster, cluster_of
+from pipeline.specification.files import find_spec, specification_toml, toml_value
 from pipeline.specification.problems import SpecError
-from pipeline.store.commits import read_commits
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import LockedError
-from pipeline.store.places import open_files
-from pipeline.store.setup import check
+from pipeline.store.objects import open_files
 
 SCRIPT, SENT, TABLE = "job.sh", "job.json", "cluster.toml"
 _ANSWER_S = 60.0
@@ -46,48 +39,20 @@ class SubmitError(Exception):
 
 @dataclass(frozen=True)
 class Submission:
-    """Batch job of a run: its script, its folder and, once it is sent, its number.
+    """Batch job of a run: its script, its folder and, once it is sent, its number."""
 
-    Attributes
-    ----------
-    name : str
-        The run directory, as it was given.
-    title : str
-        Title of the specification.
-    retry : str
-        Words after ``magpend submit`` that give the same run again.
-    folder : Path
-        Folder of its jobs: script, job number, and logs.
-    choice : Choice
-        Batch system, and the given values.
-    cluster : Cluster
-        Description of a job.
-    reasons : dict of str
-        Reason for each value of the job that was not given, by key.
-    work : Work
-        Work that the run still has to do.
-    script : str
-        The batch script.
-    worker : str, optional
-        Batch script of the jobs of workers, if the run has such jobs.
-    complete : bool
-        Whether there is nothing left to compute.
-    job : str, optional
-        Job number, after sending.
-    """
-
-    name: str
-    title: str
-    retry: str
-    folder: Path
-    choice: Choice
-    cluster: Cluster
-    reasons: dict[str, str]
-    work: Work
-    script: str
-    worker: str | None
-    complete: bool
-    job: str | None = None
+    name: str  # the run directory, as it was given
+    title: str  # title of the specification
+    retry: str  # words after ``magpend submit`` that give the same run again
+    folder: Path  # folder of its jobs: script, job number, and logs
+    choice: Choice  # batch system, and the given values
+    cluster: Cluster  # description of a job
+    reasons: dict[str, str]  # reason for each value of the job that was not given, by key
+    work: Work  # work that the run still has to do
+    script: str  # the batch script
+    worker: str | None  # batch script of the jobs of workers, if the run has such jobs
+    complete: bool  # whether there is nothing left to compute
+    job: str | None = None  # job number, after sending
 
     def log_of(self, job: str) -> str:
         """Return the path of the output of a job, by its number or a word for it."""
@@ -101,7 +66,7 @@ class Submission:
     def table(self) -> str:
         """Return the complete ``[cluster]`` table as TOML text."""
         values = self.cluster.model_dump(exclude_defaults=True)
-        return f"[cluster]\n{toml_of({'kind': self.cluster.kind, **values})}"
+        return f"[cluster]\n{specification_toml({'kind': self.cluster.kind, **values})}"
 
 
 def prepare(
@@ -135,25 +100,20 @@ def prepare(
         If the run cannot be done in the directory.
     """
     path = find_spec(spec)
-    parsed = load_spec(path, smoke=smoke)
+    directory = out if out is not None else Spec.read(path, smoke=smoke).directory
     analyses_in(analyse)
     more = [*(["--smoke"] if smoke else []), *(["--analyse", analyse] if analyse else [])]
     retry = shlex.join([str(spec), *(["--out", str(out)] if out else []), *more])
     choice = choose(cluster, changes, retry)
-    files = open_files(out if out is not None else default_directory(path, smoke))
+    files = open_files(directory)
     folder = jobs_folder(files.place)
     if _AWKWARD.search(str(folder)):
         raise SpecError(
             f"{folder}: batch systems do not accept this path for a job's output; give an --out with only letters, "
             "digits, and . _ - + , : = @."
         )
-    check_starts(parsed)
-    parsed = in_scales(parsed, files)
-    check_steps(parsed)
-    plan = make_plan(parsed)
-    info = check(files, identity_here(parsed, plan))
-    done = read_commits(info, plan) if info is not None else {}
-    work = measure(parsed, plan, done)
+    found = preview(path, directory, smoke=smoke)
+    work = measure(found.spec, found.plan, found.done)
     table, reasons = complete(choice.table, work)
     described = cluster_of(table)
     file = choice.file or folder / TABLE
@@ -161,7 +121,7 @@ def prepare(
     command = _command(described, file, path, files.place, more)
     return Submission(
         name=files.name,
-        title=parsed.title,
+        title=found.spec.title,
         retry=retry,
         folder=folder,
         choice=choice,
@@ -170,7 +130,7 @@ def prepare(
         work=work,
         script=coordinator_script(described, name, f"{folder}/coordinator", str(Path.cwd()), command),
         worker=None if is_whole(described) else worker_script(described, folder),
-        complete=info is not None and len(done) == plan.n_tasks,
+        complete=found.exists and len(found.done) == found.n_tasks,
     )
 
 
@@ -254,3 +214,168 @@ def _ask(command: Sequence[str], text: str | None = None) -> subprocess.Complete
         return subprocess.run(list(command), input=text, capture_output=True, text=True, timeout=_ANSWER_S, check=False)
     except subprocess.TimeoutExpired:
         raise SubmitError(f"{command[0]}: no answer within {_ANSWER_S:.0f} s; try again.") from None
+
+
+NUMBER = "JOB"
+"""Word for the number of a job that is not sent yet."""
+
+_MOST_QUEUES = 20
+_SIZES = ("cores", "memory", "walltime")
+
+
+def explain(submission: Submission) -> list[str]:
+    """Return the text lines of a dry run, with the job files."""
+    cluster, work = submission.cluster, submission.work
+    head = [submission.title] if submission.title else []
+    if submission.complete:
+        head.append(f"{submission.name} is complete; nothing would be sent.")
+    lines = [
+        *head,
+        *work.lines(),
+        f"batch system: {SYSTEMS[cluster.kind].title} ({submission.choice.why})",
+        *_queues(submission),
+        f"jobs: {_jobs(submission)}",
+        *(f"  {key} = {toml_value(getattr(cluster, key))}: {_reason(submission, key)}" for key in _SIZES),
+        *(f"  {key} = {toml_value(value)}: {_reason(submission, key)}" for key, value in _others(submission)),
+        *(f"warning: {remark}" for remark in remarks(cluster, work)),
+        *_places(submission),
+        *_commands(submission),
+        "change: --job KEY=VALUE, such as --job walltime=02:00:00 --job account=NAME; or a file with [cluster], given "
+        "with --cluster FILE",
+    ]
+    file = submission.folder / SCRIPT
+    lines += ["", f"---- {file}, sent with: {_send(submission, SCRIPT)}", *submission.script.splitlines()]
+    if submission.worker is not None:
+        title = "a job of workers, which the coordinator sends, up to"
+        lines += ["", f"---- {title} {cluster.max_jobs} at a time", *submission.worker.splitlines()]
+    if submission.has_table:
+        lines += ["", f"---- {submission.folder / TABLE}, from which the coordinator reads this", *_table(submission)]
+    return lines
+
+
+def _table(submission: Submission) -> list[str]:
+    return submission.table().splitlines()
+
+
+def brief(submission: Submission) -> list[str]:
+    """Return the text lines of a job that was sent."""
+    cluster = submission.cluster
+    warnings = remarks(cluster, submission.work)
+    return [
+        f"sent: job {submission.job} to {SYSTEMS[cluster.kind].title}; {_jobs(submission)}",
+        f"work: about {whole(submission.work.seconds)} of one core, {_clock(submission)}",
+        *(f"warning: {remark}" for remark in warnings),
+        *_places(submission),
+        *_commands(submission),
+    ]
+
+
+def written(submission: Submission, file: str) -> list[str]:
+    """Return the text lines of a job file that was written."""
+    return [
+        f"written: {file}, for {SYSTEMS[submission.cluster.kind].title}: {_jobs(submission)}",
+        f"send it: {_send(submission, file)}",
+        *_places(submission),
+        *_commands(submission),
+    ]
+
+
+def as_data(submission: Submission) -> dict[str, Any]:
+    """Return a submission as JSON values: sizes in bytes and seconds, commands as texts."""
+    cluster, work = submission.cluster, submission.work
+    cores, memory, time_s = resources(cluster)
+    words, job = SYSTEMS[cluster.kind], submission.job or NUMBER
+    one = {"cores": cores, "memory_bytes": memory, "walltime_s": time_s, "script": submission.script}
+    jobs = [{"role": "all" if is_whole(cluster) else "coordinator", "most": 1, **one}]
+    if submission.worker is not None:
+        sizes = {"cores": cluster.cores, "memory_bytes": cluster.memory_bytes, "walltime_s": cluster.walltime_s}
+        jobs.append({"role": "workers", "most": cluster.max_jobs, **sizes, "script": submission.worker})
+    return {
+        "sent": submission.job,
+        "complete": submission.complete,
+        "batch_system": cluster.kind,
+        "batch_system_reason": submission.choice.why,
+        "queue": cluster.queue,
+        "jobs": jobs,
+        "reasons": {key: _reason(submission, key) for key in (*_SIZES, *dict(_others(submission)))},
+        "cluster": cluster.model_dump(mode="json", exclude_none=True),
+        "cells": work.n_cells,
+        "cells_left": work.n_left,
+        "tasks": work.n_tasks,
+        "tasks_left": work.n_tasks_left,
+        "periods_left": work.periods,
+        "core_seconds": work.seconds,
+        "wall_seconds": work.wall(cluster.cores * cluster.max_jobs),
+        "warnings": remarks(cluster, work),
+        "results": submission.name,
+        "log": submission.log_of(job),
+        "folder": str(submission.folder),
+        "status": f"magpend status {shlex.quote(submission.name)}",
+        "follow": f"{words.follow} {job}",
+        "cancel": f"{words.cancel} {job}",
+        "continue": f"magpend submit {submission.retry}",
+    }
+
+
+def _send(submission: Submission, file: str) -> str:
+    """Return the command that sends a job file."""
+    reads = ["<"] if submission.cluster.kind == "lsf" else []
+    return " ".join([*SYSTEMS[submission.cluster.kind].send, *reads, shlex.quote(file)])
+
+
+def _others(submission: Submission) -> list[tuple[str, Any]]:
+    """Return the further values of ``[cluster]`` that are given."""
+    return [(key, value) for key, value in submission.choice.table.items() if key not in (*_SIZES, "kind")]
+
+
+def _reason(submission: Submission, key: str) -> str:
+    return submission.reasons.get(key) or submission.choice.sources.get(key, "by default")
+
+
+def _queues(submission: Submission) -> list[str]:
+    """Return the queue of a job, and what the batch system itself says of its queues and their limits."""
+    system = SYSTEMS[submission.cluster.kind]
+    said = (answer(shlex.split(system.queues)) or "").rstrip().splitlines()[:_MOST_QUEUES]
+    head = f"queue: {submission.cluster.queue or f'the default of {system.title}'}"
+    if not said:
+        return [f"{head}; '{system.queues}', which lists queues and their limits, gave no answer here"]
+    return [f"{head}; '{system.queues}' lists:", *(f"  {line}" for line in said)]
+
+
+def _jobs(submission: Submission) -> str:
+    cluster = submission.cluster
+    cores, memory, time_s = resources(cluster)
+    one = _described(cores, memory, time_s)
+    if is_whole(cluster):
+        return f"1 job of {one}"
+    workers = _described(cluster.cores, cluster.memory_bytes, cluster.walltime_s)
+    number = f"{cluster.min_jobs} to {cluster.max_jobs}"
+    return f"1 job that coordinates, of {one}; it sends {number} jobs of workers, each of {workers}"
+
+
+def _described(cores: int, memory: int, time_s: int) -> str:
+    return f"{cores} core{'s' if cores > 1 else ''}, {size(memory)}, at most {whole(time_s)}"
+
+
+def _clock(submission: Submission) -> str:
+    cores = submission.cluster.cores * submission.cluster.max_jobs
+    return f"{whole(submission.work.wall(cores))} by the clock on {cores} core{'s' if cores > 1 else ''}"
+
+
+def _places(submission: Submission) -> list[str]:
+    job = submission.job or NUMBER
+    log = submission.log_of(job)
+    late = "; PBS writes it at the end of the job" if submission.cluster.kind in ("pbs", "torque") else ""
+    workers = "" if submission.worker is None else f", and those of the workers in {submission.folder}"
+    return [f"results: {submission.name}", f"log: {log}{workers}{late}"]
+
+
+def _commands(submission: Submission) -> list[str]:
+    words, job = SYSTEMS[submission.cluster.kind], submission.job or NUMBER
+    name = shlex.quote(submission.name)
+    return [
+        f"follow: magpend status {name}; {words.follow} {job}; tail -F {submission.folder}/coordinator*",
+        f"cancel: {words.cancel} {job}; what is computed stays",
+        "continue: after a cancel, or at the end of its time, give the same command again; if its node fails, "
+        f"{SYSTEMS[submission.cluster.kind].title} starts the job again",
+    ]

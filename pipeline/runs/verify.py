@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pipeline.layout.plan import make_plan
 from pipeline.store.checking import ODD, Verification, verify
+from pipeline.store.commits import withdraw
 from pipeline.store.files import ASIDE, DERIVED
-from pipeline.store.packing import withdraw
 from pipeline.store.products import remove_product
 from pipeline.store.record_copy import remove_copy
 from pipeline.store.runfile import read_run

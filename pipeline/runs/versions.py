@@ -12,7 +12,7 @@ from pipeline.products.product import Analysis, Options
 from pipeline.products.registry import ANALYSES
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 OF_ATTRACTORS = "attractors.json"
 
@@ -27,7 +27,7 @@ def _parts(name: str) -> set[str]:
     return {name}.union(*(_parts(other) for other in ANALYSES[name].builds_on))
 
 
-def attractor_options(run: Run) -> AttractorOptions:
+def attractor_options(run: RunDirectory) -> AttractorOptions:
     """Return the options of the run's attractors: those last given, or the defaults."""
     try:
         return AttractorOptions.model_validate_json(run.info.files.below(DERIVED).read(OF_ATTRACTORS))
@@ -37,7 +37,7 @@ def attractor_options(run: Run) -> AttractorOptions:
         raise DamagedError(f"{run.name}: {DERIVED}/{OF_ATTRACTORS} is damaged; remove it.") from None
 
 
-def current(run: Run, name: str) -> dict[str, str]:
+def current(run: RunDirectory, name: str) -> dict[str, str]:
     """Return the attributes of those results of an analysis that hold for the present cells and attractors of a run."""
     rests = rests_on_attractors(name)
     options = json.dumps(attractor_options(run).changed(), sort_keys=True) if rests else ""

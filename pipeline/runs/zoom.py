@@ -1,4 +1,4 @@
-"""Make a new specification with narrower ranges and fixed parameters from an old one."""
+"""Make a new specification from an old one: with narrower ranges and fixed parameters, or with more of everything."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.models.imported import KEY
-from pipeline.specification.files import check_new_file, merged, nested, write_new
-from pipeline.specification.parsing import Spec, kept_spec, load_spec
+from pipeline.specification.files import check_new_file, find_spec, merged, nested, specification_toml, write_new
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
 from pipeline.specification.tables import FREQUENCY, Range
-from pipeline.specification.writing import specification_toml
 from pipeline.store.local import refuse_place
 
 MARK = "(zoom)"
@@ -25,46 +25,24 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Source:
-    """A specification, with the run or the file that it comes from.
+    """A specification, with the run or the file that it comes from."""
 
-    Attributes
-    ----------
-    spec : Spec
-        The specification.
-    origin : str
-        Phrase for the comment at the head of the new file.
-    smoke : dict
-        Its ``[smoke]`` table; empty if it has none.
-    """
-
-    spec: Spec
-    origin: str
-    smoke: Mapping[str, Any] = field(default_factory=dict)
+    spec: Spec  # the specification
+    origin: str  # phrase for the comment at the head of the new file
+    smoke: Mapping[str, Any] = field(default_factory=dict)  # its ``[smoke]`` table; empty if it has none
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes to a specification: new ranges, fixed values and numbers of points, by state or parameter.
+    """Changes to a specification: new ranges, fixed values and numbers of points, by state or parameter."""
 
-    Attributes
-    ----------
-    ranges : dict
-        Lowest and highest value by key: a state (with ``_deg`` in degrees), ``frequency_hz`` or a parameter.
-    pins : dict
-        One value by key, as in `ranges`.
-    num : int or None
-        Number of points of every new range.
-    nums : dict
-        Number of points by state, frequency or parameter; takes precedence over `num`.
-    samples : int or None
-        Number of random initial conditions.
-    """
-
+    # lowest and highest value by key: a state (with ``_deg`` in degrees), ``frequency_hz`` or a parameter
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    pins: Mapping[str, float] = field(default_factory=dict)
-    num: int | None = None
+    pins: Mapping[str, float] = field(default_factory=dict)  # one value by key, as in `ranges`
+    num: int | None = None  # number of points of every new range
+    # number of points by state, frequency or parameter; takes precedence over `num`
     nums: Mapping[str, int] = field(default_factory=dict)
-    samples: int | None = None
+    samples: int | None = None  # number of random initial conditions
 
 
 def read_source(path: str | Path) -> Source:
@@ -75,7 +53,6 @@ def read_source(path: str | Path) -> Source:
     SpecError, store.RefusedError
         If there is no specification, or it is not valid.
     """
-    from pipeline.runs.workflows import find_spec
     from pipeline.store.files import is_url, local_path
     from pipeline.store.runfile import read_run
 
@@ -83,8 +60,8 @@ def read_source(path: str | Path) -> Source:
         info = read_run(path)
         name = info.files.local.resolve().name if info.files.local else info.name
         return Source(info.parsed_spec(), f"run {name}, digest {info.digest}", _smoke_in(info.spec_text))
-    found = find_spec(path)
-    return Source(load_spec(found), f"specification {found.name}", _smoke_in(found.read_text("utf-8")))
+    spec = Spec.read(path)
+    return Source(spec, f"specification {find_spec(path).name}", spec.tables.get("smoke", {}))
 
 
 def _smoke_in(text: str) -> Mapping[str, Any]:
@@ -124,7 +101,7 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
     if changes.samples is not None:
         data["initial_conditions"]["n"] = changes.samples
     data["title"] = spec.title if spec.title.endswith(MARK) else f"{spec.title} {MARK}".strip()
-    return kept_spec(data), notes
+    return Spec.parse(data, KEPT), notes
 
 
 def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
@@ -140,7 +117,7 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
     spec, notes = zoom(source.spec, changes)
     smoke = source.smoke
     try:
-        kept_spec(merged(spec.as_dict(), nested(smoke)))
+        Spec.parse(merged(spec.as_dict(), nested(smoke)), KEPT)
     except SpecError:
         smoke = {}
         notes = [*notes, "[smoke]: is left out, since it does not fit the new ranges."]
@@ -272,10 +249,65 @@ def to_toml(spec: Spec, smoke: Mapping[str, Any] | None = None) -> str:
     read = tomllib.loads(text)
     read.pop("smoke", None)
     assert not isinstance(read["model"], dict) or read["model"] == spec.reference
-    assert kept_spec({**read, "model": spec.reference}) == spec
+    assert Spec.parse({**read, "model": spec.reference}, KEPT) == spec
     return text
 
 
 def _filled(table: Any) -> Any:
     """Return a table without its empty tables; any other value unchanged."""
     return {key: value for key, value in table.items() if value != {}} if isinstance(table, dict) else table
+
+
+@dataclass(frozen=True)
+class Widening:
+    """Changes that enlarge a specification: longer axes, more initial conditions, section points or products."""
+
+    # new ranges, as the tables of ``[axes]``, by ``frequency_hz``, parameter, or state of a grid
+    axes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    starts: int | None = None  # number of random initial states
+    keep: int | None = None  # kept sections
+    # options of additional products by name, as in the tables of ``[products]``
+    products: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.axes or self.products) or self.starts is not None or self.keep is not None
+
+
+def widened(spec: Spec, widening: Widening) -> Spec:
+    """Return a specification enlarged by longer axes, more initial conditions, section points or products.
+
+    Raises
+    ------
+    SpecError
+        If a change does not fit, or the result is not a valid specification.
+    """
+    problems = _problems(spec, widening)
+    if problems:
+        raise SpecError(problems)
+    data = spec.as_dict()
+    for name, table in widening.axes.items():
+        put_value(spec, data, name, dict(table))
+    if widening.starts is not None:
+        data["initial_conditions"]["n"] = widening.starts
+    if widening.keep is not None:
+        data["integration"]["n_keep"] = widening.keep
+    data["products"] |= {name: dict(options) for name, options in widening.products.items()}
+    return Spec.parse(data, KEPT)
+
+
+def _problems(spec: Spec, widening: Widening) -> list[str]:
+    known = (FREQUENCY, *spec.model.parameter_names, *state_keys(spec.model))
+    problems = [f"extend: {unknown_name('axis', name, known)}" for name in widening.axes if name not in known]
+    states = [name for name in widening.axes if state_of_key(name, spec.model)]
+    kind = spec.initial_conditions.kind
+    if states and not isinstance(spec.initial_conditions, GridStarts):
+        problems.append(
+            f"axis {states[0]}: the initial conditions are a {kind}, and a range widens only a grid; "
+            "give a SPEC with the new starts."
+        )
+    if widening.starts is not None and not isinstance(spec.initial_conditions, RandomStarts):
+        problems.append(
+            f"starts = {widening.starts}: the initial conditions are a {kind}, not random samples; "
+            + ("widen a state's range instead." if kind == "grid" else "give a SPEC with more rows.")
+        )
+    return problems

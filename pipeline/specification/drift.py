@@ -6,7 +6,6 @@ can be an axis.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,19 +13,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from magpend_core.models.drift.model import drifting
 from magpend_core.models.drift.ramps import NUMBERS, TABLE, Motion, Ramp, motions_of
 from magpend_core.models.parameters import unknown_name_problem
-from pipeline.specification.problems import SpecError, problems_of, shown
+from pipeline.specification.files import has_digest
+from pipeline.specification.problems import SpecError, checked, shown
 from pipeline.specification.tables import FREQUENCY, Range, Table
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model, Parameters
 
 HEADER = ("time_s", "value")
-MOST_BYTES, MOST_CORNERS = 20_000_000, 64
+MOST_CORNERS = 64
 PAIRS = (("rate_per_s", "rate_per_period"), ("start_s", "start_periods"), ("duration_s", "duration_periods"))
 _OF_A_FILE = ("start_s", "start_periods")
 
@@ -63,49 +63,14 @@ class DriftTable(Table):
         return self.model_dump(mode="json", exclude_none=True, by_alias=True)
 
 
-def with_files(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
-    """Read the files that the tables of ``[drift]`` name; add their texts and digests, unless they are there."""
-    tables = data.get("drift")
-    if not isinstance(tables, dict):
-        return data
-    read = {}
-    for name, table in tables.items():
-        read[name] = table
-        if not isinstance(table, dict) or not isinstance(table.get("file"), str) or "text" in table:
-            continue
-        try:
-            content = (Path(folder) / table["file"]).read_bytes()
-            text = content.decode("utf-8") if len(content) <= MOST_BYTES else None
-        except OSError as error:
-            problems.append(f"drift.{name}.file = {table['file']!r}: cannot be read ({error.strerror or error}).")
-            continue
-        except UnicodeDecodeError:
-            problems.append(f"drift.{name}.file = {table['file']!r}: is not text in UTF-8; give a CSV file.")
-            continue
-        if text is None:
-            problems.append(
-                f"drift.{name}.file = {table['file']!r}: has {len(content)} bytes; at most {MOST_BYTES}: thin it."
-            )
-            continue
-        read[name] = {"sha256": hashlib.sha256(content).hexdigest(), **table, "text": text}
-    return {**data, "drift": read}
-
-
 def drift_tables(data: Mapping[str, Any], problems: list[str]) -> dict[str, DriftTable]:
     """Return the valid tables of ``[drift]`` by parameter; add the problems of the others to `problems`."""
-    tables = data.get("drift", {})
-    if not isinstance(tables, dict):
-        problems.append(f"drift = {shown(tables)}: must be a table for each parameter; write [drift.NAME].")
-        return {}
     found = {}
-    for name, table in tables.items():
+    for name, table in data.get("drift", {}).items():
         if not isinstance(table, dict):
             problems.append(f"drift.{name} = {shown(table)}: must be a table; write [drift.{name}].")
-            continue
-        try:
-            found[name] = DriftTable.model_validate(table)
-        except ValidationError as error:
-            problems += problems_of(error, DriftTable, f"drift.{name}")
+        elif (valid := checked(DriftTable, table, f"drift.{name}", problems)) is not None:
+            found[name] = valid
     return found
 
 
@@ -175,11 +140,7 @@ def _of_file(name: str, table: DriftTable, numbers: Mapping[str, float], problem
     times: tuple[float, ...] = (0.0, 1.0)
     values: tuple[float, ...] = (0.0, 0.0)
     if table.text is not None:  # an unreadable file is reported already
-        if hashlib.sha256(table.text.encode()).hexdigest() != table.sha256:
-            problems.append(
-                f"drift.{name}.sha256 = {table.sha256!r}: is not the digest of {table.file}; drop the key, or "
-                "restore the file with this digest."
-            )
+        has_digest(table.text, table.sha256, table.file, f"drift.{name}", problems)
         try:
             times, values = read_table(table.text, Path(str(table.file)).name)
         except SpecError as error:
@@ -300,7 +261,7 @@ def run_problems(tables: Mapping[str, DriftTable], data: Mapping[str, Any], inte
             "move; drop the key, or [drift]."
         )
     for name in ("lyapunov", "rotation"):
-        if name in (data.get("products") or {}):
+        if name in data.get("products", {}):
             problems.append(
                 f"products.{name}: is measured on an attractor at constant parameters; drop the product, or [drift]."
             )

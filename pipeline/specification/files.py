@@ -1,7 +1,10 @@
-"""Read TOML files and texts as plain tables, and merge tables."""
+"""Find, read and write the TOML files of specifications and models."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -9,9 +12,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from magpend_core.models.imported import KEY
 from pipeline.specification.problems import SpecError, unknown_name
 
 MOST_BYTES = 1_000_000
+MOST_TEXT_BYTES = 20_000_000
+"""Most bytes of a CSV file that a table names."""
 MOST_ELEMENTS = 100_000
 """Most elements of an array."""
 MOST_DEPTH = 32
@@ -20,6 +26,11 @@ MOST_KEY = 200
 STUDY = "study.toml"
 """File name of a study that ships; its folder has the study's name."""
 WHOLE_NUMBERS = range(-(2**63), 2**63)
+
+IDENTIFICATION = "identification"
+"""Kind of the specifications that `pipeline.rig.identify` reads."""
+GALLERY = "gallery"
+"""Folder of the shipped specifications that are named with their folder, ``gallery/NAME``: one per published figure."""
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -36,6 +47,56 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise SpecError(f"{path}: {_unreadable(error)}") from None
     return toml_tables(content, str(path))
+
+
+def read_text(path: str | Path, remedy: str = "") -> tuple[str, str]:
+    """Return the text of a CSV file and its sha256.
+
+    Parameters
+    ----------
+    path
+        The file.
+    remedy
+        End of the message if it cannot be read.
+
+    Raises
+    ------
+    SpecError
+        If it cannot be read, is not text, or is too large.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read ({error.strerror or error}){remedy}.") from None
+    if len(content) > MOST_TEXT_BYTES:
+        raise SpecError(f"{path}: has {len(content)} bytes; give at most {MOST_TEXT_BYTES}: choose a part, or thin it.")
+    try:
+        return content.decode("utf-8"), hashlib.sha256(content).hexdigest()
+    except UnicodeDecodeError:
+        raise SpecError(f"{path}: is not text in UTF-8; give a CSV file.") from None
+
+
+def with_text(table: Any, folder: str | Path, at: str, problems: list[str], remedy: str = "") -> Any:
+    """Return a table with the text and the sha256 of the file that it names, unless it has them."""
+    if not isinstance(table, dict) or not isinstance(table.get("file"), str) or "text" in table:
+        return table
+    path = Path(folder) / table["file"]
+    try:
+        text, digest = read_text(path, remedy)
+    except SpecError as error:
+        problems += [f"{at}.file = {table['file']!r}: {p.removeprefix(f'{path}: ')}" for p in error.problems]
+        return table
+    return {"sha256": digest, **table, "text": text}
+
+
+def has_digest(text: str, sha256: str | None, file: str | None, at: str, problems: list[str]) -> bool:
+    """Return whether the text of a file has the digest of its table; if not, add a problem."""
+    if hashlib.sha256(text.encode()).hexdigest() == sha256:
+        return True
+    problems.append(
+        f"{at}.sha256 = {sha256!r}: is not the digest of {file}; drop the key, or restore the file with this digest."
+    )
+    return False
 
 
 def shipped_files(pattern: str) -> list[Path]:
@@ -78,6 +139,41 @@ def find_file(what: str, name: str | Path, shipped: Mapping[str, Path]) -> Path:
     if len(path.parts) > 1 and path.parts[0] not in folders:
         return path
     raise SpecError(f"{name}: no such file; {unknown_name(what, str(name), shipped)}")
+
+
+def find_spec(name: str | Path) -> Path:
+    """Return the path of a specification, given as a path or by the name of a shipped workflow.
+
+    Raises
+    ------
+    SpecError
+        If neither a file nor a workflow has the name.
+    """
+    return find_file("workflow", name, _shipped())
+
+
+def shipped_workflows() -> dict[str, Path]:
+    """Return the paths of the run specifications that ship with magpend, by name."""
+    return {name: path for name, path in _shipped().items() if not _identifies(path)}
+
+
+def shipped_identifications() -> dict[str, Path]:
+    """Return the paths of the specifications of identifications that ship with magpend, by name."""
+    return {name: path for name, path in _shipped().items() if _identifies(path)}
+
+
+def _identifies(path: Path) -> bool:
+    return tomllib.loads(path.read_text("utf-8")).get("kind") == IDENTIFICATION
+
+
+def _shipped() -> dict[str, Path]:
+    figures = {f"{GALLERY}/{path.stem}": path for path in shipped_files(f"{GALLERY}/*.toml") if path.name != STUDY}
+    return {path.stem: path for path in shipped_files("*.toml")} | figures
+
+
+def default_directory(spec_path: Path, smoke: bool) -> Path:
+    """Return the default run directory of a specification file: ``runs/NAME``."""
+    return Path("runs") / (spec_path.stem + ("-smoke" if smoke else ""))
 
 
 def check_new_file(path: str | Path, suffixes: Sequence[str]) -> Path:
@@ -188,3 +284,90 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         old = result.get(key)
         result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return result
+
+
+def toml_key(key: str) -> str:
+    """Format a TOML key, quoted if necessary."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
+
+
+def toml_value(value: Any) -> str:
+    """Format a number, text, boolean, list or inline table as TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # JSON escapes every character that TOML requires, except DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{toml_key(k)} = {toml_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        items = [toml_value(v) for v in value]
+        if any(isinstance(v, list | tuple) for v in value):
+            return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
+        return "[" + ", ".join(items) + "]"
+    return repr(value)
+
+
+def table_lines(head: str, table: Mapping[str, Any]) -> list[str]:
+    """Return the TOML lines of a table and of the tables in it, each below its own header."""
+    plain = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+    lines = [f"[{head}]", *(f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items())]
+    for key, inner in table.items():
+        if key not in plain:
+            entries = (f"{toml_key(k)} = {toml_value(v)}" for k, v in inner.items())
+            lines += ["", f"[{head}.{toml_key(key)}]", *entries]
+    return lines
+
+
+ORDER = (
+    "parameters",
+    "axes",
+    "initial_conditions",
+    "section",
+    "drive",
+    "drift",
+    "noise",
+    "continuation",
+    "integration",
+    "products",
+    "execution",
+    "smoke",
+)
+"""Tables of a specification in the order of a file. A model as text comes last, with its own tables."""
+
+
+def specification_toml(tables: Mapping[str, Any]) -> str:
+    """Return the tables of a specification as TOML text. Empty tables are left out.
+
+    Parameters
+    ----------
+    tables
+        Plain data with the keys of a specification. Values that no specification has are written as they
+        are, for the reader to report.
+    """
+    model = tables.get("model")
+    text = model_toml(model) if isinstance(model, str | Mapping) else None
+    plain = {key: value for key, value in tables.items() if key != "model" and not isinstance(value, Mapping)}
+    lines = [f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items()]
+    if model is not None and (text is None or not text.startswith("[")):
+        lines.append(text.rstrip("\n") if text is not None else f"model = {toml_value(model)}")
+    names = [key for key in tables if key not in plain and key != "model"]
+    for name in sorted(names, key=lambda n: ORDER.index(n) if n in ORDER else len(ORDER)):
+        entries = [f"{toml_key(k)} = {toml_value(v)}" for k, v in tables[name].items()]
+        lines += ["", f"[{toml_key(name)}]", *entries] if entries else []
+    if text is not None and text.startswith("["):
+        lines += ["", text.rstrip("\n")]
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def model_toml(reference: str | Mapping[str, Any]) -> str:
+    """Format the reference to a model as TOML: one line for a name, or the tables of a model given as text.
+
+    For a Python object this is its import path, which is imported when the file is read. Tables must come
+    last in a file.
+    """
+    if isinstance(reference, str):
+        return f"model = {toml_value(reference)}\n"
+    if KEY in reference:
+        return f"model = {toml_value(reference[KEY])}\n"
+    return "\n".join(table_lines("model", reference)) + "\n"

@@ -140,16 +140,11 @@ def _clashes(data: Mapping[str, Any]) -> list[str]:
             "noise: a noisy state crosses a level infinitely often; drop [section], and set "
             "parameters.frequency_hz for sections at even times."
         )
-    if _key(data, "initial_conditions", "refine") is not None:
+    if data.get("initial_conditions", {}).get("refine") is not None:
         problems.append("initial_conditions.refine: noisy cells do not close, so none can be inferred; drop the key.")
-    if _key(data, "integration", "stop_when_closed"):
+    if data.get("integration", {}).get("stop_when_closed"):
         problems.append("integration.stop_when_closed: noisy cells do not close; drop the key.")
     products = data.get("products", {})
-    for name in products if isinstance(products, Mapping) else ():
-        problems.append(f"products.{name}: is defined for runs without noise; drop the product, or [noise].")
-    return problems
-
-
-def _key(data: Mapping[str, Any], table: str, key: str) -> Any:
-    found = data.get(table)
-    return found.get(key) if isinstance(found, Mapping) else None
+    return problems + [
+        f"products.{n}: is defined for runs without noise; drop the product, or [noise]." for n in products
+    ]

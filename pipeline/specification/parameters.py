@@ -1,13 +1,21 @@
-"""Check the table ``[parameters]`` and the axes against the parameters of a model."""
+"""Check parameters, axes and initial conditions together: names, bounds, relations, and the number of cells."""
 
 from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import ParameterError, unknown_name_problem
-from pipeline.specification.ranges import corner_problems
+from pipeline.specification.starts import GridStarts, Starts
 from pipeline.specification.tables import FREQUENCY, ParametersTable, Range
+
+MAX_CELLS = 10**15
+MOST_RELATED = 12
+"""Most swept parameters that a model may relate to each other: all corners of their box are checked."""
 
 
 def parameter_problems(
@@ -59,3 +67,53 @@ def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]
         except ParameterError as error:
             problems += [p for p in error.problems if p not in problems]
     return problems
+
+
+def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
+    """Return a problem if swept values and initial conditions make more than `MAX_CELLS` cells."""
+    sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
+    if isinstance(starts, GridStarts):
+        sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
+    if math.prod(sizes.values()) <= MAX_CELLS:
+        return []
+    return [
+        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; the limit is {MAX_CELLS:.0e}: use fewer values."
+    ]
+
+
+def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
+    """Check the model's relations between parameters at all corners of the swept ranges; return the problems.
+
+    Bounds are intervals, so the corners decide. Only the axes of parameters that the model's relations read
+    are varied. They are found by asking the model, again whenever its answer has read further parameters.
+    """
+    ends = {name: (float(v.min()), float(v.max())) for name, v in swept.items()}
+    asked = _Asked(base)
+    problems, looked_at = base.model.relations(asked), set[str]()
+    while not problems and looked_at != asked.names & set(ends):
+        looked_at = asked.names & set(ends)
+        if len(looked_at) > MOST_RELATED:
+            return [f"{base.model.name} relates more than {MOST_RELATED} of the swept parameters; fix some of them."]
+        for corner in itertools.product(*(dict.fromkeys(ends[name]) for name in sorted(looked_at))):
+            asked.values_now = {**base, **dict(zip(sorted(looked_at), corner, strict=True))}
+            problems = base.model.relations(asked)
+            if problems:
+                return list(problems)
+    return list(problems)
+
+
+class _Asked(Mapping[str, float]):
+    """Mapping of parameter values that records which of them were read."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self.values_now, self.names = dict(values), set[str]()
+
+    def __getitem__(self, name: str) -> float:
+        self.names.add(name)
+        return self.values_now[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_now)
+
+    def __len__(self) -> int:
+        return len(self.values_now)

@@ -1,136 +1,35 @@
-"""Parse and validate the specification of a run as a whole.
-
-There are two kinds: a *sweep*, in which every cell is independent, and a *continuation*, in which branches
-follow a parameter path and each point starts where the previous one ended. Keys carry units. Angles in
-degrees are converted once, in `pipeline.layout.cells`.
-"""
+"""Validate the tables of a specification, each alone and then together."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from unicodedata import category
 
-from magpend_core.models import DEFAULT, load_model
+from magpend_core.models import DEFAULT
 from magpend_core.models.drift.ramps import Ramp
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import Preset, is_file
-from pipeline.motion.drifting import Drifting
-from pipeline.motion.noisy import Noisy
-from pipeline.motion.recorded import Recorded
-from pipeline.motion.steady import Steady
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification import drift as moving
-from pipeline.specification.drift import DriftTable
-from pipeline.specification.drive_files import RecordedDrive
-from pipeline.specification.files import merged, nested, odd_data, read_toml
-from pipeline.specification.methods import method_problems
-from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
+from pipeline.specification.files import IDENTIFICATION, odd_data, with_text
+from pipeline.specification.models import A_MODEL, add_model, stand_in
 from pipeline.specification.noise import NoiseTable, disturbed, follows, noise_of
-from pipeline.specification.parameters import parameter_problems
+from pipeline.specification.parameters import parameter_problems, size_problems
 from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
-from pipeline.specification.ranges import size_problems
-from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
+from pipeline.specification.recorded_drive import HOW, DriveTable, recorded, run_problems
 from pipeline.specification.section import SectionTable, section_of, seen_through
-from pipeline.specification.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
+from pipeline.specification.starts import STARTS, Starts, refine_problems, starts_model
 from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range, Table
 
 KINDS = ("sweep", "continuation")
-IDENTIFICATION = "identification"
-"""Kind of the specifications that `pipeline.rig.identify` reads."""
 
 
-@dataclass(frozen=True)
-class Spec:
-    """A valid specification; each attribute is a key or table of the TOML file."""
-
-    kind: str
-    title: str
-    reference: str | Mapping[str, Any]
-    parameters: ParametersTable
-    axes: dict[str, Range]
-    initial_conditions: Starts
-    continuation: Continuation | None
-    integration: Integration
-    products: dict[str, Options]
-    execution: Execution
-    drive: DriveTable | None = None
-    section: SectionTable | None = None
-    drift: dict[str, DriftTable] = field(default_factory=dict)
-    noise: NoiseTable | None = None
-
-    @cached_property
-    def ramps(self) -> tuple[Ramp, ...]:
-        """Motions of the parameters that move while the run integrates; empty if none does."""
-        return moving.ramps_of(self.drift, self.axes)
-
-    @cached_property
-    def motion(self) -> Steady:
-        """How the cells move: steadily, under a recorded drive, while parameters drift, or with noise."""
-        if self.noise is not None:
-            return Noisy(self.model, self.integration, self.noise)
-        if self.drift:
-            corners = moving.corners_of(self.values, self.axes, self.frequency_hz)
-            return Drifting(self.model, self.integration, self.ramps, self.values, corners)
-        if self.recorded is not None:
-            return Recorded(self.model, self.integration, self.recorded)
-        return Steady(self.model, self.integration)
-
-    @cached_property
-    def recorded(self) -> RecordedDrive | None:
-        """Recorded drive that replaces the model's own drive; None without one."""
-        return recorded(self.drive, [])
-
-    @property
-    def frequency_hz(self) -> float | None:
-        """Drive frequency [Hz], for a recorded drive its mean frequency; None if the frequency is swept.
-
-        With a section by crossing it is one over the longest time between crossings, as in the engine.
-        """
-        if self.section is not None:
-            return self.section.crossing.frequency_hz
-        return self.parameters.frequency_hz if self.recorded is None else self.recorded.frequency_hz
-
-    @property
-    def refine(self) -> int | None:
-        """Spacing n of the initial conditions that are integrated first (every n-th grid point along each axis); None
-        without refinement.
-        """
-        starts = self.initial_conditions
-        return starts.refine if isinstance(starts, GridStarts) else None
-
-    @cached_property
-    def model(self) -> Model:
-        """Model that is integrated, with what the specification adds: a Poincare section, moving parameters, noise."""
-        model = moving.moved(seen_through(load_model(self.reference), self.section), self.ramps, [])
-        return disturbed(model, self.noise)
-
-    @cached_property
-    def values(self) -> Parameters:
-        """Values of the model parameters that are not swept."""
-        return self.model.load(self.parameters.chosen, **self.parameters.overrides)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the specification as plain dicts with all defaults filled in; `parse_spec` reads them back."""
-        tables: dict[str, Any] = {"kind": self.kind, "title": self.title, "model": self.reference}
-        for name in _TABLES:
-            table = getattr(self, name)
-            if table is not None:
-                tables[name] = table.model_dump(mode="json", exclude_none=True)
-        tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
-        tables["products"] = {name: options.plain() for name, options in self.products.items()}
-        if self.drift:
-            tables["drift"] = {name: table.plain() for name, table in self.drift.items()}
-        tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
-        return tables
-
-
-_TABLES: dict[str, type[Table]] = {
+TABLES: dict[str, type[Table]] = {
     "parameters": ParametersTable,
     "continuation": Continuation,
     "integration": Integration,
@@ -140,7 +39,8 @@ _TABLES: dict[str, type[Table]] = {
     "noise": NoiseTable,
 }
 _OPTIONAL = ("drive", "section", "noise")
-_KEYS = (
+_NO_TABLES = ("kind", "title", "model", "measured")
+KEYS = (
     "kind",
     "title",
     "model",
@@ -159,109 +59,20 @@ _KEYS = (
 )
 
 
-def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
-    """Read a specification from a TOML file and validate it.
-
-    Parameters
-    ----------
-    path
-        A TOML file.
-    smoke
-        Whether to apply the file's ``[smoke]`` table, with which the run takes seconds.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once; also if the file cannot be read or is not TOML.
-    """
-    return spec_of_tables(read_toml(path), Path(path).parent, smoke=smoke)
-
-
-def spec_of_tables(data: dict[str, Any], folder: Path, *, smoke: bool = False) -> Spec:
-    """Validate the tables of a specification, including ``[smoke]``, the changes for a short test run."""
-    return parse_spec(_with_smoke(data, smoke, folder), folder)
-
-
-def kept_spec(data: Mapping[str, Any]) -> Spec:
-    """Parse the specification stored in a run's ``run.json``; read no other file and import nothing.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
-    """
-    return parse_spec(data, KEPT)
-
-
-def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, Any]:
-    """Remove and check the table ``[smoke]``, which holds the changes for a short test run; apply it if `smoke` is
-    set.
-    """
-    plain = {key: value for key, value in data.items() if key != "smoke"}
-    if "smoke" not in data:
-        if smoke:
-            parse_spec(plain, folder)  # its tables have their types from here on
-        return _small(plain) if smoke else plain
-    table = data["smoke"]
-    if not isinstance(table, dict):
-        raise SpecError(f"smoke = {shown(table)}: must be a table of keys to replace.")
-    changes = nested(table)
-    base = with_model_table(plain, folder) if isinstance(changes.get("model"), dict) else plain
-    small = merged(base, changes)
-    try:
-        parse_spec(small, folder)
-    except SpecError as error:
-        _raise_new(plain, folder, error)
-    return small if smoke else plain
-
-
-def _small(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a valid specification with the ends of each axis and range of states, and at most two other starts."""
-    starts = dict(data["initial_conditions"])
-    starts.pop("refine", None)
-    for key, value in starts.items():
-        if isinstance(value, dict):
-            starts[key] = _ends(value)
-        elif key in ("points", "points_deg"):
-            starts[key] = value[:2]
-    if "n" in starts:
-        starts["n"] = min(starts["n"], 2)
-    axes = {name: _ends(axis) for name, axis in data.get("axes", {}).items()}
-    return {**data, "initial_conditions": starts, **({"axes": axes} if axes else {})}
-
-
-def _ends(values: dict[str, Any]) -> dict[str, Any]:
-    if "values" in values:
-        return {"values": [values["values"][0], *values["values"][1:][-1:]]}
-    return {"start": values["start"], "stop": values["stop"], "num": 2}
-
-
-def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:
-    """Raise a `SpecError` with all problems of the full specification, and the further ones that appear only with its
-    ``[smoke]`` table.
-    """
-    try:
-        parse_spec(plain, folder)
-        own: list[str] = []
-    except SpecError as error:
-        own = error.problems
-    raise SpecError(own + [f"with [smoke]: {p}" for p in smoke_error.problems if p not in own])
-
-
-def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec:
-    """Validate the tables of a specification and return it as a `Spec`.
+def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str, Any]:
+    """Validate the tables of a specification; return its keys and tables by the names of `Spec`.
 
     Every table is validated on its own, so that errors in one do not hide errors in others. Then the valid
     tables are checked against each other. Files of presets, drives and models are read here, and their
     content replaces their names: a run does not need the files any more. A model that is a Python object is
-    imported, unless `folder` is None.
+    imported, unless `folder` is `KEPT`.
 
     Parameters
     ----------
     data
         Tables from TOML or from `Spec.as_dict`.
     folder
-        Folder that paths of files are relative to; None for data that a run keeps, see `kept_spec`.
+        Folder that paths of files are relative to; `KEPT` for data that a run keeps.
 
     Raises
     ------
@@ -274,12 +85,13 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         raise SpecError(f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.')
     if "kind" not in data and "equations" in data:
         raise SpecError(A_MODEL)
-    problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
+    problems = [unknown_key(key, key, KEYS) for key in data if key not in KEYS]
+    data, wrong = _only_tables(data, problems)
     data = _with_preset(data, folder, problems)
-    data = data if folder is None else moving.with_files(with_drive(data, folder, problems), folder, problems)
+    data = data if folder is None else _with_texts(data, folder, problems)
     kind, title = _kind(data, problems), _title(data, problems)
     model = add_model(data.get("model", DEFAULT), folder, problems)
-    tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
+    tables = {name: None if name in wrong else _table(data, name, table, problems) for name, table in TABLES.items()}
     axes, drift = _axes(data, problems), moving.drift_tables(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     if model is None:  # the remaining checks need the model's states and parameters
@@ -290,46 +102,49 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     ramps = moving.checked_ramps(drift, model, axes, problems)
     noise = noise_of(tables["noise"], model, data, problems)
     seen = disturbed(moving.moved(seen_through(model, section), ramps, problems), noise)
-    starts = _starts(data, model, problems)
+    starts = None if "initial_conditions" in wrong else _starts(data, model, problems)
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
     problems += moving.run_problems(drift, data, tables["integration"], starts)
     problems += size_problems(axes, starts)
-    problems += method_problems(tables["integration"], products, "drive" in data)
-    known = _valid_keys(ParametersTable, data.get("parameters", {}))
+    problems += _method_problems(tables["integration"], products, "drive" in data)
+    known = _valid_keys(data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
-    own = parameter_problems(known, seen, _declared(data), axes, complete)
+    own = parameter_problems(known, seen, tuple(data.get("axes", {})), axes, complete)
     problems += [p for p in own if not follows(p, data, noise)]
     if ramps and not problems:
         problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
     if problems:
         raise SpecError(problems)
-    assert starts is not None
-    return Spec(
-        kind,
-        title,
-        model.reference,
-        tables["parameters"],
-        axes,
-        starts,
-        walk,
-        tables["integration"],
-        products,
-        tables["execution"],
-        tables["drive"],
-        section,
-        drift,
-        noise,
-    )
+    return {
+        "kind": kind,
+        "title": title,
+        "reference": model.reference,
+        **tables,
+        "axes": axes,
+        "initial_conditions": starts,
+        "continuation": walk,
+        "products": products,
+        "section": section,
+        "drift": drift,
+        "noise": noise,
+    }
+
+
+def _only_tables(data: Mapping[str, Any], problems: list[str]) -> tuple[dict[str, Any], set[str]]:
+    """Replace what must be a table and is none by an empty table; return also the names of these keys."""
+    wrong = {key for key in KEYS if key in data and key not in _NO_TABLES and not isinstance(data[key], dict)}
+    problems += [f"{key} = {shown(data[key])}: must be a table; write [{key}]." for key in data if key in wrong]
+    return {**data, **{key: {} for key in wrong}}, wrong
 
 
 def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: list[str]) -> Mapping[str, Any]:
     """Replace the file name of a parameter preset by the file's content; drop the name if the file cannot be read."""
-    table = data.get("parameters")
-    name = table.get("preset") if isinstance(table, dict) else None
-    if table is None or not isinstance(name, str) or not is_file(name):
+    table = data.get("parameters", {})
+    name = table.get("preset")
+    if not isinstance(name, str) or not is_file(name):
         return data
     rest = {key: value for key, value in table.items() if key != "preset"}
     if folder is None:
@@ -343,10 +158,19 @@ def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: l
     return {**data, "parameters": {"preset": content, **rest}}
 
 
+def _with_texts(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
+    """Add the texts of the files that ``[drive]`` and the tables of ``[drift]`` name."""
+    found = dict(data)
+    if "drive" in data:
+        found["drive"] = with_text(data["drive"], folder, "drive", problems, HOW)
+    if "drift" in data:
+        drift = data["drift"].items()
+        found["drift"] = {name: with_text(table, folder, f"drift.{name}", problems) for name, table in drift}
+    return found
+
+
 def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
     """Validate ``[products]``, the results stored for each cell; fill in options that follow from the model."""
-    if not _is_table(data, "products", problems):
-        return {}
     found: dict[str, Options] = {}
     for name, table in data.get("products", {}).items():
         path = f"products.{name}"
@@ -365,18 +189,10 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
     return {name: found[name] for name in CELL_PRODUCTS if name in found}
 
 
-def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of all axes that the specification lists, valid or not."""
-    axes = data.get("axes", {})
-    return tuple(axes) if isinstance(axes, dict) else ()
-
-
-def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
-    valid: dict[str, Any] = {}
-    for key, value in table.items() if isinstance(table, dict) else ():
-        if checked(model, {key: value}, "", []) is not None:
-            valid[key] = value
-    return model.model_validate(valid)
+def _valid_keys(table: dict[str, Any]) -> ParametersTable:
+    """Return the table ``[parameters]`` with its valid keys alone."""
+    valid = {k: value for k, value in table.items() if checked(ParametersTable, {k: value}, "", []) is not None}
+    return ParametersTable.model_validate(valid)
 
 
 def _kind(data: Mapping[str, Any], problems: list[str]) -> str:
@@ -397,22 +213,12 @@ def _title(data: Mapping[str, Any], problems: list[str]) -> str:
     return str(title)
 
 
-def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
-    if isinstance(data.get(name, {}), dict):
-        return True
-    problems.append(f"{name} = {shown(data[name])}: must be a table; write [{name}].")
-    return False
-
-
 def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
-    if not _is_table(data, name, problems) or (name not in data and name in _OPTIONAL):
-        return None
-    return checked(model, data.get(name, {}), name, problems)
+    is_left_out = name not in data and name in _OPTIONAL
+    return None if is_left_out else checked(model, data.get(name, {}), name, problems)
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    if not _is_table(data, "axes", problems):
-        return {}
     axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
     return {name: axis for name, axis in axes.items() if axis is not None}
 
@@ -420,8 +226,6 @@ def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
 def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Starts | None:
     if "initial_conditions" not in data:
         problems.append('initial_conditions: missing; add this table with kind = "grid", "list" or "random".')
-        return None
-    if not _is_table(data, "initial_conditions", problems):
         return None
     table = data["initial_conditions"]
     kind = table.get("kind")
@@ -450,7 +254,7 @@ def _walk(
         if kind == "sweep" and "continuation" in data:
             problems.append('continuation: a sweep has no such table; set kind = "continuation" or drop the table.')
         return None
-    declared = _declared(data)
+    declared = tuple(data.get("axes", {}))
     if walk is not None and walk.path not in declared:
         known = ", ".join(declared) or "none yet"
         problems.append(
@@ -468,3 +272,15 @@ def _drift_problems(
     if problems or not imports:
         return problems
     return moving.system_problems(model, ramps, values, axes, table.frequency_hz)
+
+
+def _method_problems(integration: Integration | None, products: Mapping[str, Options], is_recorded: bool) -> list[str]:
+    """Return the problems of `integration.method`: products that interpolate within steps need the method of order
+    5.
+    """
+    if integration is None or integration.method == "dopri5":
+        return []
+    inside = [f"products.{n} looks" for n, o in products.items() if CELL_PRODUCTS[n].watches(o)]
+    inside += ["a recorded drive has edges"] * is_recorded
+    key = f'integration.method = "{integration.method}"'
+    return [f'{key}: {what} within steps; drop one of the two, or set method = "dopri5".' for what in inside]

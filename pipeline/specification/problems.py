@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -189,3 +190,30 @@ def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[s
         return list(model.model_fields)
     nested = getattr(model, "nested_model", None)
     return list(nested.model_fields) if nested is not None else []
+
+
+INSTALL = "pip install '.[{}]' in a checkout of magpend"
+
+
+def import_extra(package: str, extra: str, asker: str) -> Any:
+    """Import a package of an extra.
+
+    Parameters
+    ----------
+    package
+        Name of the package.
+    extra
+        Name of the extra that has it.
+    asker
+        Option or file that needs the package, for the message.
+
+    Raises
+    ------
+    SpecError
+        If the package is not installed.
+    """
+    try:
+        return import_module(package)
+    except ModuleNotFoundError:
+        how = INSTALL.format(extra)
+        raise SpecError(f"{asker}: needs {package}, which is not installed: {how}.") from None

@@ -4,7 +4,7 @@ drive.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
@@ -74,9 +74,9 @@ def section_of(
         return None
     found = _found(table, model, problems)
     clash = "a section by crossing needs no frequency; drop one of the two"
-    if FREQUENCY in _keys(data, "parameters"):
+    if FREQUENCY in data.get("parameters", {}):
         problems.append(f"parameters.{FREQUENCY}: {clash}.")
-    if FREQUENCY in _keys(data, "axes"):
+    if FREQUENCY in data.get("axes", {}):
         problems.append(f"axes.{FREQUENCY}: {clash}.")
     if "drive" in data:
         problems.append(f"drive: {model.name} has no drive that a recording could replace; drop the drive.")
@@ -97,14 +97,9 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
 
 
 def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
-    if FREQUENCY in _keys(data, "parameters") or FREQUENCY in _keys(data, "axes") or "drive" in data:
+    if FREQUENCY in data.get("parameters", {}) or FREQUENCY in data.get("axes", {}) or "drive" in data:
         return []
     return [
         f'section: missing; {model.name} has no drive. Add [section] with of = "{model.state_names[0]}", '
         f"value and direction, for sections by crossing; or parameters.{FREQUENCY}, for sections at even times."
     ]
-
-
-def _keys(data: Mapping[str, Any], table: str) -> Iterable[str]:
-    found = data.get(table, {})
-    return found if isinstance(found, Mapping) else ()

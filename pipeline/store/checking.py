@@ -23,37 +23,18 @@ _TASKS_PER_REPORT = 50
 
 @dataclass(frozen=True)
 class Verification:
-    """Result of `verify`: the number of intact tasks, and lists of damaged and leftover files.
+    """Result of `verify`: the number of intact tasks, and lists of damaged and leftover files."""
 
-    Attributes
-    ----------
-    n_tasks, n_committed : int
-        Tasks of the run, and those that are committed and intact.
-    damaged : dict
-        Problem by the file name of the commit record; see `packing.withdraw`.
-    skeleton : list of str
-        Problems of metadata and coordinates.
-    leftovers : list of str
-        Files without a valid commit record. They are harmless; the next run removes them.
-    derived : dict
-        Problem by product name: products whose content has changed.
-    rebuilt : list of str
-        Problems of the skeleton that have been repaired.
-    odd : list of str
-        Folders at the places of files, and files at the places of folders.
-    copies : list of str
-        Problem of the copy of commit records, if it differs from them.
-    """
-
+    # tasks of the run, and those that are committed and intact
     n_tasks: int
     n_committed: int
-    damaged: dict[str, str]
-    skeleton: list[str]
-    leftovers: list[str]
-    derived: dict[str, str] = field(default_factory=dict)
-    rebuilt: list[str] = field(default_factory=list)
-    odd: list[str] = field(default_factory=list)
-    copies: list[str] = field(default_factory=list)
+    damaged: dict[str, str]  # problem by the file name of the commit record; see `commits.withdraw`
+    skeleton: list[str]  # problems of metadata and coordinates
+    leftovers: list[str]  # files without a valid commit record. They are harmless; the next run removes them.
+    derived: dict[str, str] = field(default_factory=dict)  # problem by product name: products whose content has changed
+    rebuilt: list[str] = field(default_factory=list)  # problems of the skeleton that have been repaired
+    odd: list[str] = field(default_factory=list)  # folders at the places of files, and files at the places of folders
+    copies: list[str] = field(default_factory=list)  # problem of the copy of commit records, if it differs from them
 
     @property
     def sound(self) -> bool:
@@ -62,14 +43,7 @@ class Verification:
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
-    """Read every stored file of a run and compare its sha256 with the recorded one; return which files are damaged or
-    left over.
-
-    Raises
-    ------
-    UnreadableError
-        If a file exists and cannot be read.
-    """
+    """Compare every stored file of a run with its recorded sha256; return what is damaged or left over."""
     info.files.refuse_links(CUBE)
     records, damaged = damaged_records(info, plan, contents=True)
     n_whole = sum(name_of(index) not in damaged for index in records)
@@ -90,35 +64,22 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
 def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
     """Return the keys of folders found where a run should have files, and of files where it should have folders.
 
-    Parameters
-    ----------
-    files
-        Files of the run directory.
-    skeleton
-        Keys of the set-up's files, below the cube.
+    `skeleton` has the keys of the set-up's files, below the cube.
     """
     folders = dict.fromkeys(key.rpartition("/")[0] for key in skeleton)
     return files.odd([CUBE, *(f"{CUBE}/{folder}" for folder in folders if folder), COMMITS])
 
 
 def name_of(index: int) -> str:
-    """Return the name of the file for a single task's commit record, even if the record has been merged into a pack, a
-    file of many records.
-    """
+    """Return the file name of a single task's commit record, even if the record lies in a pack."""
     return marker_key(index).removeprefix(f"{COMMITS}/")
 
 
 def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
     """Return the valid commit records of a run's tasks, and the problems of the damaged records by file name.
 
-    A record is damaged, too, if a file that it lists is missing or has changed.
-
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    contents
-        Whether to compare the contents of files. Otherwise only their sizes are compared.
+    A record is damaged, too, if a file that it lists is missing or has changed: in its content, or, without `contents`,
+    in its size.
     """
     records, rejected = scan(info, plan)
     damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}

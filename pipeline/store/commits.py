@@ -1,4 +1,4 @@
-"""Write tasks with their commit records, read the records, and remove files that belong to no record.
+"""Write tasks with their commit records, read and pack the records, and remove files that belong to no record.
 
 A commit record is the only proof that a task is done. A task without a valid record is pending: its files are
 removed (`sweep`) and it is computed again. The bytes in ``cube.zarr`` and ``commits`` do not depend on time, on the
@@ -9,12 +9,16 @@ A *record* lies in a file of its own until all tasks of its block have one; then
 Reading order: `write_task` (how a task is committed), `read_commits` and `scan` (which records are valid),
 `_Scan` (records and packs in one folder), `sweep` (what is removed). Texts of records and packs are in
 `pipeline.store.records`.
+
+Only the holder of the lock may pack. A pack is durable before the single records that it replaces are removed: a crash
+at any moment leaves every record either there or in the pack.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any
 
@@ -29,7 +33,7 @@ from pipeline.layout.writing import NoFileError, writing
 from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
 from pipeline.store.files import COMMITS, CUBE, RUN_FILE, TIMINGS, Files, entry_of, problems_of
 from pipeline.store.keys import Owners, chunk_keys
-from pipeline.store.record_copy import copied_records
+from pipeline.store.record_copy import copied_records, remove_copy
 from pipeline.store.records import (
     BLOCK,
     Commit,
@@ -39,6 +43,7 @@ from pipeline.store.records import (
     line_of,
     marker_key,
     pack_key,
+    pack_text,
     read_pack,
     read_record,
     record_text,
@@ -60,25 +65,12 @@ def write_task(
 ) -> None:
     """Write the results of a task, then the commit record that proves them complete.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    index
-        Index of the task.
-    values
-        Array by variable name, in the shape of the task's block followed by the variable's own dims.
-    counts
-        Number of cells by status name, for the command `status`.
+    Arrays have the shape of the task's block followed by the variable's own dims; `counts` has the number of cells by
+    status name.
 
-    Raises
-    ------
-    ValueError
-        If an array has another shape or dtype than the store, or a block cuts a chunk.
-    DamagedError
-        If the metadata of a variable have changed since the set-up.
-    RefusedError
-        If the run directory was removed meanwhile.
+    Raise `ValueError` if an array has another shape or dtype than the store, or a block cuts a chunk, `DamagedError` if
+    the metadata of a variable have changed since the set-up, and `RefusedError` if the run directory was removed
+    meanwhile.
     """
     info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
     cube = info.files.below(CUBE)
@@ -173,37 +165,21 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 # ---- reading -----------------------------------------------------------------------------------
 
 
-def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
+def read_commits(info: RunInfo, plan: Plan) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
-    If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this
-    check would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the
-    reading of chunks.
+    If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this check
+    would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of
+    chunks.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    echo
-        Function that prints a line: one for every record that does not count, with the reason.
-
-    Raises
-    ------
-    UnreadableError
-        If a record or a folder exists and cannot be read. Its tasks are not taken for pending: a failing disk
-        must not cause a sweep.
-    RefusedError
-        If a folder is a link.
+    Raise `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending,
+    since a failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
-    records, rejected = scan(info, plan, copies=info.files.local is None)
-    problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
+    records, _ = scan(info, plan, copies=info.files.local is None)
     if not records.packs:  # a small run: listing its files takes little time
         absent = absent_objects(info, records)
         whole = {index: commit for index, commit in records.items() if index not in absent}
         records = Records(info.files, info.digest, whole)
-        problems = [f"task {i}: {problem}; it is computed again" for i, problem in absent.items()] + problems
-    for problem in problems if echo else ():
-        echo(problem)  # type: ignore[misc]
     return records
 
 
@@ -226,13 +202,7 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
 
 
 def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
-    """Return the valid commit record of one task, or None; the files that it lists are not checked.
-
-    Raises
-    ------
-    UnreadableError
-        If the record exists and cannot be read.
-    """
+    """Return the valid commit record of one task, or None; the files that it lists are not checked."""
     return scan(info, plan, (index // BLOCK,))[0].get(index)
 
 
@@ -241,21 +211,8 @@ def scan(
 ) -> tuple[Records, dict[str, str]]:
     """Read the folder ``commits``; return the valid commit records, and the problems of the others by file name.
 
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    blocks
-        Blocks of tasks to read; by default all.
-    copies
-        Whether the copy of a record (`pipeline.store.record_copy`) may be read in the place of its file.
-
-    Raises
-    ------
-    UnreadableError
-        If a file exists and cannot be read, or if the folder changes at every attempt.
-    RefusedError
-        If the folder is a link.
+    With `copies`, the copy of a record (`pipeline.store.record_copy`) may be read in the place of its file. Raise
+    `UnreadableError` if a file exists and cannot be read, or if the folder changes at every attempt.
     """
     info.files.refuse_links(COMMITS)
     folder = info.files.below(COMMITS)
@@ -316,9 +273,7 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Return whether a file with one commit record must be read because no valid pack (file of many records) holds
-        its record.
-        """
+        """Return whether a file with one commit record must be read because no valid pack holds its record."""
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
             return self._blocks is None  # not the name of a record: read it in a full scan, to report it
@@ -391,17 +346,8 @@ def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
 def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None) -> int:
     """Remove files in ``cube.zarr`` and ``commits`` that belong to no valid commit record; return their number.
 
-    Only the holder of the lock may call this. Files outside ``cube.zarr`` and ``commits`` stay. A link inside
-    them is removed, its target stays.
-
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    commits
-        All valid records, as `read_commits` has just returned them.
-    echo
-        Function that prints a line about the removed files.
+    Only the holder of the lock may call this, with all valid records, as `read_commits` has just returned them. Files
+    outside ``cube.zarr`` and ``commits`` stay. A link inside them is removed, its target stays.
     """
     leftovers = leftover_keys(info, plan, commits)
     info.files.remove(leftovers)
@@ -409,3 +355,78 @@ def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None)
         more = f" and {len(leftovers) - 3} more" if len(leftovers) > 3 else ""
         echo(f"removed {len(leftovers)} files that no commit record vouches for: {', '.join(leftovers[:3])}{more}")
     return len(leftovers)
+
+
+# ---- packs -----------------------------------------------------------------------------------------
+
+
+class Packer:
+    """Counter of committed tasks that packs the records of each complete block of tasks in one file."""
+
+    def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
+        self._info = info
+        self._plan = plan
+        self._n_whole = plan.n_tasks // BLOCK
+        self._counts = Counter(i // BLOCK for i in commits)
+        packed = {block for block, pack in commits.packs.items() if not pack.without}
+        for block in sorted(set(self._counts) - packed):
+            self._pack_if_whole(block)
+
+    def add(self, index: int) -> None:
+        """Count a newly committed task; pack the records of its block if that is complete."""
+        self._counts[index // BLOCK] += 1
+        self._pack_if_whole(index // BLOCK)
+
+    def _pack_if_whole(self, block: int) -> None:
+        if block < self._n_whole and self._counts[block] >= BLOCK:
+            pack_block(self._info, self._plan, block)
+
+
+def pack_block(info: RunInfo, plan: Plan, block: int) -> bool:
+    """Merge the commit records of a block of tasks into one file if all of them are valid; return whether they are."""
+    tasks = range(block * BLOCK, (block + 1) * BLOCK)
+    commits, _ = scan(info, plan, blocks={block})
+    if not all(index in commits for index in tasks):
+        return False
+    pack = commits.packs.get(block)
+    if pack is None or pack.without:
+        info.files.write(pack_key(block), pack_text(commits, info.digest, block))
+    info.files.remove([marker_key(index) for index in tasks])
+    return True
+
+
+def withdraw(info: RunInfo, names: Iterable[str]) -> None:
+    """Remove commit records, so that the next run computes their tasks again.
+
+    `names` are file names of the records, as if each had its own file; or the name of a damaged pack, whose whole
+    records stay.
+    """
+    info.files.refuse_links(COMMITS)
+    remove_copy(info)
+    folder = info.files.below(COMMITS)
+    blocks: dict[int, set[int]] = {}
+    for name in names:
+        block = block_of_pack(name)
+        stem = name.removesuffix(".json")
+        if block is not None:
+            blocks.setdefault(block, set())
+        elif stem.isdecimal() and marker_key(int(stem)) == f"{COMMITS}/{name}":
+            blocks.setdefault(int(stem) // BLOCK, set()).add(int(stem))
+        folder.remove([name] if block is None else [])
+    for block, tasks in blocks.items():
+        _rewrite(info, block, tasks)
+
+
+def _rewrite(info: RunInfo, block: int, tasks: set[int]) -> None:
+    """Rewrite a pack (a file of many commit records) without the records of some tasks and without damaged ones."""
+    try:
+        content = info.files.read(pack_key(block))
+    except FileNotFoundError:  # none, or a link, which is not read
+        content = b""
+    kept: Mapping[int, Commit] = {
+        index: commit for index, commit in salvage(content, info.digest, block).items() if index not in tasks
+    }
+    if kept:
+        info.files.write(pack_key(block), pack_text(kept, info.digest, block))
+    else:
+        info.files.remove([pack_key(block)])

@@ -25,7 +25,7 @@ from zarr.storage import LocalStore
 from pipeline.layout.cells import parameter_axes
 from pipeline.products.reporting import report
 from pipeline.store.files import CUBE, entry_of
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 CHUNK_BYTES = 500_000
 """Bytes of a chunk before compression, so large that a request's delay is short beside its transfer."""
@@ -42,49 +42,23 @@ PRIVATE = ("host",)
 
 @dataclass(frozen=True)
 class Layer:
-    """An additional array that is stored with the result cube: one value, or an array of values, for each cell.
+    """An additional array that is stored with the result cube: one value, or an array of values, for each cell."""
 
-    Attributes
-    ----------
-    values : ndarray
-        In the shape of the cells, followed by `own_dims`.
-    attrs : mapping
-        Attributes of the array, such as its unit.
-    own_dims : tuple of str
-        Dims after those of the cells.
-    """
-
-    values: np.ndarray
-    attrs: Mapping[str, Any]
-    own_dims: tuple[str, ...] = ()
+    values: np.ndarray  # in the shape of the cells, followed by `own_dims`
+    attrs: Mapping[str, Any]  # attributes of the array, such as its unit
+    own_dims: tuple[str, ...] = ()  # dims after those of the cells
 
 
 Layers = Mapping[str, Layer]
 
 
-def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
-    """Write the committed cells of a run as a zarr cube with small chunks, which browsers can read.
+def write_cube(run: RunDirectory, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
+    """Write the committed cells of a run as a zarr cube with small chunks, which browsers can read, in a new
+    ``cube.zarr``.
 
-    Parameters
-    ----------
-    run
-        An opened run. Cells that it has not committed read as pending in the new cube, too.
-    folder
-        Folder in which ``cube.zarr`` is created. It must not have one yet.
-    along
-        Dim of the swept parameter on the horizontal axis; None if nothing is swept.
-    layers
-        Additional arrays over the cells, by name.
-
-    Returns
-    -------
-    dict
-        Size and sha256 of every file, by its path below `folder`.
-
-    Raises
-    ------
-    DamagedError
-        If the content of a chunk of the run has changed since it was written.
+    Cells that the run has not committed read as pending there, too. `along` is the dim of the swept parameter on the
+    horizontal axis. Return size and sha256 of every file, by its path below `folder`. Raise `DamagedError` if the
+    content of a chunk has changed.
     """
     place = folder / CUBE
     place.mkdir(parents=True)
@@ -97,11 +71,9 @@ def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dic
 
 
 class _Columns:
-    """Chunk layout of the rewritten result cube: a chunk holds one state for all initial conditions at several values
-    of one swept parameter.
-    """
+    """Chunks of the rewritten cube: one state for all initial conditions at values of one parameter."""
 
-    def __init__(self, run: Run, along: str | None) -> None:
+    def __init__(self, run: RunDirectory, along: str | None) -> None:
         self.dims, self.shape, self._sizes = run.plan.dims, run.plan.shape, run.plan.sizes
         swept = [axis.dim for axis in parameter_axes(run.spec)]
         starts = [dim for dim in reversed(self.dims) if dim not in swept]
@@ -111,9 +83,7 @@ class _Columns:
         self._order = [*starts, *([] if along is None else [along]), *others]
 
     def chunks(self, itemsize: int, own: tuple[str, ...] = ()) -> tuple[int, ...]:
-        """Return the chunk shape of an array whose dimensions are those of the cells, then the further dimensions
-        `own`, such as ``state``.
-        """
+        """Return the chunk shape of an array over the cells and the further dims `own`, such as ``state``."""
         apart = tuple(1 if dim == "state" else self._sizes[dim] for dim in own)
         room = max(1, CHUNK_BYTES // (itemsize * math.prod(apart)))
         found = {}
@@ -123,9 +93,7 @@ class _Columns:
         return (*(found[dim] for dim in self.dims), *apart)
 
     def slabs(self, chunks: tuple[int, ...], bytes_per_cell: int) -> Iterator[tuple[slice, ...]]:
-        """Yield index slices along the explorer's horizontal axis: whole chunks, as many per slice as fit in a fixed
-        amount of memory.
-        """
+        """Yield index slices along the horizontal axis: as many whole chunks as fit in some memory."""
         if self._along is None:
             yield (slice(None),) * len(self.dims)
             return
@@ -137,7 +105,7 @@ class _Columns:
             yield tuple(part if k == i else slice(None) for k in range(len(self.dims)))
 
 
-def _write_group(run: Run, store: LocalStore, columns: _Columns, layers: Layers) -> None:
+def _write_group(run: RunDirectory, store: LocalStore, columns: _Columns, layers: Layers) -> None:
     ds = run.cube()
     attrs = {str(k): v for k, v in ds.attrs.items() if k not in PRIVATE}
     others = " ".join(sorted(str(name) for name in ds.coords if name not in ds.dims))

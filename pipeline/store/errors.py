@@ -4,9 +4,7 @@ from __future__ import annotations
 
 
 class StoreError(Exception):
-    """Base class of errors for a run directory that cannot be used as requested; the message gives the cause and a
-    remedy.
-    """
+    """Base class of errors for a run directory that cannot be used; the message has cause and remedy."""
 
 
 class RefusedError(StoreError):

@@ -59,12 +59,7 @@ class Files(Protocol):
     def names(self) -> list[str]:
         """Return the first parts of all keys (the top-level names), sorted.
 
-        Raises
-        ------
-        FileNotFoundError
-            If the place does not exist.
-        NotADirectoryError
-            If the place is a file.
+        Raise `FileNotFoundError` if the place does not exist, and `NotADirectoryError` if it is a file.
         """
         ...
 
@@ -75,12 +70,8 @@ class Files(Protocol):
     def read(self, key: str) -> bytes:
         """Return the content of a file.
 
-        Raises
-        ------
-        FileNotFoundError
-            If the file does not exist.
-        NoFileError
-            If the key leads to a link, a folder or anything else that is not a file.
+        Raise `FileNotFoundError` if it does not exist, and `NoFileError` if the key leads to a link, a folder or
+        anything else that is not a file.
         """
         ...
 
@@ -125,29 +116,15 @@ class Files(Protocol):
         ...
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Return the keys of folders found where files should be, and of files where folders should be.
-
-        Parameters
-        ----------
-        folders
-            Keys that should be folders.
-        """
+        """Return the keys of folders found where files should be, and of files where the given `folders` should be."""
         ...
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder that occupies a path needed by the run into the run's folder ``aside``; return its new
-        path.
-        """
+        """Move what occupies a path needed by the run into the run's folder ``aside``; return its new path."""
         ...
 
     def refuse_links(self, *prefixes: str) -> None:
-        """Raise `RefusedError` if one of the given files or folders is a symbolic link.
-
-        Raises
-        ------
-        RefusedError
-            If one of the prefixes is a link; the message names it.
-        """
+        """Raise `RefusedError` if one of the given files or folders is a symbolic link."""
         ...
 
     def zarr(self, *, read_only: bool) -> Store:
@@ -158,12 +135,8 @@ class Files(Protocol):
         """Hold the run's lock inside this context, so that no second writer starts; even without the lock, committed
         data stay intact.
 
-        Yields False where locks do not work; another process may then be writing, too.
-
-        Raises
-        ------
-        LockedError
-            If another process holds it.
+        Yields False where locks do not work; another process may then be writing, too. Raise `LockedError` if another
+        process holds it.
         """
         ...
 
@@ -174,13 +147,7 @@ def is_url(place: str | Path) -> bool:
 
 
 def local_path(path: str | Path) -> Path:
-    """Convert text to a path of the local file system; raise `RefusedError` for a URL.
-
-    Raises
-    ------
-    RefusedError
-        If `path` looks like a URL.
-    """
+    """Convert text to a path of the local file system; raise `RefusedError` for a URL."""
     text = str(path)
     if _URL.match(text):
         if is_url(text):
@@ -200,36 +167,14 @@ def entry_of(data: bytes) -> dict[str, Any]:
 
 
 def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Compare files with their recorded sizes and sha256 digests; return a line for each file that differs.
-
-    Parameters
-    ----------
-    files
-        Where the keys of `objects` lie.
-    objects
-        Size and sha256 by key, as of `entry_of`.
-    """
+    """Compare files with their recorded sizes and sha256 digests, by key; return a line for each file that differs."""
     return [problem for _, _, problem in compared(files, objects) if problem]
 
 
 def compared(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, bytes, str]]:
-    """Read files and compare them with their recorded sizes and sha256 digests.
+    """Read files and compare them with their recorded sizes and sha256 digests, as of `entry_of`.
 
-    Parameters
-    ----------
-    files
-        Where the keys of `objects` lie.
-    objects
-        Size and sha256 by key, as of `entry_of`.
-
-    Yields
-    ------
-    key : str
-        Key of the file.
-    content : bytes
-        Its content; empty for a file that is missing.
-    problem : str
-        Line of text; empty if the file is as recorded.
+    Yield key, content (empty for a file that is missing) and a line of text, which is empty if the file is as recorded.
     """
     for key, content in files.read_each(objects):
         if isinstance(content, NoFileError):

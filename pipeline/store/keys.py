@@ -30,13 +30,7 @@ def keys_of(plan: Plan, index: int) -> list[str]:
 
 
 class Owners:
-    """A map from the keys (relative paths) of stored chunks to the tasks that write them.
-
-    Parameters
-    ----------
-    plan
-        Plan of the run.
-    """
+    """A map from the keys (relative paths) of stored chunks to the tasks that write them."""
 
     def __init__(self, plan: Plan) -> None:
         self._block, self._grid = plan.block, plan.task_grid

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import platform
 import shutil
 import stat
 import uuid
@@ -12,7 +13,9 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
@@ -20,7 +23,6 @@ from zarr.storage import LocalStore
 from pipeline.layout.writing import open_plain, sync_folder, write_atomically, writing
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
 from pipeline.store.files import ASIDE, COMMITS, CUBE, HOLDER, LOCK, OWN_FILES, OWN_NAMES, RUN_FILE
-from pipeline.store.lease import holder, in_words
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,10 @@ class LocalFiles:
             return sorted(entry.name for entry in entries)
 
     def is_there(self, key: str) -> bool:
-        """Return whether a plain file exists at a key."""
+        """Return whether a plain file exists at a path. A link or a folder does not count.
+
+        Raise `UnreadableError` if the file system cannot tell.
+        """
         return is_there(self.root / key)
 
     def read(self, key: str) -> bytes:
@@ -65,9 +70,7 @@ class LocalFiles:
         return content
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several files; yield each key with the file's content, or with a `FileNotFoundError` for a missing
-        file.
-        """
+        """Read several files; yield each key with the content, or with a `FileNotFoundError`."""
         for key in keys:
             try:
                 yield key, self.read(key)
@@ -140,9 +143,7 @@ class LocalFiles:
         return found + [name for name in OWN_FILES if os.path.isdir(self.root / name)]
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder that occupies a path needed by the run into the subfolder ``aside``; return its new
-        path.
-        """
+        """Move what occupies a path needed by the run into the subfolder ``aside``; return its new path."""
         path = self.root / key
         target = self.root / ASIDE / f"{key.replace('/', '-')}.{uuid.uuid4().hex[:8]}"
         refuse_links(target.parent)
@@ -167,9 +168,7 @@ class LocalFiles:
 
 
 def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
-    """Add the size of each file below a folder to a dict, by key; raise `RefusedError` if a folder directly in it is a
-    symbolic link.
-    """
+    """Add the size of each file below a folder by key; raise `RefusedError` for links directly in it."""
     with unreadable(folder), os.scandir(folder) as entries:
         below = list(entries)
     for entry in below:
@@ -234,10 +233,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 def is_there(path: Path) -> bool:
     """Return whether a plain file exists at a path. A link or a folder does not count.
 
-    Raises
-    ------
-    UnreadableError
-        If the file system cannot tell.
+    Raise `UnreadableError` if the file system cannot tell.
     """
     try:
         with unreadable(path):
@@ -248,15 +244,7 @@ def is_there(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn file system errors inside this context into `UnreadableError`, except for missing files.
-
-    A missing file is not turned: it may be missing rightly.
-
-    Raises
-    ------
-    UnreadableError
-        For any `OSError` but `FileNotFoundError` and `NotADirectoryError`.
-    """
+    """Turn file system errors in this context into `UnreadableError`, except for missing files."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):
@@ -297,19 +285,8 @@ def run_around(path: Path) -> Path | None:
 def refuse_place(path: Path, option: str = "", within: str = "") -> None:
     """Raise `RefusedError` for a result path that lies inside a run directory or is a broken symbolic link.
 
-    Parameters
-    ----------
-    path
-        A file or a folder; it need not exist.
-    option
-        Option of the command that gave it, for the message.
-    within
-        Folder of a run directory in which results may lie; empty for none.
-
-    Raises
-    ------
-    RefusedError
-        In both cases.
+    `option` is that of the command that gave the path, for the message; `within` a folder of a run directory in which
+    results may lie.
     """
     name = f"{option} {path}".strip()
     if path.is_symlink() and not path.exists():
@@ -332,12 +309,8 @@ def remove_tree(path: Path) -> None:
 def writer_lock(directory: Path) -> Iterator[bool]:
     """Hold a file lock on a run directory against other writers inside this context.
 
-    The system frees the lock when its process ends, however it ends. Yields False where locks fail.
-
-    Raises
-    ------
-    LockedError
-        If another process holds it; the message names that process.
+    The system frees the lock when its process ends, however it ends. Yields False where locks fail. Raise
+    `LockedError`, which names the other process, if it is held.
     """
     from filelock import FileLock, Timeout
 
@@ -379,3 +352,43 @@ def _named(path: Path) -> Iterator[None]:
                 is_own = file.read() == content  # else another run's note: the folder was renamed meanwhile
             if is_own:
                 path.unlink()
+
+
+def holder() -> dict[str, Any]:
+    """Return a note that names this process as the holder of a lock: host, process id, and the time (UTC)."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"host": platform.node(), "pid": os.getpid(), "since": now}
+
+
+def in_words(content: bytes) -> str:
+    """Return a phrase that names the process holding a lock; empty if the note about it is damaged."""
+    found = _holder_in(content)
+    return f" (process {found['pid']} on {found['host']} since {found['since']})" if found else ""
+
+
+def _holder_in(content: bytes) -> dict[str, Any] | None:
+    try:
+        data = json.loads(content)
+        data = {"host": str(data["host"]), "pid": int(data["pid"]), "since": str(data["since"])}
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return data if all(text.isprintable() for text in (data["host"], data["since"])) else None
+
+
+def has_ended(content: bytes) -> bool:
+    """Return whether the holder of a lock was a process of this machine that has ended."""
+    found = _holder_in(content)
+    if found is None or found["host"] != platform.node():
+        return False
+    try:
+        os.kill(found["pid"], 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return False
+
+
+def is_note(content: bytes) -> bool:
+    """Return whether a file's content is a note that names the holder of a lock."""
+    return _holder_in(content) is not None

@@ -1,19 +1,29 @@
-"""Read and write a run's files in an object store, by a URL such as ``s3://bucket/prefix``.
+"""Open a run's files by path or URL, and read and write those in an object store, such as ``s3://bucket/prefix``.
 
 Objects are put whole, and commit records only once. Credentials come from the environment alone
 (``AWS_ACCESS_KEY_ID`` and the other names that S3 clients read). They are never kept, written or printed.
+
+An object store has no lock that ends with its process. A lease is the object ``lock``; it names its holder.
+The holder puts it if it is absent, and again every `RENEW_S`. Another process takes the lease over if it has
+not been renewed for `LEASE_S`, or if its holder was a process of this machine that has ended. Like any lock,
+a lease is a courtesy: the commit protocol does not rely on it.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import re
+import threading
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import islice
+from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
@@ -21,8 +31,10 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore
 
-from pipeline.specification.extras import INSTALL
-from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
+from pipeline.specification.problems import INSTALL
+from pipeline.store.errors import DamagedError, LockedError, RefusedError, StoreError, UnreadableError
+from pipeline.store.files import LOCK, Files, is_url, local_path
+from pipeline.store.local import LocalFiles, has_ended, holder, in_words
 
 T = TypeVar("T")
 
@@ -52,10 +64,7 @@ _AGAIN = "committed results stay; give the same command again to continue."
 def parse_url(text: str) -> ObjectFiles:
     """Parse a URL such as ``s3://bucket/prefix`` and return the files there.
 
-    Raises
-    ------
-    RefusedError
-        If `text` is no such URL, or if the package obstore or the credentials are missing.
+    Raise `RefusedError` if it is no such URL, or if the package obstore or the credentials are missing.
     """
     if "@" in text or "?" in text:  # the message does not repeat the text, which may hold a password
         raise RefusedError("The URL of a run has no user, password or query: credentials are environment.")
@@ -77,13 +86,23 @@ _CREDENTIALS_HELP = (
 )
 
 
+def open_files(place: str | Path | Files) -> Files:
+    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``; `Files` are returned
+    unchanged.
+
+    Raise `RefusedError` if it is another URL, or the object store cannot be used.
+    """
+    if not isinstance(place, (str, Path)):
+        return place
+    if is_url(place):
+        return parse_url(str(place))
+    return LocalFiles(local_path(place))
+
+
 class ObjectFiles:
     """Files of a run in a bucket of an object store, by key; see `pipeline.store.files.Files`.
 
-    Parameters
-    ----------
-    bucket, prefix
-        Place of the files. The prefix neither begins nor ends with a slash and may be empty.
+    The prefix neither begins nor ends with a slash and may be empty.
     """
 
     local = None
@@ -126,9 +145,7 @@ class ObjectFiles:
         return self._store
 
     def below(self, prefix: str) -> ObjectFiles:
-        """Return the files below a prefix; calls with the same prefix return the same `ObjectFiles` object, which keeps
-        its connections.
-        """
+        """Return the files below a prefix; equal prefixes return one object, which keeps its connections."""
         if prefix not in self._below:
             self._below[prefix] = ObjectFiles(self.bucket, f"{self.prefix}/{prefix}".lstrip("/"))
         return self._below[prefix]
@@ -165,9 +182,7 @@ class ObjectFiles:
         return self._ask(key, lambda: bytes(obstore.get(self.store, key).bytes()))
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several objects at once; yield each key with the object's content, or with a `FileNotFoundError` for a
-        missing object.
-        """
+        """Read several objects at once; yield each key with the content, or with a `FileNotFoundError`."""
 
         def read(key: str) -> bytes | FileNotFoundError:
             try:
@@ -188,13 +203,7 @@ class ObjectFiles:
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Write an object unless it exists. An existing object must have the same content.
-
-        Raises
-        ------
-        DamagedError
-            If an object with another content exists.
-        """
+        """Write an object unless it exists; raise `DamagedError` if it then has another content."""
         import obstore
 
         for attempt in range(RETRIES):
@@ -261,9 +270,7 @@ class ObjectFiles:
         """Create a folder: there is nothing to do, since an object store has no folders."""
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Return the keys of folders found where files should be: there are none, since an object store has
-        no folders.
-        """
+        """Return the keys of folders where files should be: an object store has no folders."""
         return []
 
     def move_aside(self, key: str) -> str:
@@ -278,9 +285,7 @@ class ObjectFiles:
         return RunStore(self, read_only=read_only)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Return a context manager that holds a lease, the lock of an object store; see `pipeline.store.lease`."""
-        from pipeline.store.lease import lease
-
+        """Return a context manager that holds a lease, the lock of an object store; see `lease`."""
         return lease(self)
 
     def _ask(self, key: str, request: Callable[[], T], *, writing: bool = False) -> T:
@@ -366,14 +371,7 @@ def _endpoint() -> str:
 def explain(place: str, error: Exception, *, writing: bool = False) -> Exception:
     """Translate an error of an object store into an exception with a one-line message, without request data.
 
-    Parameters
-    ----------
-    place
-        URL that the request was for.
-    error
-        Error from obstore. Its text holds the whole answer, which may name an access key.
-    writing
-        Whether the request was to write.
+    The text of an obstore error holds the whole answer, which may name an access key.
     """
     text = str(error)
     status = re.search(r"status code: (\d{3})", text)
@@ -407,3 +405,96 @@ def _where() -> str:
         return f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or "the object store"
     except ValueError:
         return "the object store"
+
+
+# ---- leases ------------------------------------------------------------------------------------
+
+RENEW_S, LEASE_S = 30.0, 150.0
+"""Seconds between renewals of a lease, and seconds without renewal after which it lapses."""
+
+
+@contextlib.contextmanager
+def lease(files: ObjectFiles) -> Iterator[None]:
+    """Hold the lease of a run in an object store inside this context: a lock that expires unless it is renewed."""
+    content = json.dumps({**holder(), "token": uuid.uuid4().hex}, sort_keys=True).encode()
+    tag = [_take(files, content)]
+    stop = threading.Event()
+
+    def renew() -> None:
+        while not stop.wait(RENEW_S):
+            try:
+                tag[0] = _replace(files, content, tag[0])
+            except _TakenError:
+                return
+
+    thread = threading.Thread(target=renew, name="magpend lease", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        # a failure does no harm here: the lease lapses
+        with contextlib.suppress(FileNotFoundError, StoreError):
+            files.put_lines()
+            if files.read(LOCK) == content:
+                files.remove([LOCK])
+
+
+class _TakenError(Exception):
+    """An error for a lease that another process has replaced in the meantime."""
+
+
+def _take(files: ObjectFiles, content: bytes) -> str:
+    """Create the lease object, or take over an expired one; return its entity tag."""
+    import obstore
+
+    try:
+        return str(obstore.put(files.store, LOCK, content, mode="create", use_multipart=False)["e_tag"])
+    except obstore.exceptions.AlreadyExistsError:
+        pass
+    except (obstore.exceptions.BaseError, OSError):
+        # the lease may have been put although the answer was lost; any other problem shows below
+        pass
+    found = _found(files)
+    if found is None:
+        files.write(LOCK, content)
+        found = _found(files)
+    if found is None or found[0] == content:
+        return found[1] if found else ""
+    there, tag, age_s = found
+    if has_ended(there) or age_s > LEASE_S:
+        with contextlib.suppress(_TakenError):
+            return _replace(files, content, tag)
+    raise LockedError(
+        f"{files.name}: another magpend run is writing here{in_words(there)}. Wait for it or stop it, then "
+        f"run again; the lock of a process that was killed lapses {LEASE_S:g} s after it was last renewed."
+    )
+
+
+def _found(files: ObjectFiles) -> tuple[bytes, str, float] | None:
+    """Return content, entity tag and age in seconds of the present lease object; None if there is none."""
+    import obstore
+
+    try:
+        found = obstore.get(files.store, LOCK)
+    except FileNotFoundError:
+        files.is_there(LOCK)  # raises if the bucket itself is missing
+        return None
+    except (obstore.exceptions.BaseError, OSError):
+        files.read(LOCK)
+        return None
+    age = datetime.now(UTC) - found.meta["last_modified"]
+    return bytes(found.bytes()), str(found.meta["e_tag"]), age.total_seconds()
+
+
+def _replace(files: ObjectFiles, content: bytes, tag: str) -> str:
+    import obstore
+
+    try:
+        put = obstore.put(files.store, LOCK, content, mode={"e_tag": tag}, use_multipart=False)
+    except obstore.exceptions.PreconditionError:
+        raise _TakenError from None
+    except (obstore.exceptions.BaseError, OSError):
+        return tag  # not renewed this time
+    return str(put["e_tag"])

@@ -9,9 +9,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import io
 import json
 import time
 import warnings
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,14 +23,13 @@ import zarr
 from zarr.core.buffer import cpu
 from zarr.storage import MemoryStore
 
-from pipeline.layout.attributes import netcdf_safe
+from pipeline.layout.conventions import netcdf_safe
 from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, writing
-from pipeline.store.arrays import create_array
-from pipeline.store.declared import disagreements, product_problem
+from pipeline.store.arrays import create_array, disagreements, product_problem
 from pipeline.store.errors import DamagedError, UnreadableError
 from pipeline.store.files import Files
 from pipeline.store.local import files_below, refuse_links, remove_tree, sync
-from pipeline.store.places import open_files
+from pipeline.store.objects import open_files
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -53,16 +54,8 @@ Digests = list[tuple[str, str]]
 def write_product(place: Place, ds: xr.Dataset) -> None:
     """Write a dataset (the result of an analysis) to its path, whole or not at all.
 
-    Labels are stored as codes, which the attribute ``words`` lists, since zarr format 3 has no strings of
-    fixed length. If another process first puts a sound product with the same attributes there, that
-    product stays.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written to.
-    RefusedError
-        If the folder is a link.
+    Labels are stored as codes, which the attribute ``words`` lists, since zarr format 3 has no strings of fixed length.
+    If another process first puts a sound product with the same attributes there, that product stays.
     """
     files = open_files(place)
     if files.local is None:
@@ -87,9 +80,7 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
 
 
 def _put_product(files: Files, ds: xr.Dataset) -> None:
-    """Write a product into an object store; ``zarr.json`` with the digest of the content comes last and makes it
-    valid.
-    """
+    """Write a product into an object store; ``zarr.json`` with the digest comes last and makes it valid."""
     data, attrs = _contents(ds)
     with contextlib.suppress(FileNotFoundError, DamagedError):
         if _own(read_product_attrs(files)) == attrs:
@@ -100,21 +91,10 @@ def _put_product(files: Files, ds: xr.Dataset) -> None:
 
 
 def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
-    """Read a product (the stored result of an analysis) into memory.
+    """Read a product (the stored result of an analysis) into memory; with `lazy`, numbers are read when they are used.
 
-    Parameters
-    ----------
-    place
-        Its folder.
-    lazy
-        Whether numbers are read when they are used. The content is compared with its digest now.
-
-    Raises
-    ------
-    FileNotFoundError
-        If it does not exist.
-    DamagedError
-        If its content has changed since it was written.
+    The content is compared with its digest now. Raise `FileNotFoundError` if there is none, and `DamagedError` if its
+    content has changed since it was written.
     """
     import xarray as xr
 
@@ -144,12 +124,7 @@ def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
 def read_product_attrs(place: Place) -> dict[str, Any]:
     """Compare the files of a product (stored analysis result) with the digest in its attributes; return the attributes.
 
-    Raises
-    ------
-    FileNotFoundError
-        If it does not exist.
-    DamagedError
-        If its content has changed since it was written.
+    Raise `FileNotFoundError` if there is none, and `DamagedError` if its content has changed since it was written.
     """
     files = open_files(place)
     if (path := files.local) is not None:
@@ -197,13 +172,7 @@ def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests
 
 
 def remove_product(place: Place) -> None:
-    """Remove a product (stored analysis result) if it exists; of a symbolic link, remove the link but not its target.
-
-    Raises
-    ------
-    RefusedError
-        If the folder that holds it is a link.
-    """
+    """Remove a product (stored analysis result) if it exists; remove a symbolic link, but not its target."""
     files = open_files(place)
     if files.local is None:
         keys = files.everything()
@@ -228,13 +197,7 @@ def leftover_products(files: Files, older_than: float) -> list[Files]:
 
 
 def products_in(files: Files) -> list[Files]:
-    """Return all products (stored results of analyses) in a folder, damaged ones included.
-
-    Raises
-    ------
-    RefusedError
-        If the folder is a link.
-    """
+    """Return all products (stored results of analyses) in a folder, damaged ones included."""
     files.refuse_links("")
     try:
         names = files.names()
@@ -260,9 +223,7 @@ def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
-    """Rename a finished product (stored analysis result) to its final path; first remove a damaged or different one
-    found there.
-    """
+    """Rename a finished product to its final path; first remove a damaged or different one there."""
     for _ in range(_MOST_TRIES):
         try:
             temporary.rename(path)
@@ -278,9 +239,7 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
 
 
 def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Return the files of a product by key, which hold all variables, the attributes and a digest of the content; and
-    the attributes without the digest.
-    """
+    """Return the files of a product by key, with attributes and digest; and the attributes without it."""
     data: dict[str, Any] = {}
     store = MemoryStore(data)
     group = zarr.create_group(store, zarr_format=3)
@@ -305,9 +264,7 @@ def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
 
 
 def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
-    """Return one digest of a product (stored analysis result), computed from its attributes and the digests of its
-    files.
-    """
+    """Return one digest of a product, computed from its attributes and the digests of its files."""
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
     for key, sha256 in sorted(digests, key=lambda entry: entry[0].split("/")):
         digest.update(f"\n{key} {sha256}".encode())
@@ -368,3 +325,49 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+# ---- blocks of an unfinished product: a file each, so that a block costs one write -----------------
+
+_ABOUT = "about.json"
+
+
+def write_block(files: Files, key: str, ds: xr.Dataset) -> None:
+    """Write a dataset to a file, whole or not at all."""
+    arrays, variables = {}, {}
+    for name in map(str, ds.variables):
+        arrays[name], attrs = coded(name, ds.variables[name])
+        variables[name] = [list(map(str, ds.variables[name].dims)), attrs]
+    about = {"attrs": plain(ds.attrs), "coords": list(map(str, ds.coords)), "variables": variables}
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr(_ABOUT, json.dumps(about))
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, values, allow_pickle=False)
+    files.write(key, content.getvalue())
+
+
+def read_block(files: Files, key: str) -> xr.Dataset:
+    """Read a dataset that `write_block` has written.
+
+    Raise `FileNotFoundError` if there is none, and `DamagedError` if its content has changed.
+    """
+    import xarray as xr
+
+    try:
+        with zipfile.ZipFile(io.BytesIO(files.read(key))) as archive:
+            about: dict[str, Any] = json.loads(archive.read(_ABOUT))
+            variables = {
+                name: (
+                    dims,
+                    np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False),
+                    attrs,
+                )
+                for name, (dims, attrs) in about["variables"].items()
+            }
+        ds = xr.Dataset({name: xr.Variable(*parts) for name, parts in variables.items()}, attrs=about["attrs"])
+        ds = ds.set_coords(about["coords"])
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError) as error:
+        raise DamagedError(f"{files.name}/{key}: {error}") from None
+    return ds.assign(with_words(ds))

@@ -16,13 +16,10 @@ _PACKAGES = ("magpend", "numpy", "numba", "zarr", "numcodecs", "xarray")
 
 
 def provenance() -> dict[str, str]:
-    """Return the time, the host name and, if magpend runs from a git repository, its commit.
+    """Return the time ``created`` (UTC, ISO 8601), the ``host``, and, if magpend runs from a git repository, its
+    ``git_commit``.
 
-    Returns
-    -------
-    dict
-        ``created`` (UTC, ISO 8601), ``host``, and ``git_commit``: 40 hexadecimal digits, followed by
-        ``+changes`` where files differ from the commit.
+    This has 40 hexadecimal digits, followed by ``+changes`` where files differ from the commit.
     """
     commit = git_commit()
     return {

@@ -12,22 +12,14 @@ import json
 from collections.abc import Mapping
 
 from pipeline.layout.plan import Plan
-from pipeline.store.checksums import fits, seal
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.records import Commit, Records, line_of, marker_key, read_record
 from pipeline.store.runfile import RunInfo
+from pipeline.store.stored_json import fits, seal
 
 
 def copy_text(singles: Mapping[int, Commit], digest: str) -> bytes:
-    """Return the content of the copy: the commit records in order, then a line with their number and a checksum.
-
-    Parameters
-    ----------
-    singles
-        Records by task that are in no pack.
-    digest
-        Digest of the run.
-    """
+    """Return the content of the copy: unpacked commit records in order, then their number and a checksum."""
     body = b"".join(line_of(singles[index], digest) for index in sorted(singles))
     return body + seal(json.dumps({"digest": digest, "records": len(singles)}, sort_keys=True), body).encode()
 
@@ -36,13 +28,6 @@ def write_copy(info: RunInfo, plan: Plan, commits: Records) -> None:
     """Write the copy for a complete run whose records are not all in packs; remove it for any other run.
 
     Only the holder of the lock may call this.
-
-    Parameters
-    ----------
-    info, plan
-        The run and its plan.
-    commits
-        All valid records.
     """
     if len(commits) < plan.n_tasks or not commits.singles:
         remove_copy(info)
@@ -59,15 +44,7 @@ def remove_copy(info: RunInfo) -> None:
 
 
 def copied_records(info: RunInfo, sizes: Mapping[str, int]) -> dict[int, Commit]:
-    """Return by task the records in the copy whose own files are there; none if there is no undamaged copy.
-
-    Parameters
-    ----------
-    info
-        The run.
-    sizes
-        Size of the files in ``commits``, by name.
-    """
+    """Return by task the records in an undamaged copy whose own files have the sizes given by name."""
     content = _content(info)
     if content is None or not fits(content):
         return {}

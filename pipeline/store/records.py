@@ -19,10 +19,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.store.checksums import CHECKSUM, fits, seal, unseal
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import COMMITS, Files
-from pipeline.store.stored_json import StoredCommit, StoredPack, WrongTypeError, parsed
+from pipeline.store.stored_json import CHECKSUM, StoredCommit, StoredPack, WrongTypeError, fits, parsed, seal, unseal
 
 BLOCK = 1000
 """Tasks whose records make a pack; this number is part of the directory's format."""
@@ -32,21 +31,11 @@ _OPEN_PACKS = 8
 
 @dataclass(frozen=True)
 class Commit:
-    """A valid commit record: the number of cells by status, and size and sha256 of the task's files.
+    """A valid commit record: the number of cells by status, and size and sha256 of the task's files."""
 
-    Attributes
-    ----------
-    task : int
-        Index of the task.
-    status : dict
-        Number of cells by status name.
-    objects : dict
-        Size and sha256 of the task's files, by key below ``cube.zarr``.
-    """
-
-    task: int
-    status: dict[str, int]
-    objects: dict[str, dict[str, Any]]
+    task: int  # index of the task
+    status: dict[str, int]  # number of cells by status name
+    objects: dict[str, dict[str, Any]]  # size and sha256 of the task's files, by key below ``cube.zarr``
 
 
 # ---- names -------------------------------------------------------------------------------------
@@ -98,21 +87,11 @@ def line_of(commit: Commit, digest: str) -> bytes:
 
 @dataclass(frozen=True)
 class Pack:
-    """Summary in the last line of a pack, a file of many commit records.
+    """Summary in the last line of a pack, a file of many commit records."""
 
-    Attributes
-    ----------
-    block : int
-        Index of the block.
-    cells : dict
-        Number of committed cells by status name.
-    without : tuple of int
-        Tasks of the block without a record: they were withdrawn.
-    """
-
-    block: int
-    cells: dict[str, int]
-    without: tuple[int, ...]
+    block: int  # index of the block
+    cells: dict[str, int]  # number of committed cells by status name
+    without: tuple[int, ...]  # tasks of the block without a record: they were withdrawn
 
     @property
     def tasks(self) -> list[int]:
@@ -138,9 +117,7 @@ def pack_text(commits: Mapping[int, Commit], digest: str, block: int) -> bytes:
 
 
 def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
-    """Return the summary of a pack (a file of many commit records) if it is undamaged and of this run; otherwise return
-    the problem.
-    """
+    """Return the summary of a pack if it is undamaged and of this run; otherwise return the problem."""
     if not fits(content):
         return "torn or damaged"
     try:
@@ -173,16 +150,7 @@ def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
 class Records(Mapping[int, Commit]):
     """Valid commit records of a run by task; records in packs (files of many records) are read on demand.
 
-    Parameters
-    ----------
-    files
-        Files of the run directory.
-    digest
-        Digest of the run.
-    singles
-        Records by task that have their own files, or were salvaged from a damaged pack.
-    packs
-        Whole packs by block.
+    `singles` have their own files, or were salvaged from a damaged pack; `packs` are whole.
     """
 
     def __init__(

@@ -9,9 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.limits import check_plan
-from pipeline.layout.plan import Plan, make_plan
-from pipeline.specification.parsing import Spec
+from pipeline.layout.plan import Plan, check_plan, make_plan
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import cube_digest, read_commits
 from pipeline.store.files import Files
 from pipeline.store.records import Records
@@ -33,31 +32,18 @@ def _short(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class Run:
-    """An opened run directory with the commit records found when it was opened, so that all results use the same cells.
+class RunDirectory:
+    """An opened run directory with the commit records found when it was opened: all results use the same cells."""
 
-    Attributes
-    ----------
-    info : RunInfo
-        Content of ``run.json``.
-    spec : Spec
-        Specification of the run.
-    plan : Plan
-        Plan that follows from `spec`.
-    commits : Records
-        Valid commit records by task.
-    known : dict
-        Contents of small files of the set-up by key, which were compared with their digests in ``run.json``.
-    """
-
-    info: RunInfo
-    spec: Spec
-    plan: Plan
-    commits: Records
+    info: RunInfo  # content of ``run.json``
+    spec: Spec  # specification of the run
+    plan: Plan  # plan that follows from `spec`
+    commits: Records  # valid commit records by task
+    # contents of small files of the set-up by key, which were compared with their digests in ``run.json``
     known: Mapping[str, bytes] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def open(cls, source: str | Path | Files | Run) -> Run:
+    def open(cls, source: str | Path | Files | RunDirectory) -> RunDirectory:
         """Open a run directory with its present commit records; return an opened run unchanged.
 
         Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
@@ -73,10 +59,10 @@ class Run:
 
         Examples
         --------
-        >>> run = Run.open("runs/quickstart")                                # doctest: +SKIP
+        >>> run = RunDirectory.open("runs/quickstart")                                # doctest: +SKIP
         >>> run.cube().section.sel(frequency=2.2, method="nearest")          # doctest: +SKIP
         """
-        if isinstance(source, Run):
+        if isinstance(source, RunDirectory):
             return source
         info = read_run(source)
         known = check_skeleton(info)
@@ -156,7 +142,7 @@ class Run:
         return cube_of(self, chunks=chunks, check=check)
 
 
-def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
+def open_run(path: str | Path | RunDirectory, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
     """Open the result cube of a run directory as a dataset; only coordinates are read until variables are used.
 
     Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. Open the run again to see
@@ -193,4 +179,4 @@ def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None =
     >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
     >>> ds.section.isel(state=0).sel(frequency=2.2, method="nearest")       # doctest: +SKIP
     """
-    return Run.open(path).cube(chunks, check=check)
+    return RunDirectory.open(path).cube(chunks, check=check)

@@ -12,52 +12,30 @@ from typing import Any
 
 from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.recorded_drive import is_whole
-from pipeline.store.checksums import CHECKSUM, fits, has_seal, seal
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files
-from pipeline.store.places import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.provenance import provenance, versions
-from pipeline.store.stored_json import StoredRun, parsed
+from pipeline.store.stored_json import CHECKSUM, StoredRun, fits, has_seal, parsed, seal
 
 
 @dataclass(frozen=True)
 class RunInfo:
-    """The content of ``run.json``.
+    """The content of ``run.json``."""
 
-    Attributes
-    ----------
-    files : Files
-        Files of the run directory.
-    digest : str
-        Digest of `identity`.
-    identity : dict
-        Everything that decides the numbers and the layout.
-    title : str
-        Title from the specification.
-    spec : dict
-        Specification as plain data for `parse_spec`.
-    spec_text : str
-        Text of the TOML file.
-    versions : dict
-        Versions of the packages that made the run.
-    provenance : dict
-        See `pipeline.store.provenance`.
-    skeleton : dict
-        Size and sha256 of the files written by the set-up.
-    """
-
-    files: Files
-    digest: str
-    identity: dict[str, Any]
-    title: str
-    spec: dict[str, Any]
-    spec_text: str
-    versions: dict[str, str]
-    provenance: dict[str, str]
-    skeleton: dict[str, dict[str, Any]]
+    files: Files  # files of the run directory
+    digest: str  # digest of `identity`
+    identity: dict[str, Any]  # everything that decides the numbers and the layout
+    title: str  # title from the specification
+    spec: dict[str, Any]  # specification as plain data for `Spec.parse`
+    spec_text: str  # text of the TOML file
+    versions: dict[str, str]  # versions of the packages that made the run
+    provenance: dict[str, str]  # see `pipeline.store.provenance`
+    skeleton: dict[str, dict[str, Any]]  # size and sha256 of the files written by the set-up
 
     @property
     def name(self) -> str:
@@ -67,7 +45,7 @@ class RunInfo:
     def parsed_spec(self) -> Spec:
         """Parse the specification; raise `DamagedError` if this version cannot read it."""
         try:
-            return kept_spec(self.spec)
+            return Spec.parse(self.spec, KEPT)
         except SpecError as error:
             made = self.versions.get("magpend", "not named")
             raise DamagedError(
@@ -91,12 +69,8 @@ def is_run(files: Files) -> bool:
 def read_run(place: str | Path | Files) -> RunInfo:
     """Read and check ``run.json``.
 
-    Raises
-    ------
-    RefusedError
-        If it does not exist, or has another format.
-    DamagedError
-        If its content has changed since it was written.
+    Raise `RefusedError` if it does not exist or has another format, and `DamagedError` if it has changed since it was
+    written.
     """
     files = open_files(place)
     directory, path = files.name, files.below(RUN_FILE).name
@@ -118,9 +92,7 @@ def read_run(place: str | Path | Files) -> RunInfo:
 
 
 def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
-    """Raise `RefusedError` if ``run.json`` has another format number than this version reads, unless the number itself
-    may be damaged.
-    """
+    """Raise `RefusedError` for another format number in ``run.json``, unless the number may be damaged."""
     found = data["identity"]["format"]
     if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
         raise RefusedError(

@@ -7,21 +7,19 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import differences, digest_of
+from pipeline.layout.identity import differences, digest_of, numbered
 from pipeline.layout.plan import Plan
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
+from pipeline.store.arrays import METADATA
 from pipeline.store.checking import ODD, odd_keys, verify
-from pipeline.store.checksums import fits
-from pipeline.store.declared import METADATA
+from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
-from pipeline.store.lease import is_note
-from pipeline.store.local import run_around
-from pipeline.store.packing import withdraw
-from pipeline.store.places import open_files
+from pipeline.store.local import is_note, run_around
+from pipeline.store.objects import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
 from pipeline.store.skeleton import entries_of, skeleton_files, skeleton_keys, skeleton_problems, write_skeleton
+from pipeline.store.stored_json import fits
 
 Echo = Callable[[str], None]
 
@@ -29,15 +27,8 @@ Echo = Callable[[str], None]
 def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | None:
     """Check whether a run can be started or continued in a directory, without changing anything there.
 
-    Returns
-    -------
-    RunInfo or None
-        The run that is there already; None if it can be set up, or its ``run.json`` must be rebuilt.
-
-    Raises
-    ------
-    RefusedError
-        If the directory holds another run (the message lists the differences) or other files.
+    Return the run that is there already; None if it can be set up, or its ``run.json`` must be rebuilt. Raise
+    `RefusedError` if the directory holds another run (the message lists the differences) or other files.
     """
     files = open_files(place)
     if files.local is not None:
@@ -91,9 +82,7 @@ def _refuse_place(folder: Path) -> None:
 
 
 def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
-    """Raise `RefusedError` for a directory without a valid ``run.json``, unless it is empty or holds files of this same
-    run.
-    """
+    """Raise `RefusedError` for a directory without a valid ``run.json`` that holds what is not of this run."""
     foreign = [name for name in names if not _is_own(name)]
     if foreign:
         raise RefusedError(
@@ -201,15 +190,9 @@ def establish(
 ) -> RunInfo:
     """Create a run directory or, if it exists, open it and rebuild damaged metadata and coordinates of its result cube.
 
-    Only the holder of the lock may call this.
-
-    If ``run.json`` or a file of the skeleton had to be rebuilt, the committed tasks are compared with their
-    records, and tasks that do not fit are withdrawn.
-
-    Raises
-    ------
-    RefusedError
-        See `check`.
+    Only the holder of the lock may call this. If ``run.json`` or a file of the skeleton had to be rebuilt, the
+    committed tasks are compared with their records, and tasks that do not fit are withdrawn. Raise `RefusedError` as
+    `check`.
     """
     files = open_files(place)
     for key in odd_keys(files, skeleton_keys(spec, plan)):

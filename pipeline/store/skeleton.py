@@ -14,16 +14,14 @@ import numpy as np
 import zarr
 from zarr.storage import MemoryStore
 
-from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.cells import Coordinate, coordinates, moving_coordinates
 from pipeline.layout.conventions import CONVENTIONS, Described, conventional_attributes
 from pipeline.layout.identity import digest_of
-from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.parsing import Spec
-from pipeline.store.arrays import create_array, write_whole
-from pipeline.store.declared import METADATA, consolidated_metadata, disagreements
+from pipeline.specification.spec import Spec
+from pipeline.store.arrays import METADATA, consolidated_metadata, create_array, disagreements, write_whole
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files, compared, entry_of
 from pipeline.store.runfile import RunInfo
@@ -35,16 +33,10 @@ MOST_KEPT = 1_000_000
 def skeleton_files(
     spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str, *, described: bool = True
 ) -> dict[str, bytes]:
-    """Return the contents of all files of an empty result cube (metadata and coordinates) by key; those of the group
-    come first.
+    """Return the contents of all files of an empty result cube (metadata and coordinates) by key, those of the group
+    first.
 
-    Parameters
-    ----------
-    spec, plan, identity, spec_text, title
-        The run.
-    described
-        Whether variables have the attributes of `pipeline.layout.conventions`. Cubes of earlier versions have none
-        of them.
+    Unless `described`, variables lack the attributes of `pipeline.layout.conventions`, as in cubes of earlier versions.
     """
     attrs = {
         "kind": plan.kind,
@@ -152,16 +144,12 @@ def _compare(info: RunInfo, keys: Iterable[str]) -> tuple[dict[str, bytes], list
 
 
 def check_skeleton(info: RunInfo) -> dict[str, bytes]:
-    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; return the contents of the
-    small files.
+    """Compare the cube's metadata and coordinates with their digests in ``run.json``; return the contents of the small
+    files.
 
-    In an object store, where each file is a request, the arrays' own metadata are not read if the group's file
-    repeats them all: readers then use that file, whose digest is compared, and no other.
-
-    Raises
-    ------
-    DamagedError
-        If a file is missing or has changed; the message names the files and the remedy.
+    In an object store, where each file is a request, the arrays' own metadata are not read if the group's file repeats
+    them all: readers then use that file, whose digest is compared, and no other. Raise `DamagedError`, which names the
+    files and the remedy, if a file is missing or has changed.
     """
     keys = list(info.skeleton)
     first = [key for key in keys if key == METADATA or not key.endswith(METADATA)]

@@ -1,13 +1,62 @@
-"""Declare the types of stored JSON (``run.json``, commit records, packs), which may come from a stranger."""
+"""Seal JSON texts (``run.json``, commit records, packs) by a checksum; check it, and the types of their values.
+
+A sealed text is a JSON object, or lines that end in one. Its last member is the sha256 of every byte before
+it, so that any changed bit is noticed.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.specification.problems import problems_of
-from pipeline.store.declared import METADATA
+from pipeline.store.arrays import METADATA
+
+# ---- checksums -------------------------------------------------------------------------------------
+
+CHECKSUM = "checksum"
+_MARK = f', "{CHECKSUM}": "'
+_END = '"}\n'
+
+
+class SealError(ValueError):
+    """An error for a text whose checksum is missing or wrong."""
+
+
+def seal(text: str, before: bytes = b"") -> str:
+    """Append a checksum to a JSON object; it also covers `before`, the bytes before it in its file."""
+    body = text.rstrip()
+    if not body.endswith("}"):
+        raise ValueError("only a JSON object can be sealed.")
+    body = body[:-1].rstrip() + _MARK
+    return body + hashlib.sha256(before + body.encode()).hexdigest() + _END
+
+
+def has_seal(content: bytes) -> bool:
+    """Return whether a file's content ends with a checksum, right or wrong."""
+    return _MARK.encode() in content[-200:]
+
+
+def fits(content: bytes) -> bool:
+    """Return whether the checksum at the end of a file's content fits all bytes before it."""
+    n = 64 + len(_END)
+    body, end = content[:-n], content[-n:]
+    return body.endswith(_MARK.encode()) and end == hashlib.sha256(body).hexdigest().encode() + _END.encode()
+
+
+def unseal(content: bytes) -> dict[str, Any]:
+    """Check the checksum at the end of a JSON object; return the object without it, or raise `SealError`."""
+    if not fits(content):
+        raise SealError("its checksum does not fit" if has_seal(content) else "it ends without its checksum")
+    data: dict[str, Any] = json.loads(content)
+    del data[CHECKSUM]
+    return data
+
+
+# ---- types -----------------------------------------------------------------------------------------
 
 
 class Stored(BaseModel):
@@ -97,13 +146,7 @@ class WrongTypeError(ValueError):
 
 
 def parsed(model: type[S], data: Any) -> dict[str, Any]:
-    """Compare stored JSON with its types; return it as plain data.
-
-    Raises
-    ------
-    WrongTypeError
-        If a key is missing or unknown, or a value has another type.
-    """
+    """Compare stored JSON with its types; return it as plain data, or raise `WrongTypeError`."""
     try:
         return model.model_validate(data).model_dump(exclude_unset=True)
     except ValidationError as error:

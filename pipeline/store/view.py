@@ -20,7 +20,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
-from pipeline.store.declared import Declared
+from pipeline.store.arrays import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files
 from pipeline.store.keys import Owners
@@ -31,13 +31,11 @@ VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 SMALL = 200_000
-"""Largest size in bytes of a chunk that `pipeline.store.parallel_reads` reads; zarr reads larger ones."""
+"""Largest size in bytes of a chunk that `pipeline.store.reading` reads; zarr reads larger ones."""
 
 
 def checks_chunks() -> bool:
-    """Return whether chunks are compared with their commit records when read; MAGPEND_VERIFY=0 in the environment turns
-    it off.
-    """
+    """Return whether chunks are compared with their records when read; MAGPEND_VERIFY=0 turns it off."""
     return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
@@ -67,21 +65,8 @@ class Shown:
 class CommittedStore(WrapperStore[Store]):
     """A read-only zarr store of the result cube, in which chunks without a valid commit record do not exist.
 
-    zarr then reads the fill value, which means pending. A chunk that has a record but is missing or has
-    changed raises `DamagedError`.
-
-    Parameters
-    ----------
-    store
-        Store of the cube.
-    files
-        Files of the run directory.
-    shown
-        Files that readers see.
-    checks
-        Whether contents are compared with their records.
-    known
-        Contents of files by key that were compared already.
+    zarr then reads the fill value, which means pending. A chunk that has a record but is missing or has changed raises
+    `DamagedError`. Contents of files in `known` were compared already.
     """
 
     def __init__(
@@ -124,11 +109,6 @@ class CommittedStore(WrapperStore[Store]):
 
         It is compared with the crc32c at its end, as zarr does with larger chunks, and with its record unless that is
         turned off.
-
-        Raises
-        ------
-        DamagedError
-            If the content has changed since it was written.
         """
         entry = self._shown.entry(key) if self._files.local is not None else None
         if entry is None or entry["size"] > SMALL:
@@ -139,9 +119,7 @@ class CommittedStore(WrapperStore[Store]):
         return content
 
     def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
-        """Read a local file and compare it with its recorded size and sha256, unless MAGPEND_VERIFY=0 turns this
-        off.
-        """
+        """Read a local file and compare it with its recorded size and sha256."""
         try:
             content: bytes | None = self._files.read(f"{CUBE}/{key}")
         except FileNotFoundError:
@@ -217,14 +195,8 @@ def committed_view(
     """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's result
     cube.
 
-    Parameters
-    ----------
-    info, plan, commits
-        The run, its plan and its valid records.
-    check
-        Whether to compare chunks with their records. The default follows `checks_chunks`.
-    known
-        Contents of files of the set-up by key that were compared with their digests already.
+    By default `checks_chunks` says whether chunks are compared with their records. Files in `known` were compared
+    already.
     """
     store = info.files.below(CUBE).zarr(read_only=True)
     shown = Shown(info, plan, commits)

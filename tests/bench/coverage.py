@@ -24,12 +24,11 @@ from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF
 from pipeline.analysis.branches.carrying import OrbitData, Solution, settled, solve
 from pipeline.analysis.draws import LEVELS
 from pipeline.rig.identify.build import build
-from pipeline.rig.identify.linearise import linearise
 from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.measured_orbits import read_orbits
-from pipeline.rig.identify.orbits import quantities_of
+from pipeline.rig.identify.orbit_residuals import quantities_of
 from pipeline.rig.identify.specification import parse_identification
-from pipeline.rig.identify.statistics import covariance_of
+from pipeline.rig.identify.statistics import covariance_of, linearise
 
 RADIAL = {
     "name": "radial",

@@ -31,8 +31,7 @@ from typing import Any
 
 from distributed import Client, LocalCluster, Worker
 
-from pipeline.compute.dispatch import Window
-from pipeline.compute.limits import Limits
+from pipeline.compute.dispatch import Limits, Window
 from pipeline.compute.order import Order
 from pipeline.runs import run as runs
 

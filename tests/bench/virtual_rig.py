@@ -19,15 +19,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magpend_core.models import load_model
-from pipeline.rig.identify.build import noise_of, pieces_of
+from pipeline.rig.identify.build import apply_settings, noise_of, pieces_of
 from pipeline.rig.identify.identifiability import sizes_of
-from pipeline.rig.identify.linearise import linearise
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.search import refine
-from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import RecordingTable
-from pipeline.rig.identify.statistics import covariance_of
+from pipeline.rig.identify.statistics import covariance_of, linearise
 from pipeline.rig.recordings import smooth
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
 

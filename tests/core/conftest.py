@@ -1,6 +1,5 @@
 """What the tests of the core share: reference numbers, parameter sets, a second system, subprocesses."""
 
-import dataclasses
 import json
 import os
 import shutil
@@ -76,19 +75,28 @@ def _oscillator_rhs(y, u, c):
 
 
 @inline
-def _no_edges(frequency, p, times, half_widths, jumps):
-    return
-
-
-@inline
-def _no_layers(y, dy, c):
-    return ()
-
-
-@inline
 def _oscillator_jacobian(y, u, c):
     zero = 0.0 * y[0]
     return (zero, zero + 1.0, -c[1] - 3.0 * c[2] * y[0] * y[0], zero - c[0])
+
+
+@inline
+def _duffing_rhs(y, u, c):
+    return (y[1], u - c[0] * y[1] - c[1] * y[0] - c[2] * y[0] * y[0] * y[0])
+
+
+def _oscillator(name, states, rhs, escape):
+    return System(
+        name=name,
+        state_names=states,
+        parameter_names=("damping", "linear", "cubic", "amplitude"),
+        n_constants=5,
+        constants=_oscillator_constants,
+        forcing=_oscillator_forcing,
+        rhs=rhs,
+        jacobian=_oscillator_jacobian,
+        escape=escape,
+    )
 
 
 @pytest.fixture(scope="session")
@@ -97,43 +105,14 @@ def oscillator():
 
     The last four states are the derivative of (x, x') by the initial state, row by row.
     """
-    return System(
-        name="forced_oscillator",
-        state_names=("x", "v", "a11", "a12", "a21", "a22"),
-        is_angle=(False,) * 6,
-        scales=(1.0,) * 6,
-        parameter_names=("damping", "linear", "cubic", "amplitude"),
-        n_constants=5,
-        constants=_oscillator_constants,
-        forcing=_oscillator_forcing,
-        rhs=_oscillator_rhs,
-        n_edges=0,
-        edges=_no_edges,
-        layers=_no_layers,
-        jacobian=_oscillator_jacobian,
-        escape=(1e3, 1e3, 1e6, 1e6, 1e6, 1e6),
-        has_layers=False,
-    )
-
-
-@inline
-def _duffing_rhs(y, u, c):
-    return (y[1], u - c[0] * y[1] - c[1] * y[0] - c[2] * y[0] * y[0] * y[0])
+    states = ("x", "v", "a11", "a12", "a21", "a22")
+    return _oscillator("forced_oscillator", states, _oscillator_rhs, (1e3, 1e3, 1e6, 1e6, 1e6, 1e6))
 
 
 @pytest.fixture(scope="session")
-def duffing(oscillator):
+def duffing():
     """The same oscillator without the derivatives."""
-    return dataclasses.replace(
-        oscillator,
-        name="forced_oscillator_alone",
-        state_names=("x", "v"),
-        is_angle=(False, False),
-        scales=(1.0, 1.0),
-        sizes=(1.0, 1.0),
-        rhs=_duffing_rhs,
-        escape=(1e3, 1e3),
-    )
+    return _oscillator("forced_oscillator_alone", ("x", "v"), _duffing_rhs, (1e3, 1e3))
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Equilibria of flows, against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -39,11 +37,7 @@ def test_find_equilibria__not_finite():
     found = find_equilibria(parameters.model.system, guesses, parameters.pack())
     assert found.converged.tolist() == [False, True]
     np.testing.assert_allclose(found.states[1], 0.0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_newton_steps__through_a_section():
-    """The section changes nothing: the level is one more parameter, of which the rates know nothing."""
+    # The section changes nothing: the level is one more parameter, of which the rates know nothing
     model = flow(VAN_DER_POL)
     seen = sectioned(model, Crossing("x", 0.7)).load(mu=2.0)
     states = np.array([[0.4, -0.3], [2.0, 1.0]])

@@ -1,16 +1,13 @@
 """Limit cycles of flows: the return map, its derivative, periods and multipliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
-from magpend_core import lyapunov_exponents, run_branches
+from magpend_core import load_model, lyapunov_exponents
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import of_flow, sectioned
-from magpend_core.multipliers import orbit_exponents
-from magpend_core.orbits import polish_orbits, section_map
+from magpend_core.orbits import orbit_exponents, section_map
+from tests.core.cells import polish, run_cells, scipy_end
 from tests.core.flows import HOPF, LORENZ, PAIR, ROSSLER, VAN_DER_POL, flow
 
 VAN_DER_POL_PERIOD = 6.663286859323130
@@ -21,14 +18,6 @@ def seen(table, of, **changes):
     """The parameters of a flow seen where a state crosses 0 upwards."""
     crossing = Crossing(of, longest=changes.pop("longest", 50.0), direction=changes.pop("direction", "up"))
     return sectioned(flow(table), crossing).load(**changes)
-
-
-def polish(parameters, points, period=1, **options):
-    system = parameters.model.system
-    n = len(points)
-    packed = np.tile(parameters.pack(), (n, 1))
-    longest = np.full(n, parameters.model.crossing.frequency_hz)
-    return polish_orbits(packed, longest, np.asarray(points), np.full(n, period), system=system, **options)
 
 
 @pytest.mark.parametrize("mu", [0.01, 0.25, 1.0])
@@ -59,9 +48,9 @@ def test_polish_orbits__van_der_pol():
         return [v, (1.0 - x**2) * v - x, 1.0 - x**2]
 
     # the product of all multipliers is the exponential of the divergence's integral (Liouville)
-    end = solve_ivp(rates, (0.0, found.seconds[0]), [*start, 0.0], method="DOP853", rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(end.y[:2, -1], start, atol=1e-9)
-    assert found.multipliers[0, 0].real == pytest.approx(np.exp(end.y[2, -1]), rel=1e-8)
+    end = scipy_end(rates, [*start, 0.0], found.seconds[0])
+    np.testing.assert_allclose(end[:2], start, atol=1e-9)
+    assert found.multipliers[0, 0].real == pytest.approx(np.exp(end[2]), rel=1e-8)
     assert found.multipliers[0, 0].imag == 0.0
 
 
@@ -82,14 +71,10 @@ def test_section_map__differences():
     system, packed = parameters.model.system, parameters.pack()[None]
     rate = np.array([parameters.model.crossing.frequency_hz])
     found = section_map(packed, rate, point[None], 2, system=system)
-    step = 1e-5
-    for k in (1, 2):
-        shift = step * np.eye(3)[k]
-        ends = section_map(
-            np.tile(packed, (2, 1)), np.tile(rate, 2), np.array([point + shift, point - shift]), 2, system=system
-        )
-        slope = (ends.images[0, -1] - ends.images[1, -1]) / (2.0 * step)
-        np.testing.assert_allclose(found.derivatives[0, :, k], slope, atol=2e-7)
+    steps = 1e-5 * np.eye(3)[1:]
+    around = np.concatenate([point + steps, point - steps])
+    ends = section_map(np.tile(packed, (4, 1)), np.tile(rate, 4), around, 2, system=system).images[:, -1]
+    np.testing.assert_allclose(found.derivatives[0, :, 1:], (ends[:2] - ends[2:]).T / 2e-5, atol=2e-7)
     assert (found.derivatives[0, 0] == 0.0).all()
     assert (found.derivatives[0, :, 0] == 0.0).all()
     np.testing.assert_allclose(found.images[0, :, 0], 0.0, atol=1e-12)
@@ -113,39 +98,15 @@ def test_sectioned__same_object():
     assert sectioned(model, Crossing("x")).digest != one.digest
     assert sectioned(model, Crossing("y", value=0.3)).load()["section_value"] == 0.3
     assert of_flow(one.load(mu=0.5)) == model.load(mu=0.5)
-
-
-def test_sectioned__forced():
-    from magpend_core import load_model
-
     with pytest.raises(ValueError, match="is forced"):
         sectioned(load_model("duffing"), Crossing("x"))
 
 
 def exponents(parameters, starts, n_periods, tolerance=1e-8):
-    n, system = len(starts), parameters.model.system
-    packed = np.tile(parameters.pack(), (n, 1))
-    longest = np.full(n, parameters.model.crossing.frequency_hz)
-    settled = run_branches(
-        packed[:, None],
-        longest[:, None],
-        np.asarray(starts),
-        n_transient=100,
-        n_keep=1,
-        rtol=tolerance,
-        atol=tolerance,
-        system=system,
-    )
-    return lyapunov_exponents(
-        packed,
-        longest,
-        settled.section[:, 0, -1],
-        n_transient=50,
-        n_periods=n_periods,
-        rtol=tolerance,
-        atol=tolerance,
-        system=system,
-    )
+    n, system, hertz = len(starts), parameters.model.system, parameters.model.crossing.frequency_hz
+    settled = run_cells(system, parameters.pack(), hertz, starts, n_transient=100, rtol=tolerance).section[:, 0, -1]
+    options = {"n_transient": 50, "n_periods": n_periods, "rtol": tolerance, "atol": tolerance}
+    return lyapunov_exponents(np.tile(parameters.pack(), (n, 1)), np.full(n, hertz), settled, system=system, **options)
 
 
 @pytest.mark.slow

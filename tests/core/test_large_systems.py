@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from magpend_core import Status, jacobian, lyapunov_exponents, rates
@@ -20,7 +19,8 @@ from magpend_core.models import ModelError, load_model
 from magpend_core.orbits import section_map
 from magpend_core.sizes import MAX_STATES, WRITTEN_OUT
 from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
-from tests.core.flows import flow, lorenz96
+from tests.core.cells import scipy_end
+from tests.core.flows import flow, lorenz96, table
 
 N = 12
 
@@ -32,19 +32,18 @@ def kaplan_yorke(spectrum):
     return k + 1 + sums[k] / abs(spectrum[k + 1])
 
 
-RUBBED = {
-    "name": "rubbed",
-    "states": {"x": "1", "v": "1"},
-    "equations": {"x": "v", "v": "cos(2*pi*f*t) - x - 0.2*v - 0.4*sign(v + 0.3) - 0.2*tanh(20*v)"},
-    "impacts": [{"of": "x - 0.5", "direction": "up", "set": {"v": "-0.7*v"}}],
-}
+RUBBED = table(
+    "rubbed",
+    {"x": "v", "v": "cos(2*pi*f*t) - x - 0.2*v - 0.4*sign(v + 0.3) - 0.2*tanh(20*v)"},
+    impacts=[{"of": "x - 0.5", "direction": "up", "set": {"v": "-0.7*v"}}],
+)
 """A layer, a switch on which the motion slides for a quarter of the time, and an impact in each period."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("table", [lorenz96(7), RUBBED], ids=["sparse", "rubbed"])
-def test_with_tangents__loops_give_the_bits_of_written_out_products(table, monkeypatch):
-    model = flow(table)
+@pytest.mark.parametrize("equations", [lorenz96(7), RUBBED], ids=["sparse", "rubbed"])
+def test_with_tangents__loops_give_the_bits_of_written_out_products(equations, monkeypatch):
+    model = flow(equations)
     system, n = model.system, len(model.states)
     states = np.random.default_rng(3).uniform(-0.3, 0.3, (3, n))
     cells = np.tile(model.load().pack(), (3, 1)), np.full(3, 0.15), states
@@ -82,8 +81,8 @@ def _spectrum_by_numpy(start, n_transient, n_units):
 
     y, q, logs = start, np.eye(n), np.zeros(n)
     for i in range(10 * (n_transient + n_units)):
-        end = solve_ivp(extended, (0.0, 0.1), np.append(y, q), method="DOP853", rtol=1e-12, atol=1e-12)
-        y, (q, r) = end.y[:n, -1], np.linalg.qr(end.y[n:, -1].reshape(n, n))
+        end = scipy_end(extended, np.append(y, q), 0.1)
+        y, (q, r) = end[:n], np.linalg.qr(end[n:].reshape(n, n))
         logs += np.log(np.abs(np.diag(r))) if i >= 10 * n_transient else 0.0
     return np.sort(logs / n_units)[::-1]
 
@@ -92,22 +91,17 @@ def _spectrum_by_numpy(start, n_transient, n_units):
 def ring():
     """Lorenz-96 of `N` states, with a start on its chaotic attractor."""
     start = 8.0 + np.random.default_rng(1).normal(size=N)
-    end = solve_ivp(lambda t, y: _rates(y), (0.0, 20.0), start, rtol=1e-8, atol=1e-8)
-    return flow(lorenz96(N)).system, end.y[:, -1]
+    return flow(lorenz96(N)).system, scipy_end(lambda t, y: _rates(y), start, 20.0, 1e-8)
 
 
 @pytest.mark.slow
-def test_lyapunov__of_twelve_states_like_numpy(ring):
+def test_lyapunov__of_twelve_states(ring, monkeypatch):
     system, start = ring
     options = {"n_transient": 2, "n_periods": 4, "n_blocks": 2, "rtol": 1e-12, "atol": 1e-12}
     found = lyapunov_exponents(np.full((1, 1), 8.0), np.ones(1), start[None], system=system, **options)
     # chaos of some 1.7 per time unit separates the two by exp(10) in 6 of them
     expected = _spectrum_by_numpy(start, 2, 4)
     assert found.exponents[0] == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.slow
-def test_lyapunov__of_twelve_states_adds_up_to_the_divergence(ring):
     system, start = ring
     starts = start + 0.1 * np.random.default_rng(2).normal(size=(16, N))
     options = {"n_transient": 20, "n_periods": 80, "n_blocks": 4, "system": system}
@@ -118,10 +112,6 @@ def test_lyapunov__of_twelve_states_adds_up_to_the_divergence(ring):
     nearest = np.abs(found.exponents).argmin(axis=1)
     rows = np.arange(16)
     assert (np.abs(found.exponents[rows, nearest]) < 5.0 * found.stderr[rows, nearest] + 1e-3).all()
-
-
-@pytest.mark.slow
-def test_lyapunov__cells_in_parts_have_the_same_bits(ring, monkeypatch):
     system, start = ring
     starts = start + 0.1 * np.random.default_rng(2).normal(size=(40, N))
     cells = np.full((40, 1), 8.0), np.ones(40), starts
@@ -147,14 +137,8 @@ def test_lyapunov__standard_case_of_forty_states():
     # the case of Lorenz and Emanuel, J. Atmos. Sci. 55 (1998) 399-414: a largest exponent of 1.69 per time
     # unit, and a dimension of 27.1; the tolerances are those of published values, not of the 16 trajectories
     n, rng = 40, np.random.default_rng(1)
-    found = lyapunov_exponents(
-        np.full((16, 1), 8.0),
-        np.ones(16),
-        8.0 + rng.normal(size=(16, n)),
-        system=flow(lorenz96(n)).system,
-        n_transient=100,
-        n_periods=400,
-    )
+    cells = np.full((16, 1), 8.0), np.ones(16), 8.0 + rng.normal(size=(16, n))
+    found = lyapunov_exponents(*cells, system=flow(lorenz96(n)).system, n_transient=100, n_periods=400)
     mean = found.exponents.mean(axis=0)
     assert mean[0] == pytest.approx(1.69, abs=0.03)
     assert kaplan_yorke(mean) == pytest.approx(27.1, abs=0.3)
@@ -173,9 +157,6 @@ def test_jacobian__of_a_large_text_is_whole():
     found = jacobian(0.0, state, model.load(), 1.0)
     np.testing.assert_allclose(found, _jacobian(state), atol=1e-14)
     np.testing.assert_allclose(rates(0.0, state, model.load(), 1.0), _rates(state), atol=1e-14)
-
-
-def test_jacobian__of_a_small_text_has_all_entries():
     assert flow(lorenz96(WRITTEN_OUT)).system.jacobian_entries is None
 
 

@@ -6,7 +6,7 @@ import pytest
 from magpend_core import Status, jacobian, lyapunov_exponents, polish_orbits, sections
 from magpend_core.lyapunov import MOST_LOSS
 from magpend_core.models.duffing.system import DUFFING
-from tests.core.maps import stroboscopic_map
+from tests.core.cells import stroboscopic_map
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
 CHAOTIC = [0.2, -1.0, 1.0, 0.3]  # damping, linear, cubic, amplitude of the chaotic Duffing oscillator
@@ -17,17 +17,12 @@ def packed(parameters, n):
 
 
 def of_duffing(parameters, n_cells=32, **options):
-    rng = np.random.default_rng(4)
-    return lyapunov_exponents(
-        np.tile(np.array(parameters), (n_cells, 1)),
-        np.full(n_cells, UNIT_FREQUENCY),
-        rng.uniform(-1.0, 1.0, (n_cells, 2)),
-        system=DUFFING,
-        **options,
-    )
+    starts = options.pop("starts", np.random.default_rng(4).uniform(-1.0, 1.0, (n_cells, 2)))
+    cells = np.tile(parameters, (len(starts), 1)), np.full(len(starts), UNIT_FREQUENCY), starts
+    return lyapunov_exponents(*cells, system=DUFFING, **options)
 
 
-def test_duffing__published_exponents():
+def test_duffing__published_exponents_half_the_damping_and_none():
     # x'' = .3 cos t + x - x^3 - .2 x': (0.158, -0.358) +- 0.002 per unit time, recomputed
     # independently; ChaosTools.jl issue 301 has 0.15894, -0.35894
     found = of_duffing(CHAOTIC, n_periods=1600, rtol=1e-7, atol=1e-7)
@@ -36,6 +31,18 @@ def test_duffing__published_exponents():
     assert found.weighted.mean(axis=0) == pytest.approx([0.158, -0.358], abs=0.003)
     # the spread between cells is what their standard errors say
     assert found.exponents[:, 0].std(ddof=1) == pytest.approx(found.stderr[:, 0].mean(), rel=0.5)
+    # complex pair: both exponents are -c/2; the plain average oscillates about them
+    found = of_duffing([0.2, 2.0, 0.0, 1.0], 2)
+    assert found.weighted == pytest.approx(-0.1, abs=1e-6)
+    assert found.exponents == pytest.approx(-0.1, abs=1e-3)
+    assert (found.exponents[:, 0] >= found.exponents[:, 1]).all()
+    # negative cubic stiffness: one of the two escapes
+    starts = np.array([[0.0, 0.0], [3.0, 1.0]])
+    found = of_duffing([0.1, 1.0, -1.0, 0.1], starts=starts, n_exponents=2, n_periods=16)
+    assert found.status.tolist() == [Status.BOUNDED, Status.DIVERGED]
+    assert np.isfinite(found.exponents[0]).all()
+    for name in ("exponents", "stderr", "weighted", "blocks", "divergence", "loss"):
+        assert np.isnan(getattr(found, name)[1]).all(), name
 
 
 @pytest.mark.parametrize("parameters", [CHAOTIC, [0.15, -1.0, 1.0, 0.2], [0.2, 2.0, 0.0, 1.0]])
@@ -44,14 +51,6 @@ def test_duffing__exponents_add_up_to_minus_the_damping(parameters):
     assert found.exponents.sum(axis=1) == pytest.approx(-parameters[0], abs=1e-8)
     assert found.divergence == pytest.approx(-parameters[0], abs=1e-12)
     assert found.is_whole
-
-
-def test_linear_oscillator__exponents_are_half_the_damping():
-    # complex pair: both exponents are -c/2; the plain average oscillates about them
-    found = of_duffing([0.2, 2.0, 0.0, 1.0], 2)
-    assert found.weighted == pytest.approx(-0.1, abs=1e-6)
-    assert found.exponents == pytest.approx(-0.1, abs=1e-3)
-    assert (found.exponents[:, 0] >= found.exponents[:, 1]).all()
 
 
 @pytest.mark.slow
@@ -78,11 +77,10 @@ def test_lyapunov__on_closed_orbits_the_logarithms_of_the_multipliers(preset, re
     periods = np.array([orbit["orbit_period"] for orbit in orbits])
     orbit = polish_orbits(packed(preset, len(points)), frequency, points, periods)
     expected = np.log(np.abs(orbit.multipliers)) * (frequency / periods)[:, None]
-    found = lyapunov_exponents(packed(preset, len(points)), frequency, orbit.section, rtol=1e-9, atol=1e-9)
+    cells, options = (packed(preset, len(points)), frequency, orbit.section), {"rtol": 1e-9, "atol": 1e-9}
+    found = lyapunov_exponents(*cells, **options)
     assert np.sort(found.weighted)[:, ::-1] == pytest.approx(expected, abs=1e-4)
-    largest = lyapunov_exponents(
-        packed(preset, len(points)), frequency, orbit.section, n_exponents=1, rtol=1e-9, atol=1e-9
-    )
+    largest = lyapunov_exponents(*cells, n_exponents=1, **options)
     assert largest.weighted == pytest.approx(expected[:, :1], abs=1e-4)
     assert largest.divergence == pytest.approx(found.divergence, abs=5e-5)
     # as the docstring says of the plain average
@@ -138,22 +136,6 @@ def test_lyapunov__a_cell_depends_on_itself_alone(mixed):
         assert (a[4] == getattr(alone, name)[0]).all(), name
 
 
-def test_lyapunov__a_trajectory_that_fails_has_no_exponents():
-    # negative cubic stiffness: one of the two escapes
-    found = lyapunov_exponents(
-        np.tile([0.1, 1.0, -1.0, 0.1], (2, 1)),
-        np.full(2, UNIT_FREQUENCY),
-        np.array([[0.0, 0.0], [3.0, 1.0]]),
-        n_exponents=2,
-        n_periods=16,
-        system=DUFFING,
-    )
-    assert found.status.tolist() == [Status.BOUNDED, Status.DIVERGED]
-    assert np.isfinite(found.exponents[0]).all()
-    for name in ("exponents", "stderr", "weighted", "blocks", "divergence", "loss"):
-        assert np.isnan(getattr(found, name)[1]).all(), name
-
-
 @pytest.mark.parametrize(
     ("option", "words"),
     [
@@ -166,9 +148,6 @@ def test_lyapunov__a_trajectory_that_fails_has_no_exponents():
 def test_lyapunov__options_out_of_bounds(preset, option, words):
     with pytest.raises(ValueError, match=words):
         lyapunov_exponents(packed(preset, 1), np.array([2.2]), np.zeros((1, 4)), **option)
-
-
-def test_lyapunov__rows_that_do_not_agree(preset):
     with pytest.raises(ValueError, match="1, 2 and 1 rows"):
         lyapunov_exponents(packed(preset, 1), np.array([2.2, 2.3]), np.zeros((1, 4)))
 

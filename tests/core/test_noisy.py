@@ -26,50 +26,26 @@ from magpend_core.noisy import NoisySections, cell_words, first_passages, noisy_
 SEED = 11
 
 
+# equations, parameters and strengths of the noise; the well is that of tests/pipeline, so it compiles once
+KINDS: dict[str, tuple[dict[str, str], dict[str, float], dict[str, Any]]] = {
+    "ou": ({"x": "-a*x"}, {"a": 1.5}, {"x": 0.7}),
+    "ito": ({"x": "m*x"}, {"m": 0.4, "s": 0.8}, {"x": "s*x"}),
+    "stratonovich": ({"x": "m*x"}, {"m": 0.4, "s": 0.8}, {"x": "s*x"}),
+    "well": ({"x": "a*x - x**3"}, {"a": 1.0}, {"x": 0.5}),
+    # nothing but noise, on a plane and on a circle
+    "free": ({"x": "0*x", "y": "0*y", "th": "0*th"}, {}, {"x": 0.5, "y": 0.5, "th": 0.8}),
+    "shaken": ({"x": "v", "v": "-x - d*v"}, {"d": 0.3, "s": 0.8}, {"v": "s*x"}),
+    "oscillator": ({"x": "v", "v": "cos(2*pi*f*t) - d*v - k*x"}, {"d": 0.2, "k": 2.0}, {"v": 0.1}),
+}
+
+
 @cache
 def model(kind: str) -> NoisyModel:
-    if kind == "ou":
-        table: dict[str, Any] = {
-            "name": "ou",
-            "states": {"x": {}},
-            "parameters": {"a": 1.5},
-            "equations": {"x": "-a*x"},
-        }
-        return noisy(load_model(table), Disturbance((("x", 0.7),)))
-    if kind in ("ito", "stratonovich"):
-        table = {"name": "gbm", "states": {"x": {}}, "parameters": {"m": 0.4, "s": 0.8}, "equations": {"x": "m*x"}}
-        return noisy(load_model(table), Disturbance((("x", "s*x"),), kind))
-    if kind == "well":  # as in tests/pipeline/runs/test_noisy_run.py, so it compiles once
-        table = {
-            "name": "well",
-            "states": {"x": {"meaning": "position"}},
-            "parameters": {"a": 1.0},
-            "equations": {"x": "a*x - x**3"},
-        }
-        return noisy(load_model(table), Disturbance((("x", 0.5),)))
-    if kind == "free":  # nothing but noise, on a plane and on a circle
-        table = {
-            "name": "free",
-            "states": {"x": {}, "y": {}, "th": {"on_circle": True, "unit": "rad"}},
-            "parameters": {},
-            "equations": {"x": "0*x", "y": "0*y", "th": "0*th"},
-        }
-        return noisy(load_model(table), Disturbance((("x", 0.5), ("y", 0.5), ("th", 0.8))))
-    if kind == "shaken":
-        table = {
-            "name": "shaken",
-            "states": {"x": {}, "v": {}},
-            "parameters": {"d": 0.3, "s": 0.8},
-            "equations": {"x": "v", "v": "-x - d*v"},
-        }
-        return noisy(load_model(table), Disturbance((("v", "s*x"),)))
-    table = {
-        "name": "oscillator",
-        "states": {"x": {}, "v": {}},
-        "parameters": {"d": 0.2, "k": 2.0},
-        "equations": {"x": "v", "v": "cos(2*pi*f*t) - d*v - k*x"},
-    }
-    return noisy(load_model(table), Disturbance((("v", 0.1),)))
+    equations, parameters, strengths = KINDS[kind]
+    states = {name: {"on_circle": True, "unit": "rad"} if name == "th" else {} for name in equations}
+    table = {"name": "noisy", "states": states, "parameters": parameters, "equations": equations}
+    interpretation = (kind,) if kind in ("ito", "stratonovich") else ()
+    return noisy(load_model(table), Disturbance(tuple(strengths.items()), *interpretation))
 
 
 def run(kind: str, n: int, steps: int, start: Any, **options: Any) -> NoisySections:
@@ -155,9 +131,6 @@ def test_noisy_sections__halved_steps_follow_the_same_path() -> None:
     strong = float(np.abs(run("ou", 2000, 8, 1.0).section[:, 0, 0] - ou_reference(2000, 8, 1.0)).mean())
     halved = float(run("ou", 2000, 8, 1.0).strong_error.mean())
     assert strong / 2 < halved < 2 * strong
-
-
-def test_noisy_sections__order_holds_for_a_nonlinear_equation() -> None:
     errors = [float(np.median(run("well", 2000, k, 0.5).strong_error)) for k in (4, 8, 16, 32)]
     assert slope_of(errors) > 1.4
 
@@ -177,11 +150,6 @@ def test_noisy_sections__strength_of_a_state_without_noise() -> None:
     assert (np.abs(products.mean(axis=1) - exact) < 4 * error).all()
 
 
-def test_parameters__with_noise_can_be_pickled() -> None:
-    parameters = model("ito").load(s=0.3)
-    assert pickle.loads(pickle.dumps(parameters)) == parameters
-
-
 @pytest.mark.slow
 def test_noisy_sections__oscillator_has_the_closed_covariance() -> None:
     # x'' + .2 x' + 2 x = cos t + .1 xi: Lyapunov's equation gives var x = .01/(2 .2 2), var v = .01/(2 .2), cov 0
@@ -196,7 +164,7 @@ def test_noisy_sections__oscillator_has_the_closed_covariance() -> None:
     assert abs(v.mean() - mean[1]) < 4 * math.sqrt(0.025 / n)
 
 
-def test_noisy_sections__same_bits_in_any_company() -> None:
+def test_noisy_sections__same_bits_in_any_company_and_when_they_go_on() -> None:
     options: dict[str, Any] = {"hz": 0.16, "n_transient": 1, "n_keep": 3}
     whole = run("oscillator", 75, 20, [0.1, 0.2], **options)
     for n_lanes in (1, 16, 33):
@@ -205,9 +173,6 @@ def test_noisy_sections__same_bits_in_any_company() -> None:
         np.testing.assert_array_equal(again.strong_error, whole.strong_error)
     fewer = run("oscillator", 7, 20, [0.1, 0.2], **options)
     np.testing.assert_array_equal(fewer.section, whole.section[:7])
-
-
-def test_noisy_sections__cells_with_unequal_steps_do_not_mix() -> None:
     m = model("oscillator")
     parameters = np.tile(m.load().pack(), (40, 1))
     parameters[:, -1] = np.arange(40)
@@ -219,9 +184,6 @@ def test_noisy_sections__cells_with_unequal_steps_do_not_mix() -> None:
         part = slice(i, i + 1)
         alone = noisy_sections(parameters[part], hz[part], states[part], steps_per_period=steps[part], **given)
         np.testing.assert_array_equal(alone.section[0], together.section[i])
-
-
-def test_noisy_sections__goes_on_bit_for_bit() -> None:
     m = model("oscillator")
     parameters, hz, states = np.tile(m.load().pack(), (5, 1)), np.full(5, 0.2), np.zeros((5, 2))
     parameters[:, -1] = np.arange(5)
@@ -238,18 +200,9 @@ def test_noisy_sections__goes_on_bit_for_bit() -> None:
 
 def test_noisy_sections__without_noise_follows_the_deterministic_flow() -> None:
     m = model("oscillator")
-    parameters = np.array([[0.2, 2.0, 0.0, 0.0]])
-    found = noisy_sections(
-        parameters,
-        np.array([1 / (2 * math.pi)]),
-        np.array([[0.1, 0.2]]),
-        system=m.system,
-        noise=m.noise,
-        seed=0,
-        steps_per_period=400,
-        n_transient=0,
-        n_keep=1,
-    )
+    cell = np.array([[0.2, 2.0, 0.0, 0.0]]), np.array([1 / (2 * math.pi)]), np.array([[0.1, 0.2]])
+    given: dict[str, Any] = {"system": m.system, "noise": m.noise, "seed": 0, "n_transient": 0, "n_keep": 1}
+    found = noisy_sections(*cell, steps_per_period=400, **given)
     # the linear equation's closed form: particular solution and decaying oscillation
     amplitude = 1.0 / complex(1.0, 0.2)
     a, b = amplitude.real, -amplitude.imag  # x = a cos t + b sin t
@@ -301,34 +254,31 @@ def test_first_passages__mean_time_has_an_error_of_the_order_of_the_step(
         assert not of_cells.contains(found.place, m.is_angle).all()
 
 
-def test_noisy__problems_name_the_key() -> None:
-    plain_model = model("oscillator").whole
-    with pytest.raises(ParameterError, match=r"strengths\.y: is not a state"):
-        noisy(plain_model, Disturbance((("y", 1.0),)))
-    with pytest.raises(ParameterError, match=r"strengths\.x = 'v': depends on v, which has noise of its own"):
-        noisy(plain_model, Disturbance((("x", "v"), ("v", 0.1))))
-    with pytest.raises(ParameterError, match=r"interpretation: missing"):
-        noisy(plain_model, Disturbance((("v", "k*v"),)))
-    with pytest.raises(ParameterError, match=r"strengths\.v.*depends on t"):
-        noisy(plain_model, Disturbance((("v", "cos(t)"),)))
-    with pytest.raises(ParameterError, match=r"strengths\.v"):
-        noisy(plain_model, Disturbance((("v", "k*unknown"),)))
-    with pytest.raises(ParameterError, match=r"not given as text"):
-        noisy(load_model(), Disturbance((("psi1_dot", "2*psi1"),)))
+@pytest.mark.parametrize(
+    ("strengths", "words"),
+    [
+        ({"y": 1.0}, r"strengths\.y: is not a state"),
+        ({"x": "v", "v": 0.1}, r"strengths\.x = 'v': depends on v"),
+        ({"v": "k*v"}, "interpretation: missing"),
+        ({"v": "cos(t)"}, r"strengths\.v.*depends on t"),
+        ({"v": "k*unknown"}, r"strengths\.v"),
+        ({"psi1_dot": "2*psi1"}, "not given as text"),
+    ],
+)
+def test_noisy__problems_name_the_key(strengths: dict[str, Any], words: str) -> None:
+    owner = load_model() if "psi1_dot" in strengths else model("oscillator").whole
+    with pytest.raises(ParameterError, match=words):
+        noisy(owner, Disturbance(tuple(strengths.items())))
 
 
 def test_with_strengths__refuses_impacts() -> None:
-    bouncing = load_model(
-        {
-            "name": "ball",
-            "states": {"x": {}, "v": {}},
-            "parameters": {},
-            "equations": {"x": "v", "v": "-1 + 0*t"},
-            "impacts": [{"of": "x", "direction": "down", "set": {"v": "-0.5*v"}}],
-        }
-    )
+    impacts = [{"of": "x", "direction": "down", "set": {"v": "-0.5*v"}}]
+    ball = {"name": "ball", "states": {"x": {}, "v": {}}, "parameters": {}, "impacts": impacts}
+    bouncing = load_model({**ball, "equations": {"x": "v", "v": "-1 + 0*t"}})
     with pytest.raises(ValueError, match="crosses a surface infinitely often"):
         with_strengths(bouncing.system, model("oscillator").noise)
+    parameters = model("ito").load(s=0.3)
+    assert pickle.loads(pickle.dumps(parameters)) == parameters
 
 
 def digest() -> str:

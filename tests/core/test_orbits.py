@@ -1,7 +1,5 @@
 """Polished periodic orbits and tangent vectors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -9,12 +7,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from magpend_core import load_preset, polish_orbits, run_branches
+from magpend_core import load_preset, polish_orbits
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.duffing.system import DUFFING
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance, section_map, wrap_angles
-from tests.core.maps import stroboscopic_map
+from tests.core.cells import run_cells, stroboscopic_map
 
 # made by Newton's method on the stroboscopic map at rtol 1e-12 with other integrators: points agree
 # among them to 3e-11, multipliers are good to 1e-6
@@ -53,6 +51,9 @@ def test_polish_orbits__far_from_any(packed):
     found = polish_orbits(packed[:1], np.array([2.03]), [[2.0, -2.0, 15.0, -20.0]], np.array([1]), max_iterations=3)
     assert not found.converged[0]
     assert np.isnan(found.multipliers).all()
+    wrapped = wrap_angles(np.array([np.pi, -np.pi, 7.0, -7.0]))
+    np.testing.assert_allclose(wrapped, [np.pi, np.pi, 7.0, -7.0])
+    assert scaled_distance([np.pi - 1e-3, 0, 0, 0], [-np.pi + 1e-3, 0, 0, 0]) == pytest.approx(2e-3)
 
 
 @pytest.mark.parametrize(("periods", "message"), [([0], "1 or more"), ([1.5], "whole numbers"), ([1, 1], "must agree")])
@@ -67,15 +68,7 @@ def test_stroboscopic_map__derivatives(packed, reference):
     _, derivatives = stroboscopic_map(packed[:1], frequency[:1], points[:1], 1)
     step = 1e-6 * np.array([1.0, 1.0, 10.0, 10.0])
     shifted = np.concatenate([points[0] + np.diag(step), points[0] - np.diag(step)])
-    plain = run_branches(
-        np.tile(packed[0], (8, 1, 1)),
-        np.full((8, 1), frequency[0]),
-        shifted,
-        n_transient=0,
-        n_keep=1,
-        rtol=1e-12,
-        atol=1e-12,
-    ).section[:, 0, 0]
+    plain = run_cells(PENDULUM_FITTED, packed[0], frequency[0], shifted, rtol=1e-12).section[:, 0, 0]
     differences = (plain[:4] - plain[4:]).T / (2.0 * step)
     # integration error over the step, and the step's square
     assert np.abs(derivatives[0] - differences).max() < 1e-4 * np.abs(differences).max()
@@ -98,9 +91,7 @@ def test_section_map__a_number_of_periods_for_each_row(packed, reference):
 def test_polish_orbits__points_and_derivative(packed, reference):
     """Orbits of several periods in one call, one of them from a multiple of its period."""
     points, frequency, _ = reference
-    settled = run_branches(
-        packed[:1, None], [[2.48]], [[0.05, 0.1, 0.0, 0.0]], n_transient=600, n_keep=1, rtol=1e-9, atol=1e-9
-    )
+    settled = run_cells(PENDULUM_FITTED, packed[0], 2.48, [[0.05, 0.1, 0.0, 0.0]], n_transient=600, rtol=1e-9)
     guesses, drives = np.vstack([settled.section[0, 0], points[:2]]), np.array([2.48, *frequency[:2]])
     found = polish_orbits(packed[:1].repeat(3, 0), drives, guesses, np.array([2, 1, 3]))
     assert found.orbit_period.tolist() == [2, 1, 1]
@@ -115,25 +106,14 @@ def test_polish_orbits__points_and_derivative(packed, reference):
 @pytest.mark.slow
 def test_with_tangents__trajectory_unchanged():
     """Tangents stay out of the error control: same steps, same states."""
-    arguments = {"n_transient": 0, "n_keep": 5, "rtol": 1e-8, "atol": 1e-8}
-    cell, start = (np.array([[[0.1, -1.0, 1.0, 0.3]]]), [[0.2]]), np.array([[0.2, 0.2]])
-    plain = run_branches(*cell, start, system=DUFFING, **arguments)
-    extended = np.concatenate([start, [[1.0, 0.0]]], axis=1)
-    result = run_branches(*cell, extended, system=with_tangents(DUFFING, 1), **arguments)
+    values = [0.1, -1.0, 1.0, 0.3]
+    plain = run_cells(DUFFING, values, 0.2, [[0.2, 0.2]], n_keep=5)
+    result = run_cells(with_tangents(DUFFING, 1), values, 0.2, [[0.2, 0.2, 1.0, 0.0]], n_keep=5)
     assert result.n_steps[0, 0] == plain.n_steps[0, 0]
     # the compiler may order the same sums otherwise
     np.testing.assert_allclose(result.section[0, 0, :, :2], plain.section[0, 0], rtol=1e-11, atol=1e-12)
-
-
-def test_with_tangents__bad_count():
     with pytest.raises(ValueError, match="between 1 and 4"):
         with_tangents(PENDULUM_FITTED, 5)
-
-
-def test_wrap_angles__cut():
-    wrapped = wrap_angles(np.array([np.pi, -np.pi, 7.0, -7.0]))
-    np.testing.assert_allclose(wrapped, [np.pi, np.pi, 7.0, -7.0])
-    assert scaled_distance([np.pi - 1e-3, 0, 0, 0], [-np.pi + 1e-3, 0, 0, 0]) == pytest.approx(2e-3)
 
 
 @pytest.mark.parametrize("period", [10.0, 100.0])

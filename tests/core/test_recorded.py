@@ -1,19 +1,17 @@
 """Sections and quantities under a recorded drive, against ordinary runs, closed forms, another integrator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
-from magpend_core import evaluate, load_preset, run_branches
+from magpend_core import evaluate, load_preset, trajectory
 from magpend_core.models import load_model
 from magpend_core.pointwise import drive_level
 from magpend_core.recorded_drive import evaluate_recorded, recorded_sections, recorded_trajectory
 from magpend_core.sampling import Drive
 from magpend_core.status import Status
-from tests.core.watched import OF_THE_DRIVE, OF_THE_PENDULUM
+from tests.core.cells import OF_THE_DRIVE, OF_THE_PENDULUM, run_cells
 
 DUFFING = load_model("duffing")
 LINEAR = DUFFING.load(damping=0.3, linear=4.0, cubic=0.0, amplitude=0.7)
@@ -50,7 +48,7 @@ def test_recorded_sections__of_equal_periods_are_those_of_an_ordinary_run():
     """All numbers of cells that settle, and of some that begin by turning over."""
     start = np.vstack([states(12), states(4, rate=40.0)])
     options = {"n_transient": 8, "n_keep": 5, "quantities": OF_THE_PENDULUM, **TIGHT}
-    plain = run_branches(packed(16)[:, None], np.full((16, 1), HZ), start, **options)
+    plain = run_cells(SYSTEM, PRESET.pack(), HZ, start, **options)
     found = recorded_sections(packed(16), even_drive(13), start, system=SYSTEM, **options)
     assert np.abs(plain.turns).max() > 0
     np.testing.assert_array_equal(found.turns, plain.turns)
@@ -65,15 +63,11 @@ def test_recorded_sections__of_equal_periods_are_those_of_an_ordinary_run():
 def test_recorded_sections__closes_where_an_ordinary_run_does():
     start, options = states(8), {"n_transient": 400, "n_keep": 4, "rtol": 1e-8, "atol": 1e-8}
     quiet = packed(8, load_preset(q=0.4))
-    plain = run_branches(quiet[:, None], np.full((8, 1), HZ), start, **options)
+    plain = run_cells(SYSTEM, quiet, HZ, start, **options)
     found = recorded_sections(quiet, even_drive(404), start, system=SYSTEM, **options)
     assert (plain.status == Status.PERIODIC).any()
     np.testing.assert_array_equal(found.status, plain.status)
     np.testing.assert_array_equal(found.orbit_period, plain.orbit_period)
-
-
-@pytest.mark.slow
-def test_recorded_sections__jitter_closes_within_a_tolerance_that_allows_for_it():
     rng = np.random.default_rng(0)
     rising = np.arange(405) / HZ + 1e-5 * rng.standard_normal(405)
     drive = Drive.from_edges(rising, rising[:-1] + 0.4927 / HZ)
@@ -94,18 +88,9 @@ def test_recorded_sections__same_bits_in_any_chunks(torque):
     if torque:
         times = np.linspace(0, 4, 41)
         drive, ends = (Drive.from_torque(times, np.sin(13 * times)), np.array([3, 7, 12, 15, 21, 28, 30, 35, 39]))
+    cells, options = (packed(5), drive, states(5, rate=30.0)), {"ends": ends, "n_transient": 4, "n_keep": 5}
     found = [
-        recorded_sections(
-            packed(5),
-            drive,
-            states(5, rate=30.0),
-            ends=ends,
-            n_transient=4,
-            n_keep=5,
-            system=SYSTEM,
-            n_points=n,
-            n_lanes=lanes,
-        )
+        recorded_sections(*cells, system=SYSTEM, n_points=n, n_lanes=lanes, **options)
         for n, lanes in ((None, 64), (1, 3), (4, 8))
     ]
     for other in found[1:]:
@@ -128,15 +113,8 @@ def test_recorded_sections__of_uneven_periods_against_another_integrator(pendulu
         wave = np.sin(2 * np.pi * (t - rising[k]) / length + phase) - np.sin(phase)
         return p["q"] * 2 / np.pi * np.arctan(p["eps_drive"] * wave)
 
-    found = recorded_sections(
-        values.pack()[None],
-        Drive.from_edges(rising, falling),
-        [start],
-        n_transient=2,
-        n_keep=4,
-        system=model.system,
-        **TIGHT,
-    )
+    drive, options = Drive.from_edges(rising, falling), {"n_transient": 2, "n_keep": 4, **TIGHT}
+    found = recorded_sections(values.pack()[None], drive, [start], system=model.system, **options)
     other = solve_ivp(
         pendulum_rhs(p, torque), (0, rising[-1]), start, "DOP853", rising[3:], rtol=1e-10, atol=1e-10, max_step=2e-3
     )
@@ -150,16 +128,8 @@ def test_recorded_sections__of_a_torque_are_the_exact_response():
     times = np.linspace(0, 6, 241)
     torque = np.random.default_rng(2).normal(size=241).cumsum() * 0.1
     ends = np.array([9, 40, 41, 100, 180, 239])
-    found = recorded_sections(
-        LINEAR.pack()[None],
-        Drive.from_torque(times, torque),
-        [[0.1, 0.0]],
-        ends=ends,
-        n_transient=1,
-        n_keep=5,
-        system=DUFFING.system,
-        **TIGHT,
-    )
+    drive, options = Drive.from_torque(times, torque), {"ends": ends, "n_transient": 1, "n_keep": 5, **TIGHT}
+    found = recorded_sections(LINEAR.pack()[None], drive, [[0.1, 0.0]], system=DUFFING.system, **options)
     exact = lsim(([[0, 1], [-4.0, -0.3]], [[0], [1]], np.eye(2), [[0], [0]]), torque, times, [0.1, 0.0])[1]
     np.testing.assert_allclose(found.section[0, 0], exact[ends[1:] + 1], atol=1e-9)
 
@@ -167,8 +137,6 @@ def test_recorded_sections__of_a_torque_are_the_exact_response():
 @pytest.mark.slow
 def test_recorded_trajectory__of_the_models_own_torque_converges_to_the_ordinary_one():
     """Lines between samples of the drive: the error falls with the square of their distance."""
-    from magpend_core import trajectory
-
     parameters = DUFFING.load(damping=0.3, linear=-1.0, cubic=1.0, amplitude=5.0)
     start, times = np.array([0.3, -0.1]), np.linspace(0, 3 / HZ, 31)
     exact = trajectory(parameters, HZ, start, times, **TIGHT)
@@ -186,25 +154,15 @@ def test_recorded_trajectory__of_the_models_own_torque_converges_to_the_ordinary
 def test_recorded_sections__says_who_diverged():
     runaway = DUFFING.load(damping=0.0, linear=-1.0, cubic=-1.0, amplitude=0.0).pack()
     drive = Drive.from_torque(np.linspace(0, 20, 81), np.zeros(81))
-    found = recorded_sections(
-        np.array([runaway, LINEAR.pack()]),
-        drive,
-        [[2.0, 1.0], [0.1, 0.0]],
-        n_transient=3,
-        n_keep=60,
-        system=DUFFING.system,
-        n_points=7,
-    )
+    both, starts = np.array([runaway, LINEAR.pack()]), [[2.0, 1.0], [0.1, 0.0]]
+    options = {"n_transient": 3, "n_keep": 60, "n_points": 7}
+    found = recorded_sections(both, drive, starts, system=DUFFING.system, **options)
     assert found.status[:, 0].tolist() == [Status.DIVERGED, Status.BOUNDED]
     assert np.isnan(found.section[0]).all()
     assert np.isfinite(found.section[1]).all()
     assert found.n_periods[0, 0] < 63 == found.n_periods[1, 0]
-
-
-def test_recorded_sections__step_limit_is_one():
-    found = recorded_sections(
-        packed(1), even_drive(3), states(1), n_transient=0, n_keep=2, system=SYSTEM, max_steps_per_period=5
-    )
+    options = {"n_transient": 0, "n_keep": 2, "max_steps_per_period": 5}
+    found = recorded_sections(packed(1), even_drive(3), states(1), system=SYSTEM, **options)
     assert found.status[0, 0] == Status.STEP_LIMIT
 
 
@@ -214,10 +172,9 @@ def test_recorded_sections__refuses_what_the_drive_has_not():
         recorded_sections(packed(1), even_drive(4), states(1), **options)
     with pytest.raises(ValueError, match="ends must rise"):
         recorded_sections(packed(1), even_drive(9), states(1), ends=np.array([0, 2, 1, 3, 4]), **options)
+    options |= {"ends": np.arange(0, 9, 2)[:5], "quantities": ["psi1"]}
     with pytest.raises(ValueError, match="extremes are taken over intervals"):
-        recorded_sections(
-            packed(1), even_drive(9), states(1), ends=np.arange(0, 9, 2)[:5], quantities=["psi1"], **options
-        )
+        recorded_sections(packed(1), even_drive(9), states(1), **options)
 
 
 def test_evaluate_recorded__of_edges_is_each_periods_own():

@@ -1,10 +1,12 @@
 """Sampling at a recording's instants, under a recorded drive, against closed forms and another integrator."""
 
-from __future__ import annotations
+import dataclasses
 
 import numpy as np
 import pytest
 
+from magpend_core.engine.placeholders import no_forcing
+from magpend_core.engine.variational import with_parameter_tangent
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models import load_model
 from magpend_core.sampling import Drive, sample, with_recorded_drive
@@ -97,13 +99,6 @@ def test_sample__refuses(change, words):
 def test_drive__refuses_edges_out_of_order():
     with pytest.raises(ValueError, match="between the rising edges"):
         Drive.from_edges(np.array([0.0, 1.0, 2.0]), np.array([0.5, 2.5]))
-
-
-def test_with_recorded_drive__refuses_a_system_without_a_drive():
-    import dataclasses
-
-    from magpend_core.engine.placeholders import no_forcing
-
     alone = dataclasses.replace(DUFFING.system, name="alone", forcing=no_forcing)
     with pytest.raises(ValueError, match="has no drive"):
         with_recorded_drive(alone)
@@ -111,8 +106,6 @@ def test_with_recorded_drive__refuses_a_system_without_a_drive():
 
 def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
     """By the drive's amplitude: the response over it; by the start: the free motion."""
-    from magpend_core.engine.variational import with_parameter_tangent
-
     values = DUFFING.load(damping=0.3, linear=4.0, cubic=0.0, amplitude=0.7)
     names, times = list(values.names), np.linspace(0, 8, 41)
     packed = np.tile(values.pack(), (2, 3))
@@ -122,16 +115,9 @@ def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
     packed[0, 2 * len(names) + at] -= 1e-4
     per_step[0] = 1 / 2e-4
     start = [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-    found = sample(
-        with_parameter_tangent(DUFFING.system),
-        np.hstack([packed, per_step]),
-        start,
-        [times],
-        piece=np.zeros(2, int),
-        drives=[Drive(np.full(8, 1.1))],
-        rtol=1e-10,
-        atol=1e-10,
-    )
+    options = {"piece": np.zeros(2, int), "drives": [Drive(np.full(8, 1.1))], "rtol": 1e-10, "atol": 1e-10}
+    extended = with_parameter_tangent(DUFFING.system)
+    found = sample(extended, np.hstack([packed, per_step]), start, [times], **options)
     np.testing.assert_allclose(found.states[0, :, 2:], found.states[0, :, :2] / 0.7, atol=1e-8)
     root = np.sqrt(4.0 - 0.15**2)
     free = np.exp(-0.15 * times) * (np.cos(root * times) + 0.15 / root * np.sin(root * times))
@@ -143,27 +129,16 @@ def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
 @pytest.mark.parametrize("name", ["e1", "mu", "c0", "q", "duty_cycle"])
 def test_with_parameter_tangent__is_that_of_differences(name):
     """Of the pendulum with load-dependent friction and a square wave: central differences, tightly."""
-    from magpend_core.engine.variational import with_parameter_tangent
-
     values, times = PENDULUM.load(), np.linspace(0, 2, 101)
     drive, start = [Drive(np.full(8, 1 / 2.3))], np.array([0.6, -0.4, 1.0, -2.0])
     at, p = list(values.names).index(name), values.pack()
     h = 1e-4 * p[at]
     step = h * np.eye(len(p))[at]
     given = np.concatenate([p, p + step, p - step, [1 / (2 * h)]])
-    tangent = sample(
-        with_parameter_tangent(PENDULUM.system), given[None], [[*start, 0, 0, 0, 0]], [times], drives=drive
-    ).states[0, :, 4:]
-    sides = sample(
-        PENDULUM.system,
-        np.array([p + step, p - step]),
-        np.array([start, start]),
-        [times],
-        piece=np.zeros(2, int),
-        drives=drive,
-        rtol=1e-12,
-        atol=1e-12,
-    ).states
+    extended, options = with_parameter_tangent(PENDULUM.system), {"piece": np.zeros(2, int), "drives": drive}
+    tangent = sample(extended, given[None], [[*start, 0, 0, 0, 0]], [times], drives=drive).states[0, :, 4:]
+    around = np.array([p + step, p - step])
+    sides = sample(PENDULUM.system, around, [start, start], [times], rtol=1e-12, atol=1e-12, **options).states
     difference = (sides[0] - sides[1]) / (2 * h)
     np.testing.assert_allclose(tangent, difference, atol=1e-4 * np.abs(difference).max())
 

@@ -49,17 +49,8 @@ def test_sections__stop_when_closed_is_within_the_tolerance_of_the_orbit(preset,
     orbits = reference("orbits")
     points = np.array([orbit["section"] for orbit in orbits])
     frequencies = [orbit["frequency_hz"] for orbit in orbits]
-    found = sections(
-        preset,
-        frequencies,
-        points + 0.01,
-        n_transient=2000,
-        n_keep=3,
-        rtol=1e-10,
-        atol=1e-10,
-        stop_when_closed=True,
-        closure_tolerance=tolerance,
-    )
+    options = {"stop_when_closed": True, "closure_tolerance": tolerance, "rtol": 1e-10, "atol": 1e-10}
+    found = sections(preset, frequencies, points + 0.01, n_transient=2000, n_keep=3, **options)
     # slow spirals, of moduli 0.93 to 0.96
     assert (distance(found.section, points[:, None]) <= tolerance).all()
     assert (found.orbit_period == 1).all()
@@ -98,12 +89,8 @@ def test_sections__chaos_does_not_close(preset, frequency):
     # the whole transient, then the kept periods
     assert (found.n_periods == 704).all()
     assert np.ptp(found.section[..., 0]) > 0.05
-
-
-@pytest.mark.slow
-def test_sections__stop_when_closed_changes_nothing_where_nothing_closes(preset):
-    early, late = closed_at(preset, 2.03), closed_at(preset, 2.03, stop_when_closed=False)
-    assert early.section.tobytes() == late.section.tobytes()
+    late = closed_at(preset, frequency, stop_when_closed=False)
+    assert found.section.tobytes() == late.section.tobytes()
 
 
 def test_sections__one_frequency_serves_all(preset):
@@ -117,55 +104,6 @@ def test_sections__one_frequency_serves_all(preset):
     for name in ("status", "orbit_period", "n_periods", "n_steps", "n_rejected", "step_size"):
         assert getattr(one, name).shape == (2,), name
     assert (one.section[:, -1] == one.final_state).all()
-
-
-GOOD = {"frequency_hz": [2.2], "initial_states": [[0.1, 0.1, 0.0, 0.0]], "n_transient": 0, "n_keep": 1}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"frequency_hz": [2.2, 2.3]}, "initial_states has 1 rows; frequency_hz has 2 branches"),
-        ({"frequency_hz": [[2.2]]}, "frequency_hz has 2 dimensions"),
-        ({"frequency_hz": [-2.2]}, "frequency_hz = -2.2 is out of bounds: it must be greater than 0"),
-        ({"frequency_hz": [np.nan]}, r"frequency_hz\[0\] = nan is not finite"),
-        ({"initial_states": [0.1, 0.1, 0.0, 0.0]}, r"initial_states has 1 dimensions \(shape \(4,\)\)"),
-        ({"initial_states": [[0.1, 0.1, 0.0]]}, "initial_states has 3 numbers per state"),
-        ({"initial_states": [[0.1, np.nan, 0.0, 0.0]]}, r"initial_states\[0, 1\] = nan is not finite"),
-        ({"n_transient": -1}, "n_transient = -1 is out of bounds: it must be 0 or more"),
-        ({"n_keep": 0}, "n_keep = 0 is out of bounds: it must be 1 or more"),
-        ({"n_keep": True}, "n_keep = True is not a whole number"),
-        ({"n_keep": 2.0}, "n_keep = 2.0 is not a whole number"),
-        ({"rtol": 1e-14}, "rtol = 1e-14 is out of bounds: it must be at least 1e-13"),
-        ({"atol": 0.0}, "atol = 0 is out of bounds: it must be greater than 0 and less than 1"),
-        ({"closure_tolerance": 0.0}, "closure_tolerance = 0 is out of bounds"),
-        ({"max_orbit_period": 0}, "max_orbit_period = 0 is out of bounds"),
-        ({"max_steps_per_period": 0}, "max_steps_per_period = 0 is out of bounds"),
-        ({"n_lanes": 0}, "n_lanes = 0 is out of bounds"),
-        ({"step_size": [1e-3, 1e-3]}, "step_size has 2 rows; frequency_hz has 1 branches"),
-    ],
-)
-def test_sections__name_the_bad_argument(preset, change, message):
-    with pytest.raises(ValueError, match=message):
-        sections(preset, **(GOOD | change))
-
-
-@pytest.mark.parametrize(
-    ("parameters", "frequency", "message"),
-    [
-        (np.ones((1, 1, 33)), [[2.2]], r"parameters has shape \(1, 1, 33\).*ask for \(1, 1, 34\)"),
-        (np.ones((2, 1, 34)), [[2.2]], r"parameters has shape \(2, 1, 34\).*ask for \(1, 1, 34\)"),
-        (np.ones((1, 34)), [[2.2]], "parameters has 2 dimensions"),
-        (np.full((1, 1, 34), np.nan), [[2.2]], r"parameters\[0, 0, 0\] = nan"),
-        (np.ones((1, 1, 34)), [2.2], "frequency_hz has 1 dimensions"),
-    ],
-)
-def test_run_branches__names_the_bad_array(parameters, frequency, message):
-    with pytest.raises(ValueError, match=message):
-        run_branches(parameters, frequency, [[0.1, 0.1, 0.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8)
-
-
-def test_run_branches__read_only_memory_compiles_nothing_more(preset):
     # to numba such an array is of another type, and an engine takes 10 s
     packed, start = preset.pack()[None, None], np.zeros((1, 4))
     frequency = np.array([[2.2]])

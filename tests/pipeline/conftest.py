@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -11,6 +12,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+from tests.pipeline.factories import result_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -105,17 +108,10 @@ def write_spec(tmp_path):
     return write
 
 
-def _bytes_of(directory: Path) -> dict[str, bytes]:
-    folders = [directory / "cube.zarr", directory / "commits"]
-    files = [f for folder in folders for f in folder.rglob("*") if f.is_file()]
-    files += directory.glob("records.jsonl")
-    return {f.relative_to(directory).as_posix(): f.read_bytes() for f in files}
-
-
 @pytest.fixture
 def bytes_of():
     """All files of a run that must not depend on how it was run."""
-    return _bytes_of
+    return result_of
 
 
 @pytest.fixture
@@ -123,12 +119,12 @@ def made(tmp_path, write_spec, sweep_text):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
-    from pipeline.specification.parsing import load_spec
+    from pipeline.specification.spec import Spec
     from pipeline.store.commits import write_task
     from pipeline.store.setup import create
 
     path = write_spec(sweep_text)
-    spec = load_spec(path)
+    spec = Spec.read(path)
     plan = make_plan(spec)
     identity = identity_of(spec, plan)
     info = create(tmp_path / "run", spec, plan, identity, sweep_text)
@@ -179,14 +175,16 @@ def magpend(tmp_path, environment):
     return call
 
 
+def _heed_signals() -> None:
+    """Undo what runs the tests, which may ignore signals as `nohup` does; processes inherit that."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @pytest.fixture
 def start(tmp_path, environment):
     """Start the command line in a session of its own; whatever is left at the end is killed."""
-    import signal
-
     running = []
-    # a shell lets background jobs ignore Ctrl-C, and children inherit that
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def begin(*arguments):
         process = subprocess.Popen(
@@ -197,6 +195,7 @@ def start(tmp_path, environment):
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            preexec_fn=_heed_signals,
         )
         running.append(process)
         return process
@@ -206,7 +205,6 @@ def start(tmp_path, environment):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

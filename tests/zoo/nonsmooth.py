@@ -20,7 +20,7 @@ TWO_PI = 2.0 * math.pi
 # ---- a stop ------------------------------------------------------------------------------------
 
 
-def _linear(t0: float, x0: float, v0: float, w: float, amplitude: float, zeta: float) -> Callable:
+def linear_motion(t0: float, x0: float, v0: float, w: float, amplitude: float, zeta: float) -> Callable:
     """Motion of x'' + 2 zeta x' + x = amplitude cos(w t) from a state, in closed form: t -> (x, v)."""
     d = (1.0 - w * w) ** 2 + (2.0 * zeta * w) ** 2
     c, s = amplitude * (1.0 - w * w) / d, amplitude * 2.0 * zeta * w / d
@@ -43,7 +43,7 @@ def impact_map(state, w: float, amplitude: float, zeta: float, gap: float, r: fl
     x, v = state
     t, end, hits = 0.0, n * TWO_PI / w, 0
     while True:
-        motion = _linear(t, x, v, w, amplitude, zeta)
+        motion = linear_motion(t, x, v, w, amplitude, zeta)
         if end - t < 1e-9:
             return np.array(motion(end)), hits
         # close to an impact the next may follow soon
@@ -76,7 +76,7 @@ def impact_one(w: float, amplitude: float, zeta: float, gap: float, r: float) ->
     period = TWO_PI / w
 
     def residual(z: np.ndarray) -> list[float]:
-        x, v = _linear(z[0], gap, -r * z[1], w, amplitude, zeta)(z[0] + period)
+        x, v = linear_motion(z[0], gap, -r * z[1], w, amplitude, zeta)(z[0] + period)
         return [float(x) - gap, float(v) - z[1]]
 
     best = [
@@ -109,7 +109,7 @@ def coulomb_map(state, w: float, amplitude: float, mu: float) -> tuple[np.ndarra
             t, v = t + 1e-12, 0.0
             push = amplitude * math.cos(w * t) - x
         sign = math.copysign(1.0, v if abs(v) >= 1e-13 else push)
-        motion = _linear(t, x + sign * mu, v, w, amplitude, 0.0)
+        motion = linear_motion(t, x + sign * mu, v, w, amplitude, 0.0)
         grid = np.linspace(t, end, max(8, int((end - t) * w * 400)))
         speed = sign * motion(grid)[1]
         turn = np.flatnonzero((speed[1:-1] > 0.0) & (speed[2:] <= 0.0)) + 1

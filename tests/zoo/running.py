@@ -82,12 +82,12 @@ def _time_limit(seconds: float) -> Iterator[None]:
 
 def analysed(data: Mapping[str, Any], folder: Path) -> tuple[Any, list[dict[str, Any]]]:
     """Run a specification and find its attractors; returns the analysis' dataset and the table's rows."""
-    from pipeline.analysis.attractors.table import attractors_table
+    from pipeline.analysis.attractors.analysis import attractors_table
     from pipeline.analysis.ragged import dense
     from pipeline.runs.derive import derive
     from pipeline.runs.run import run
 
-    run(variants.write(data, folder), folder / "run", workers=0, echo=lambda _: None)
+    run(data, folder / "run", workers=0, echo=lambda _: None)
     found = derive(folder / "run", "attractors")
     return dense(found, points=True), attractors_table(found).rows
 

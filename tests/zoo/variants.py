@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-import json
 import tomllib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from tests.zoo.answers import SYSTEMS
@@ -59,23 +57,3 @@ def _started(given: Mapping[str, Any], word: str) -> dict[str, Any]:
         shift = 0.37 * (side["stop"] - side["start"]) / (side["num"] - 1)
         grid[state] = {**side, "start": side["start"] + shift, "stop": side["stop"] + shift}
     return grid
-
-
-def dumps(data: Mapping[str, Any]) -> str:
-    """Write plain data as TOML, a line for each key at the top."""
-    return "".join(f"{key} = {_value(value)}\n" for key, value in data.items())
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(k)} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
-
-
-def write(data: Mapping[str, Any], folder: Path) -> Path:
-    """Write a specification into a folder; returns its path."""
-    path = folder / "spec.toml"
-    path.write_text(dumps(data), "utf-8")
-    return path

@@ -2,12 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from magpend_core.models.model import Classifier, Mirror, Model, Preset, Quantity, State
-from magpend_core.models.pendulum import drawing, sides
+import numpy as np
+
+from magpend_core.models.model import Classifier, Drawing, Mirror, Model, Preset, Quantity, State
 from magpend_core.models.pendulum import parameters as groups
+from magpend_core.models.pendulum import sides
+
+
+def _place(length: float, angle: np.ndarray) -> np.ndarray:
+    return length * np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
+
+
+def _with_magnet(states: np.ndarray, parameters: Mapping[str, float]) -> dict[str, np.ndarray]:
+    joint = _place(parameters["l1"], states[..., 0])
+    return {"joint": joint, "magnet": joint + _place(parameters["l2"], states[..., 1])}
+
+
+def _magnet_and_joint(parameters: Mapping[str, float]) -> dict[str, np.ndarray]:
+    return {"pivot": np.zeros(2), "fixed magnet": np.array([0.0, -parameters["h"]])}
+
+
+def _without_magnet(states: np.ndarray, parameters: Mapping[str, float]) -> dict[str, np.ndarray]:
+    joint = _place(parameters["l1"], states[..., 0])
+    return {"joint": joint, "centre of mass": joint + _place(parameters["e2"], states[..., 1])}
+
+
+def _joint(parameters: Mapping[str, float]) -> dict[str, np.ndarray]:
+    return {"pivot": np.zeros(2)}
+
+
+DRAWN_MAGNETS = Drawing(_with_magnet, _magnet_and_joint, (("pivot", "joint", "magnet"),), "magnet")
+DRAWN_LINKS = Drawing(_without_magnet, _joint, (("pivot", "joint", "centre of mass"),), "centre of mass")
+
 
 STATES = (
     State("psi1", "rad", "angle of link 1", r"\psi_1", on_circle=True, rate="psi1_dot"),
@@ -62,7 +92,7 @@ def _model(name: str, title: str, drive: str, magnets: tuple[Any, ...], **more: 
         classifier=SIDES if with_magnets else None,
         # with a duty cycle of one half; near it, the symmetry is approximate
         mirror=Mirror((-1, -1, -1, -1), half_period=True),
-        drawing=drawing.MAGNETS if with_magnets else drawing.FREE,
+        drawing=DRAWN_MAGNETS if with_magnets else DRAWN_LINKS,
         angle_dim="link",
         **more,
     )

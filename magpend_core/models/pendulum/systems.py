@@ -9,7 +9,7 @@ from magpend_core.engine.jit import inline, specialise
 from magpend_core.engine.system import System, positions
 from magpend_core.engine.vecmath import LN2, LOG2_E, exp, sincos, wrapped
 from magpend_core.models.model import Model
-from magpend_core.models.pendulum import jacobian, quantities
+from magpend_core.models.pendulum import jacobian
 from magpend_core.models.pendulum.equations import (
     N_DIPOLE,
     N_FITTED,
@@ -22,12 +22,62 @@ from magpend_core.models.pendulum.equations import (
     drive,
     fitted_torques,
     link_constants,
+    loads,
+    magnet_moment,
     sine_constants,
     sine_drive,
     solve_accelerations,
     square_wave_constants,
+    stribeck,
 )
 from magpend_core.models.pendulum.models import DIPOLE, DIPOLE_SINE, FITTED, FITTED_SINE, FREE, FREE_SINE
+
+
+@inline
+def _common_quantities(y: Any, dy: Any, u: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
+    """Compute energy, powers, loads and friction torques, which do not depend on the magnets."""
+    _, _, w1, w2 = y
+    s12, c12 = s1 * c2 - c1 * s2, c1 * c2 + s1 * s2
+    kinetic = 0.5 * k.B1 * (w1 * w1) + 0.5 * k.B2 * (w2 * w2) + k.N12 * c12 * (w1 * w2)
+    energy = kinetic + (k.M1 * (1.0 - c1) + k.M2 * (1.0 - c2))
+    n1, n2 = loads(s1, c1, s12, c12, w1, w2, dy[2], dy[3], k)
+    v2 = w2 - w1
+    r1 = (k.T1 + k.mu * n1) * stribeck(w1, k) + k.viscous1 * w1
+    r2 = (k.T2 + k.mu * n2) * stribeck(v2, k) + k.viscous2 * v2
+    return energy, u * w1, r1 * w1 + r2 * v2, u, r1, r2, n1, n2
+
+
+def free_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
+    """Compute the named quantities of the pendulum without magnets."""
+    s1, c1 = sincos(y[0])
+    s2, c2 = sincos(y[1])
+    return _common_quantities(y, dy, u, s1, c1, s2, c2, LinkConstants(*c[:N_LINK]))
+
+
+def fitted_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
+    """Compute the named quantities of the pendulum with the fitted magnet torque."""
+    s1, c1 = sincos(y[0])
+    s2, c2 = sincos(y[1])
+    common = _common_quantities(y, dy, u, s1, c1, s2, c2, LinkConstants(*c[:N_LINK]))
+    k = FittedConstants(*c[N_LINK:])
+    q1, q2 = magnet_torques(y, s1, c1, s2, c2, c)
+    moment = magnet_moment(y[0], y[1] - y[0], k)
+    return common + (moment, q1, q2, k.l1 * s1 + k.l2 * s2, -(k.l1 * c1 + k.l2 * c2))
+
+
+def dipole_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
+    """Compute the named quantities of the pendulum with point dipoles."""
+    s1, c1 = sincos(y[0])
+    s2, c2 = sincos(y[1])
+    common = _common_quantities(y, dy, u, s1, c1, s2, c2, LinkConstants(*c[:N_LINK]))
+    k = DipoleConstants(*c[N_LINK:])
+    q1, q2 = magnet_torques(y, s1, c1, s2, c2, c)
+    return common + (q1 + q2, q1, q2, k.l1 * s1 + k.l2 * s2, -(k.l1 * c1 + k.l2 * c2))
+
+
+QUANTITIES = {"fitted": fitted_quantities, "dipole": dipole_quantities, "none": free_quantities}
+"""Template by kind of magnets."""
+
 
 # ---- magnets: constants, torques, layers, slopes -------------------------------------------------
 
@@ -241,7 +291,7 @@ def _system(model: Model, magnets: str, driven: str) -> System:
         jacobian=bind(_jacobian, "rhs_jacobian"),
         escape=tuple(s.escape for s in model.states),
         quantity_names=tuple(q.name for q in model.quantities),
-        quantities=bind(quantities.QUANTITIES[magnets], "quantities"),
+        quantities=bind(QUANTITIES[magnets], "quantities"),
     )
 
 

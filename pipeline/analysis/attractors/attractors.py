@@ -7,7 +7,7 @@ the sweep.
 
 The modules work on a parameter point in this order: `equilibria` and `limit_cycles` find the equilibria and the
 limit cycles of flows, `searching` finds orbits, `extending` integrates the remaining cells further, and
-`labelling` labels cells and describes sets. `hysteresis.hysteresis` finds where a continuation meets
+`labelling` labels cells and describes sets. `hysteresis.find_hysteresis` finds where a continuation meets
 different attractors going up and going down.
 
 Schema
@@ -67,7 +67,7 @@ variable                 dims                                  dtype, fill  mean
 ``time_at_risk``         set                                   float64, NaN sum over cells [drive periods]
 ``mean_lifetime``,       set                                   float64, NaN lifetime and its interval, or its
 ``lifetime_low``,                                                           lower bound and infinity [drive
-``lifetime_high``                                                           periods]; see `lifetimes`
+``lifetime_high``                                                           periods]; see `intervals`
 ``dimension``            set                                   int8, 0      of a torus; 0 of any other set
 ``closes_above``         set                                   int32, 0     period that cells seem to close
                                                                             with, above the longest looked for
@@ -110,14 +110,14 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
-from pipeline.analysis.attractors.describing.features import ENERGY, Features
-from pipeline.analysis.attractors.describing.labelling import Found, analyse, follow
+from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.attractors.finding.requests import Settings, answer_all
 from pipeline.analysis.attractors.finding.searching import Search
-from pipeline.analysis.attractors.matching.matching import match
+from pipeline.analysis.attractors.labelling import Found, analyse, follow
+from pipeline.analysis.attractors.matching import match
 from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, index_of_rows
 from pipeline.analysis.sides import flags_of
@@ -389,7 +389,6 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
 }
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
-
 
 _COUNTED = ("n_cells", "share", N_POINTS)
 """Variables that are not an attribute of `Features`."""

@@ -23,18 +23,10 @@ UNFINISHED = (-1,)
 
 @dataclass(frozen=True)
 class LabelGrid:
-    """Outcome labels of a grid or sample of cells, stored as consecutive indices.
+    """Outcome labels of a grid or sample of cells, stored as consecutive indices."""
 
-    Attributes
-    ----------
-    codes
-        Index into `ids` per cell, any shape; -1 where the cell is unfinished.
-    ids
-        The labels in rising order, without unfinished codes.
-    """
-
-    codes: Codes
-    ids: Ints
+    codes: Codes  # index into `ids` per cell, any shape; -1 where the cell is unfinished
+    ids: Ints  # the labels in rising order, without unfinished codes
 
     @property
     def fraction_unfinished(self) -> float:

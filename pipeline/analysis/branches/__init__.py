@@ -4,15 +4,13 @@
     branches = explore(starts, Scope(2.0, 3.0))
     ds = dataset_of(branches, "frequency", parameters, left_out)
 
-An orbit of period p is a fixed point of the p-fold stroboscopic map, or of the p-fold return map of a flow
-seen at crossings (`magpend_core.orbits` has its derivative); its branch is followed by
-pseudo-arclength continuation, whether it is stable or not. `problems` has the equations, `lockstep`
-evaluates many of them in one call of the engine, `arclength` traces, `bifurcations` notices and locates,
-`following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
-parameters. `equilibria` has the equations of equilibria and the normal form of Hopf points, `cycles` follows the
-cycles that leave them. `connecting` says which orbits of a grid of parameter points
-lie on one branch or sheet, which `sheets` keeps. Any
-`magpend_core.engine.system.System` will do; names, units and the class of a motion are the model's.
+An orbit of period p is a fixed point of the p-fold stroboscopic map, or of the p-fold return map of a flow seen at
+crossings (`magpend_core.orbits` has its derivative); its branch is followed by pseudo-arclength continuation, whether
+it is stable or not. `problems` has the equations of orbits and equilibria, `lockstep` evaluates many of them in one
+call of the engine, `arclength` traces, `bifurcations` notices and locates, `following` makes one branch, `exploring`
+all that hang together, `curves` continues located points in two parameters. `connecting` says which orbits of a grid
+of parameter points lie on one branch or sheet, which `sheets` keeps. Any `magpend_core.engine.system.System` will do;
+names, units and the class of a motion are the model's.
 
 Located bifurcations
 --------------------
@@ -105,25 +103,3 @@ variable                          dims                     meaning
 ``normal_form``, ``_error``       bifurcation              coefficient of the normal form, NaN if unknown
 ================================= ======================== ===================================================
 """
-
-from pipeline.analysis.branches.curves import curves_from
-from pipeline.analysis.branches.curves_dataset import curves_dataset
-from pipeline.analysis.branches.dataset import dataset_of
-from pipeline.analysis.branches.exploring import Scope, explore
-from pipeline.analysis.branches.known import Start
-from pipeline.analysis.branches.starting_orbits import attracting, orbits_near, recurrent
-from pipeline.analysis.branches.table import table_of, windows_of
-
-__all__ = [
-    "Scope",
-    "Start",
-    "attracting",
-    "curves_dataset",
-    "curves_from",
-    "dataset_of",
-    "explore",
-    "orbits_near",
-    "recurrent",
-    "table_of",
-    "windows_of",
-]

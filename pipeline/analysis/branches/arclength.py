@@ -18,29 +18,16 @@ from pipeline.analysis.branches.problems import Problem, Value
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Settings of pseudo-arclength continuation: step lengths, tolerance and limits.
+    """Settings of pseudo-arclength continuation: step lengths, tolerance and limits."""
 
-    Attributes
-    ----------
-    first_step, longest_step, shortest_step : float
-        Arclengths; a trace ends if it needs a step below the shortest.
-    max_points : int
-        Points of one trace.
-    tolerance : float
-        Largest scaled residual of a point.
-    max_iterations : int
-        Newton steps before a step is halved.
-    largest_turn : float
-        Largest angle between neighbouring tangents [rad].
-    """
-
+    # arclengths; a trace ends if it needs a step below the shortest
     first_step: float = 1e-3
     longest_step: float = 5e-3
     shortest_step: float = 1e-7
-    max_points: int = 4000
-    tolerance: float = 1e-10
-    max_iterations: int = 6
-    largest_turn: float = 0.25
+    max_points: int = 4000  # points of one trace
+    tolerance: float = 1e-10  # largest scaled residual of a point
+    max_iterations: int = 6  # Newton steps before a step is halved
+    largest_turn: float = 0.25  # largest angle between neighbouring tangents [rad]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,12 +6,17 @@ draw by Newton's method (`carrying`). An orbit that is lost on the way counts as
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.model import Parameters
+from pipeline.analysis.branches.analysis import settle_branches
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, TORUS
 from pipeline.analysis.branches.carrying import (
@@ -22,11 +27,19 @@ from pipeline.analysis.branches.carrying import (
     Datum,
     OrbitData,
     Solution,
+    raw_of,
     settled,
     solve,
 )
-from pipeline.analysis.tabular import words_of
+from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.analysis.draws import LEVELS, interval_of
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import aligned, words_of
+from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
+from pipeline.products.branches import BandOptions, BranchOptions
+from pipeline.products.product import Table
 from pipeline.products.reporting import report
+from pipeline.specification.problems import SpecError
 
 GRID = 41
 """Values of the parameter at which bands are computed."""
@@ -37,24 +50,17 @@ DRAWS = 16
 FOLLOWED = (FOLD, DOUBLING, TORUS, HOPF)
 """Kinds of bifurcations that get an interval."""
 
+DRAWS_FILE = "posterior.nc"
+"""Name of the file of draws in the directory of an identification."""
+
 
 @dataclass(frozen=True)
 class Place:
-    """Place of a carried orbit in a diagram.
+    """Place of a carried orbit in a diagram."""
 
-    Attributes
-    ----------
-    branch : int
-        Index of the branch.
-    run : int
-        Number of the stretch of the branch in which the parameter keeps rising or falling.
-    step : int
-        Index of the value of the parameter, of `GRID` ones.
-    """
-
-    branch: int
-    run: int
-    step: int
+    branch: int  # index of the branch
+    run: int  # number of the stretch of the branch in which the parameter keeps rising or falling
+    step: int  # index of the value of the parameter, of `GRID` ones
 
 
 def bifurcation_data(branches: xr.Dataset) -> tuple[list[Datum], list[np.ndarray], list[int]]:
@@ -145,3 +151,201 @@ def place_variables(data: list[Datum], places: list[Place], share: np.ndarray) -
         "is_stable": ("orbit", np.array([d.stability == 1 for d in data], bool)),
         "share": ("orbit", share),
     }
+
+
+def settle_bands(run: OpenRun, options: BandOptions) -> BandOptions:
+    """Complete the interval of the branches, and the digest of the draws; raise SpecError if there are none."""
+    path = _path(options.posterior)
+    try:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        raise SpecError(
+            [f"--posterior {options.posterior}: has no {DRAWS_FILE}; make it: magpend identify posterior DIR."]
+        ) from None
+    settled = settle_branches(run, options)
+    return options.model_copy(update={**settled.part(BranchOptions), "digest": digest})
+
+
+def _path(posterior: str) -> Path:
+    path = Path(posterior)
+    return path / DRAWS_FILE if path.is_dir() else path
+
+
+def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
+    """Carry draws of the parameters through the branches of a run.
+
+    Returns
+    -------
+    Dataset
+        Over ``draw`` and ``bifurcation``: ``bifurcation_value`` [SI], NaN where a draw has none; with ``kind``,
+        ``value`` (of the run), ``orbit_period``, ``bifurcation_section`` and ``is_border`` (whether a stable orbit
+        begins or ends there). Over ``level`` (`LEVELS`) and ``orbit``: ``section_level`` (phase, state), quantiles of
+        the section points of each orbit, with the variables of `place_variables`.
+
+    Raises
+    ------
+    SpecError
+        If the draws are of another model, or the run sweeps more than one parameter.
+    """
+    drawn = _draws(run, options)
+    located = run.derive("branches", **options.part(BranchOptions))
+    base = parameters_of(run.cube())
+    along = _along(options, base, located)
+    points, states, chosen = bifurcation_data(located)
+    orbits, guesses, places = orbit_data(along, located)
+    data = [*points, *orbits]
+    n_states = located.sizes["state"]
+    guess = np.array([*states, *guesses]).reshape(len(data), n_states + 1)
+    start, solved = solvable(OrbitData(along, "", tuple(data), Solution(base.pack(), guess, np.zeros_like(guess))))
+    run.echo(f"bands: {len(solved)} orbits and bifurcations for each of {drawn.sizes['draw']} draws")
+    values, sections = _carry(start, _packed(base, drawn), located.sizes["phase"])
+    is_orbit = np.array([d.kind == ORBIT for d in start.data], bool)
+    own = [solved[k] - len(points) for k in np.flatnonzero(is_orbit)]
+    of_points = [chosen[solved[k]] for k in np.flatnonzero(~is_orbit)]
+    found = _bifurcations(located, of_points, values[:, ~is_orbit])
+    share = np.isfinite(sections[:, is_orbit, 0, 0]).mean(axis=0)
+    levels = _levels(sections[:, is_orbit], np.asarray(along.model.system.is_angle, bool))
+    found = found.assign(place_variables([orbits[k] for k in own], [places[k] for k in own], share))
+    found["section_level"] = (("level", "orbit", "phase", "state"), levels, dict(located["section"].attrs))
+    return found.assign_coords(level=list(LEVELS), state=located["state"]).assign_attrs(
+        parameter=located.attrs["parameter"],
+        parameter_units=located.attrs["parameter_units"],
+        **{k: v for k, v in located.attrs.items() if k == "model"},
+        n_draws=drawn.sizes["draw"],
+        identified=str(drawn.attrs["identified"]),
+    )
+
+
+def _draws(run: OpenRun, options: BandOptions) -> xr.Dataset:
+    with xr.open_dataset(_path(options.posterior), engine="scipy") as ds:
+        drawn = ds.load()
+    names = [str(name) for name in drawn["parameter"].values]
+    own = [name for name in run.model.parameter_names if name in names]
+    identified = str(drawn.attrs["identified"]).split()
+    swept = parameter_name(options.parameter)
+    problems = []
+    if len(own) != len(names):
+        problems.append(f"--posterior {options.posterior}: has the parameters {', '.join(names)}: another model's.")
+    if swept in identified:
+        problems.append(f"--posterior {options.posterior}: {swept} was identified, and the branches run along it.")
+    if problems:
+        raise SpecError(problems)
+    return drawn.isel(draw=slice(options.draws or None))
+
+
+def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along:
+    varying = [str(n) for n in located.data_vars if located[n].attrs.get("long_name", "") == f"value of {n}"]
+    frequency = base.model.crossing.frequency_hz if base.model.crossing is not None else np.nan
+    if base.model.crossing is None and axis_name(options.parameter) != FREQUENCY and FREQUENCY in located:
+        rates = np.unique(located[FREQUENCY].values)
+        varying += [FREQUENCY] if len(rates) > 1 else []
+        frequency = float(rates[0]) if len(rates) else np.nan
+    if varying:
+        raise SpecError(
+            [f"the run sweeps {' and '.join(varying)} besides {options.parameter}; bands need a run along one axis."]
+        )
+    assert options.low is not None
+    assert options.high is not None
+    return Along(base.model, axis_name(options.parameter), options.low, options.high, frequency)
+
+
+def _packed(base: Parameters, drawn: xr.Dataset) -> np.ndarray:
+    """Return the run's parameters with the drawn ones in place of those that were identified or tied."""
+    names = [str(name) for name in drawn["parameter"].values]
+    values = drawn["value"].values
+    packed = np.tile(base.pack(), (len(values), 1))
+    moving = str(drawn.attrs["identified"]).split() + str(drawn.attrs.get("tied", "")).split()
+    for name in moving:
+        packed[:, base.names.index(name)] = values[:, names.index(name)]
+    return packed
+
+
+def _carry(table: OrbitData, packed: np.ndarray, longest: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each draw and datum the value of the parameter, and the section points (phase, state); NaN where it
+    is lost.
+    """
+    n_states = len(table.along.model.states)
+    values = np.full((len(packed), len(table.data)), np.nan)
+    sections = np.full((len(packed), len(table.data), longest, n_states), np.nan)
+    row = 0
+    for own, found in carried(table, packed):
+        for points in found:
+            for k, (datum, point) in enumerate(zip(table.data, points, strict=True)):
+                if point is None:
+                    continue
+                raw = raw_of(table, datum, point)
+                values[row, k] = raw[-1]
+                if datum.kind == ORBIT:
+                    images = np.asarray(point.value.images)[: datum.period - 1]
+                    sections[row, k, : datum.period] = np.concatenate([raw[None, :-1], images])
+            row += 1
+        del own
+    return values, sections
+
+
+def _levels(sections: np.ndarray, is_angle: np.ndarray) -> np.ndarray:
+    """Return quantiles of section points over the draws, (level, orbit, phase, state); angles about their mean."""
+    centre = np.zeros(sections.shape[1:])
+    turns = np.where(is_angle, sections, 0.0)
+    with np.errstate(invalid="ignore"):
+        middle = np.angle(np.nansum(np.exp(1j * turns), axis=0))
+        centre = np.where(is_angle, middle, 0.0)
+        away = sections - centre
+        away = np.where(is_angle, np.angle(np.exp(1j * away)), away)
+    found = np.full((len(LEVELS), *sections.shape[1:]), np.nan)
+    known = np.isfinite(away).any(axis=0)
+    if known.any():
+        found[:, known] = np.nanquantile(away[:, known], LEVELS, axis=0) + centre[known]
+    return found
+
+
+def _bifurcations(located: xr.Dataset, chosen: list[int], values: np.ndarray) -> xr.Dataset:
+    """Return the variables over ``bifurcation``: those of the run's own, and the values of the draws."""
+    part = located.isel(bifurcation=chosen)
+    names = ("kind", "value", "of_branch", "bifurcation_section")
+    found = part[list(names)].drop_vars("state", errors="ignore")
+    border = np.minimum(part["n_unstable_before"].values, part["n_unstable_after"].values) == 0
+    units = {"units": located.attrs["parameter_units"]}
+    return found.assign(
+        bifurcation_value=(("draw", "bifurcation"), values, units),
+        is_border=("bifurcation", border),
+        orbit_period=("bifurcation", located["orbit_period"].values[part["of_branch"].values]),
+    )
+
+
+def bands_table(ds: xr.Dataset) -> Table:
+    """Return a table of the bifurcations: value in the run, median and 95 % interval over the draws that have it."""
+    rows: list[dict[str, Any]] = []
+    words = words_of(ds["kind"]) if ds.sizes["bifurcation"] else []
+    for k in np.argsort(ds["value"].values, kind="stable"):
+        low, middle, high, n = interval_of(ds["bifurcation_value"].values[:, k])
+        rows.append(
+            {
+                "type": words[int(ds["kind"].values[k])],
+                "period": int(ds["orbit_period"].values[k]),
+                "branch": int(ds["of_branch"].values[k]),
+                "value": float(ds["value"].values[k]),
+                "median": middle,
+                "low": low,
+                "high": high,
+                "n_draws": n,
+                "share": n / int(ds.attrs["n_draws"]),
+            }
+        )
+    name = parameter_name(str(ds.attrs["parameter"]))
+    lines = [
+        f"{len(rows)} bifurcations along {name}, carried to {ds.attrs['n_draws']} draws of {ds.attrs['identified']}"
+    ]
+    shown = [
+        {
+            name: f"{row['value']:.7g}",
+            "type": row["type"],
+            "period": str(row["period"] or "equilibrium"),
+            "median": f"{row['median']:.7g}",
+            "95 %": f"{row['low']:.7g} to {row['high']:.7g}",
+            "draws": f"{row['n_draws']}",
+            "branch": str(row["branch"]),
+        }
+        for row in rows
+    ]
+    return Table(rows, [*lines, "", *aligned(shown, "")] if rows else lines)

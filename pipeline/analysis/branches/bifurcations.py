@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
-from pipeline.analysis.branches.equilibria import OneParameter, hopf_test
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import Problem, doubling_test, torus_test
+from pipeline.analysis.branches.problems import OneParameter, Problem, doubling_test, hopf_test, torus_test
 
 FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
 HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
@@ -94,40 +93,21 @@ and the tangent are dependent.
 
 @dataclass(eq=False)
 class Bifurcation:
-    """A bifurcation that was located on a branch of periodic orbits or equilibria.
+    """A bifurcation that was located on a branch of periodic orbits or equilibria."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`.
-    point : Point
-        The orbit there.
-    bracket : float
-        Distance of the parameter values between which the test function changes its sign.
-    n_unstable_before, n_unstable_after : int
-        Multipliers outside the unit circle on both sides, in the order of the branch (see `settle_sides`).
-    rises_before : bool
-        Whether the parameter rises along the branch before it; at a fold it turns.
-    after : int
-        Index of the point of the branch after which it comes.
-    criticality : str
-        ``supercritical``, ``subcritical`` or, if unknown, empty, by the sign of `coefficient`. The branch that
-        leaves a period doubling or pitchfork tells it as well: `CONTRADICTORY` if the two disagree.
-    coefficient, coefficient_error : float
-        Normal form coefficient and its error (see `normal_forms`); NaN if unknown.
-    child : Branch or None
-        The other branch through it, if that is known.
-    """
-
-    kind: str
-    point: Point
-    bracket: float
+    kind: str  # one of `KINDS`
+    point: Point  # the orbit there
+    bracket: float  # distance of the parameter values between which the test function changes its sign
+    # multipliers outside the unit circle on both sides, in the order of the branch (see `settle_sides`)
     n_unstable_before: int
     n_unstable_after: int
-    rises_before: bool
-    after: int = -1
+    rises_before: bool  # whether the parameter rises along the branch before it; at a fold it turns
+    after: int = -1  # index of the point of the branch after which it comes
+    # ``supercritical``, ``subcritical`` or, if unknown, empty, by the sign of `coefficient`. The branch that leaves a
+    # period doubling or pitchfork tells it as well: `CONTRADICTORY` if the two disagree.
     criticality: str = ""
-    child: Any = None
+    child: Any = None  # the other branch through it, if that is known
+    # normal form coefficient and its error (see `normal_forms`); NaN if unknown
     coefficient: float = np.nan
     coefficient_error: float = np.nan
 

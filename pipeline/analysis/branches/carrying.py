@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from magpend_core.models.model import Model
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.bifurcations import HOPF, n_unstable
-from pipeline.analysis.branches.equilibria import HopfProblem
 from pipeline.analysis.branches.following import end_of_crossings, problem_of
 from pipeline.analysis.branches.lockstep import Steps, run_together
-from pipeline.analysis.branches.problems import BifurcationProblem, Family
+from pipeline.analysis.branches.problems import BifurcationProblem, Family, HopfProblem
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 
 Array = NDArray[np.float64]
@@ -40,28 +39,16 @@ LOCATED = Settings(tolerance=1e-8, max_iterations=12)
 
 @dataclass(frozen=True)
 class Along:
-    """Parameter interval of branches.
+    """Parameter interval of branches."""
 
-    Attributes
-    ----------
-    model : Model
-        Forced model, or a flow with its Poincare section.
-    parameter : str
-        Parameter that changes, ``frequency`` for the drive frequency.
-    low, high : float
-        Interval [SI].
-    frequency_hz : float
-        Drive frequency [Hz], unless it is the parameter; of a flow one over the longest time between crossings.
-    max_period : int
-        Longest period of the orbits [drive periods or returns].
-    """
-
-    model: Model
-    parameter: str
+    model: Model  # forced model, or a flow with its Poincare section
+    parameter: str  # parameter that changes, ``frequency`` for the drive frequency
+    # interval [SI]
     low: float
     high: float
+    # drive frequency [Hz], unless it is the parameter; of a flow one over the longest time between crossings
     frequency_hz: float = float("nan")
-    max_period: int = 2
+    max_period: int = 2  # longest period of the orbits [drive periods or returns]
 
     def family(self, period: int, packed: np.ndarray) -> Family:
         """Return the family of the orbits of one period, or with period 0 of the equilibria, along the parameter."""
@@ -80,33 +67,17 @@ class Along:
 
 @dataclass(frozen=True)
 class Datum:
-    """Measured orbit or bifurcation.
+    """Measured orbit or bifurcation."""
 
-    Attributes
-    ----------
-    name : str
-        Name, by which it can be held out.
-    kind : str
-        `ORBIT`, ``fold``, ``period_doubling``, ``neimark_sacker`` or ``hopf``.
-    value : float
-        Value of the parameter, of a bifurcation its measured value [SI].
-    period : int
-        Drive periods or returns of the orbit; 0 for an equilibrium.
-    stability : int
-        0 unknown, 1 stable, 2 unstable: an orbit of the other stability is not taken.
-    quantities : tuple of str
-        Measured quantities, as in `Shapes.columns`; ``parameter`` of a bifurcation, and of an orbit whose parameter
-        has an error.
-    measured, sd : ndarray, (n_quantities,)
-        Measured values and their standard deviations [SI].
-    """
-
-    name: str
-    kind: str
-    value: float
-    period: int
-    stability: int
+    name: str  # name, by which it can be held out
+    kind: str  # `ORBIT`, ``fold``, ``period_doubling``, ``neimark_sacker`` or ``hopf``
+    value: float  # value of the parameter, of a bifurcation its measured value [SI]
+    period: int  # drive periods or returns of the orbit; 0 for an equilibrium
+    stability: int  # 0 unknown, 1 stable, 2 unstable: an orbit of the other stability is not taken
+    # measured quantities, as in `Shapes.columns`; ``parameter`` of a bifurcation, and of an orbit whose parameter has
+    # an error
     quantities: tuple[str, ...]
+    # (n_quantities,): measured values and their standard deviations [SI]
     measured: Array
     sd: Array
 
@@ -118,49 +89,25 @@ class Datum:
 
 @dataclass(frozen=True)
 class Solution:
-    """Computed orbits of a table's data for one set of parameters.
+    """Computed orbits of a table's data for one set of parameters."""
 
-    Attributes
-    ----------
-    packed : ndarray, (n_parameters,)
-        Packed parameters of the model.
-    unknowns : ndarray, (n_datum, n_states + 1)
-        Section point and value of the parameter of each orbit [SI].
-    tangents : ndarray, (n_datum, n_states + 1)
-        Unit tangents of the branches there, in scaled unknowns.
-    slopes : dict of ndarray, (n_datum, n_states + 1)
-        Derivatives of `unknowns` by parameters of the model, as far as they are known.
-    """
-
-    packed: Array
-    unknowns: Array
-    tangents: Array
+    packed: Array  # (n_parameters,): packed parameters of the model
+    unknowns: Array  # (n_datum, n_states + 1): section point and value of the parameter of each orbit [SI]
+    tangents: Array  # (n_datum, n_states + 1): unit tangents of the branches there, in scaled unknowns
+    # dict of ndarray, (n_datum, n_states + 1): derivatives of `unknowns` by parameters of the model, as far as they
+    # are known
     slopes: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class OrbitData:
-    """Measured orbits and bifurcations of one table, with the computed orbits from which Newton's method starts.
+    """Measured orbits and bifurcations of one table, with the computed orbits from which Newton's method starts."""
 
-    Attributes
-    ----------
-    along : Along
-        Model, parameter along which was measured, and its interval.
-    state : str
-        State that was measured.
-    data : tuple of Datum
-        Orbits and bifurcations.
-    known : Solution
-        Computed orbits for the parameters accepted last.
-    settings : dict
-        Values of parameters in these measurements alone.
-    """
-
-    along: Along
-    state: str
-    data: tuple[Datum, ...]
-    known: Solution
-    settings: Mapping[str, float] = field(default_factory=dict)
+    along: Along  # model, parameter along which was measured, and its interval
+    state: str  # state that was measured
+    data: tuple[Datum, ...]  # orbits and bifurcations
+    known: Solution  # computed orbits for the parameters accepted last
+    settings: Mapping[str, float] = field(default_factory=dict)  # values of parameters in these measurements alone
 
     def packed(self, values: Mapping[str, float]) -> Array:
         """Return packed parameters for the values of the fit, with the table's own settings."""

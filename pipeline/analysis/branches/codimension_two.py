@@ -59,27 +59,14 @@ ON_AXIS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SpecialPoint:
-    """A located point of codimension two, such as a cusp, with its orbit, both parameter values and their errors.
+    """A located point of codimension two, such as a cusp, with its orbit, both parameter values and their errors."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `POINT_KINDS`.
-    family : Family
-        Family of the orbit.
-    point : Point
-        The orbit at the point.
-    bracket : ndarray, (2,)
-        Distance of the values of both parameters between which the test function changes its sign.
-    curve : int
-        Number of the curve on which it was located.
-    """
-
-    kind: str
-    family: Family
-    point: Point
+    kind: str  # one of `POINT_KINDS`
+    family: Family  # family of the orbit
+    point: Point  # the orbit at the point
+    # (2,): distance of the values of both parameters between which the test function changes its sign
     bracket: np.ndarray
-    curve: int = -1
+    curve: int = -1  # number of the curve on which it was located
 
     @property
     def values(self) -> np.ndarray:

@@ -65,21 +65,11 @@ _STEP, _SETTLE, _HALVE = range(3)
 
 @dataclass(frozen=True, eq=False)
 class Web:
-    """Orbits with the links between them; the given orbits come first, in their order.
+    """Orbits with the links between them; the given orbits come first, in their order."""
 
-    Attributes
-    ----------
-    place : ndarray of int, (orbit,)
-        Parameter point of each.
-    links : ndarray of int, (link, 3)
-        Two orbits, and the number of period doublings between them.
-    ways : ndarray of int, (orbit, axis, 2)
-        State of the way up and down each axis, of `UNTRIED` to `GOING`.
-    """
-
-    place: Array
-    links: Array
-    ways: Array
+    place: Array  # int, (orbit,): parameter point of each
+    links: Array  # int, (link, 3): two orbits, and the number of period doublings between them
+    ways: Array  # int, (orbit, axis, 2): state of the way up and down each axis, of `UNTRIED` to `GOING`
 
 
 def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:

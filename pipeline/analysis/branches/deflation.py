@@ -44,23 +44,12 @@ CLOSE = 1e-9
 class FoundOrbit:
     """A periodic orbit found by the search: its section points, its monodromy matrix and the number of starts that led
     to it.
-
-    Attributes
-    ----------
-    points : ndarray, (period, n_states)
-        Section points in the order of time.
-    monodromy : ndarray, (n_states, n_states)
-        Derivative of the section map over the period.
-    n_hits : int
-        Starts of the first round, in which nothing is deflated, that led to it.
-    search_round : int
-        Round in which it was found, from 0.
     """
 
-    points: np.ndarray
-    monodromy: np.ndarray
-    n_hits: int
-    search_round: int
+    points: np.ndarray  # (period, n_states): section points in the order of time
+    monodromy: np.ndarray  # (n_states, n_states): derivative of the section map over the period
+    n_hits: int  # starts of the first round, in which nothing is deflated, that led to it
+    search_round: int  # round in which it was found, from 0
 
     @property
     def period(self) -> int:

@@ -1,4 +1,12 @@
-"""Follow all branches that are connected by bifurcations with some given orbits, each branch once."""
+"""Follow all branches that are connected by bifurcations with some given orbits, each branch once.
+
+At a pitchfork one branch passes straight through and the other turns back, so that its two arms lie on one side.
+The point belongs to the first.
+
+The section of the cycles that start at a Hopf point is the level of the crossing state there, so that small cycles
+cross it. The first cycle has a given amplitude along the critical eigenvector; Newton's method finds its parameter
+value. Larger cycles often cross the section of the run as well.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +16,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings
-from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, HOPF, Bifurcation
-from pipeline.analysis.branches.crossings import FOLLOWING, cross, settle_crossings
-from pipeline.analysis.branches.cycles import crossings_of, cycle_family, cycles_from
+from magpend_core.orbits import crossed_state, section_map
+from magpend_core.sections import run_branches
+from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.bifurcations import (
+    BRANCHING,
+    DOUBLING,
+    FOLD,
+    HOPF,
+    SAME_PLACE,
+    Bifurcation,
+    settle_sides,
+)
 from pipeline.analysis.branches.following import (
     Branch,
+    Half,
+    crossing_half,
     doubled_start,
     first_point,
     half_branch,
@@ -23,9 +41,10 @@ from pipeline.analysis.branches.following import (
     problem_of,
 )
 from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others
-from pipeline.analysis.branches.lockstep import run_together
+from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.normal_forms import judge
-from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.tolerances import BRANCH_RTOL
 
 AT_HOPF = 0.05
 """Largest scaled distance of the last cycle of a branch from the Hopf point at which it ends."""
@@ -33,28 +52,33 @@ AT_HOPF = 0.05
 CLEAR = 2
 """Points of a branch by which cycles are away from where they touch a section."""
 
+AMPLITUDES = (0.02, 0.05, 0.1)
+"""Amplitudes of the first cycle that are tried, in units of the scales."""
+
+SAME_LEVEL = 1e-9
+"""Two sections this close are one [scales of the state that crosses]."""
+
+SAME_TIME = 1e-6
+"""Relative difference within which the times of some returns add up to the period of a cycle."""
+
+
+FOLLOWING = "following branches"
+"""First words of the work's name in progress reports."""
+
+BESIDE = 3
+"""Points of a branch away from a bifurcation at which it is seen on which side of it the branch lies."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """Limits within which branches are explored: parameter interval, longest period, number of generations.
+    """Limits within which branches are explored: parameter interval, longest period, number of generations."""
 
-    Attributes
-    ----------
-    low, high : float
-        Interval of the parameter.
-    max_period : int
-        Longest period of a branch [drive periods].
-    max_generations : int
-        Most generations of branches that bifurcate from branches.
-    settings : Settings
-        Settings of the traces.
-    """
-
+    # interval of the parameter
     low: float
     high: float
-    max_period: int = 8
-    max_generations: int = 3
-    settings: Settings = field(default_factory=Settings)
+    max_period: int = 8  # longest period of a branch [drive periods]
+    max_generations: int = 3  # most generations of branches that bifurcate from branches
+    settings: Settings = field(default_factory=Settings)  # settings of the traces
 
 
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
@@ -314,3 +338,211 @@ def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
         origin = cycles.origin if first == 0 else None
         parts.append(Branch(cycles.family, cycles.points[first : last + 1], inside, ends, origin))
     return parts
+
+
+def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
+    """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if they do
+    not cross it.
+
+    There is none if the system has no section by crossing, or if the crossing state does not oscillate.
+    """
+    crossed = crossed_state(equilibria.system)
+    if crossed is None or _direction(equilibria, at) is None:
+        return None
+    level = equilibria.parameters.copy()
+    at_rest = float(at.point.value.images[0, crossed])
+    if abs(at_rest - level[-1]) > SAME_LEVEL * equilibria.system.scales[crossed]:
+        level[-1] = at_rest
+    for name, value in zip(equilibria.free, equilibria.values(at.point.u), strict=True):
+        level[equilibria.system.parameter_names.index(name)] = value
+    return replace(equilibria, period=1, parameters=level)
+
+
+def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settings: Settings) -> Steps[Half | None]:
+    """Follow the limit cycles that start at a Hopf point along the parameter; None if no small cycle is found."""
+    direction = _direction(family, at)
+    assert direction is not None
+    normal = np.append(direction / np.linalg.norm(direction), 0.0)
+    for amplitude in AMPLITUDES:
+        guess = at.point.u + amplitude * np.append(direction, 0.0)
+        first = yield from correct(OrbitProblem(family), guess, normal, settings)
+        if first is not None:
+            return (yield from half_branch(family, first, low, high, settings))
+    return None
+
+
+def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
+    """Return the scaled direction from an equilibrium to the point where small limit cycles cross the section; None if
+    they do not cross it.
+
+    It is the real part of the critical eigenvector at the phase at which the crossing state passes its level in
+    the section's direction; its largest component is 1.
+    """
+    assert family.system.section is not None
+    crossed, sign = family.system.section
+    values, vectors = np.linalg.eig(family.scaled(at.point.value.monodromy))
+    vector = vectors[:, int(np.argmin(np.abs(values.real) + 1e300 * (values.imag <= 0.0)))]
+    if abs(vector[crossed]) < 1e-6 * np.abs(vector).max():
+        return None
+    turned = vector * np.exp(-1j * (sign * np.pi / 2.0 + np.angle(vector[crossed])))
+    found = np.asarray(turned.real)
+    found[crossed] = 0.0
+    largest = np.abs(found).max()
+    return found / largest if largest > 1e-9 * np.abs(vector).max() else None
+
+
+def crossings_of(cycles: Branch, section: Family, most: int) -> list[tuple[np.ndarray, int]]:
+    """Find where the limit cycles of a branch cross another Poincare section of the same flow.
+
+    Parameters
+    ----------
+    cycles
+        The branch.
+    section
+        A family of the same flow with the other section.
+    most
+        Largest number of crossings per cycle that is looked for.
+
+    Returns
+    -------
+    list of (ndarray, int)
+        For each cycle a point on the section, and the number of crossings per period, 0 if there is none.
+    """
+    rows = section.rows(np.array([point.u for point in cycles.points]))
+    first = run_branches(
+        rows.parameters[:, None],
+        rows.frequency_hz[:, None],
+        rows.states,
+        n_transient=1,
+        n_keep=1,
+        rtol=BRANCH_RTOL,
+        atol=BRANCH_RTOL,
+        system=section.system,
+    ).section[:, 0, 0]
+    found = section_map(rows.parameters, rows.frequency_hz, first, most, rtol=BRANCH_RTOL, system=section.system)
+    seconds = np.array([point.value.seconds for point in cycles.points])[:, None]
+    closes = np.abs(np.cumsum(found.times, axis=1) - seconds) < SAME_TIME * seconds
+    periods = np.where(closes.any(axis=1), closes.argmax(axis=1) + 1, 0)
+    return list(zip(first, map(int, periods), strict=True))
+
+
+def cross(
+    points: Sequence[tuple[Branch, Bifurcation]],
+    branches: list[Branch],
+    interval: tuple[float, float],
+    settings: Settings,
+) -> None:
+    """Follow the second branch through each branch point in both directions, and append it to `branches`."""
+    for parent, one in points:
+        known = _crossing(parent, one, branches)
+        if known is not None:
+            branch, other = known
+            one.child, other.child = branch, parent
+            continue
+        halves = run_together(
+            [
+                crossing_half(parent.family, one, _crossing_direction(parent, one), way, *interval, settings)
+                for way in (-1.0, 1.0)
+            ],
+            FOLLOWING,
+        )
+        child = joined(parent.family, *halves)
+        if len(child.points) > 2:
+            child.origin, one.child = one, child
+            branches.append(child)
+
+
+def _crossing_direction(branch: Branch, at: Bifurcation) -> np.ndarray:
+    """Return the direction of a branch at a bifurcation: the difference of the points after and before it."""
+    u = np.array([p.u for p in branch.points])
+    i = int(np.argmin(np.linalg.norm(u - at.point.u, axis=1)))
+    return np.asarray(u[min(i + 1, len(u) - 1)] - u[max(i - 1, 0)])
+
+
+def _crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> tuple[Branch, Bifurcation] | None:
+    """Find a branch on which the same branch point was located as well, and the point there."""
+    for branch in branches:
+        if branch.family.period != parent.family.period or not same_others(branch.family, parent.family):
+            continue
+        for other in branch.bifurcations:
+            away = gap(branch.family, one.point.u, other.point), abs(one.point.u[-1] - other.point.u[-1])
+            if other is not one and other.kind == BRANCHING and max(away) < SAME_PLACE:
+                return branch, other
+    return None
+
+
+def settle_crossings(branches: Sequence[Branch]) -> None:
+    """Leave each branch point on one of its two branches: at a pitchfork on the one that passes straight through.
+
+    The branch that turns there tells the criticality: its arms lie on one side.
+    """
+    for branch in branches:
+        for one in [one for one in branch.bifurcations if one.kind == BRANCHING]:
+            if one.child is None or not any(one is own for own in branch.bifurcations):
+                continue
+            twin = _crossing(branch, one, [one.child])
+            if twin is not None:
+                kept, dropped = (twin[1], one) if _side(branch, one) else (one, twin[1])
+                other = branch if dropped is one else one.child
+                side = _side(other, dropped)
+                _drop(dropped, other)
+                kept.child, other.origin = other, other.origin or kept
+            elif _side(branch, one) and not _side(one.child, one):
+                kept, side = one, _side(branch, one)
+                _move(one, branch)
+            else:
+                kept, side = one, _side(one.child, one)
+            if side:
+                kept.criticality = _side_criticality(kept, side)
+
+
+def _side(branch: Branch, at: Bifurcation) -> int:
+    """Return on which side of a bifurcation in the parameter a branch lies that turns there: 1 above, -1 below; 0 if it
+    passes through.
+    """
+    after = _place(branch, at)
+    before, beyond = (
+        branch.points[max(after - BESIDE + 1, 0)],
+        branch.points[min(after + BESIDE, len(branch.points) - 1)],
+    )
+    sides = np.sign([p.u[-1] - at.point.u[-1] for p in (before, beyond)])
+    return int(sides[0]) if sides[0] == sides[1] else 0
+
+
+def _place(branch: Branch, at: Bifurcation) -> int:
+    """Return the index of a branch's point after which a bifurcation lies; the point itself if the branch has it."""
+    if any(at is own for own in branch.bifurcations):
+        return at.after
+    return next((i for i, p in enumerate(branch.points) if p.u is at.point.u), 0)
+
+
+def _move(one: Bifurcation, turning: Branch) -> None:
+    """Make a branch point, located where a branch turns, one of the branch that passes straight through."""
+    straight: Branch = one.child
+    _drop(one, turning)
+    place = _place(straight, one)
+    del straight.points[place]
+    for own in straight.bifurcations:
+        own.after -= own.after >= place
+    one.after, one.child = place - 1, turning
+    straight.bifurcations = sorted([*straight.bifurcations, one], key=lambda own: own.after)
+    straight.origin, turning.origin = None, turning.origin or one
+    settle_sides(straight.points, straight.bifurcations)
+
+
+def _drop(one: Bifurcation, branch: Branch) -> None:
+    """Drop a branch point that belongs to another branch, and the fold where a branch turns there."""
+    branch.bifurcations = [
+        own
+        for own in branch.bifurcations
+        if own is not one and (own.kind != FOLD or np.abs(own.point.u - one.point.u).max() >= SAME_PLACE)
+    ]
+    settle_sides(branch.points, branch.bifurcations)
+
+
+def _side_criticality(at: Bifurcation, side: int) -> str:
+    """Decide whether a pitchfork is sub- or supercritical, from the side on which the branch that turns there lies."""
+    if at.n_unstable_before == at.n_unstable_after:
+        return ""
+    worse = 1 if (at.n_unstable_after > at.n_unstable_before) == at.rises_before else -1
+    return "supercritical" if side == worse else "subcritical"

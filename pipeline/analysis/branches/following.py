@@ -11,9 +11,8 @@ from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch, settle_sides
-from pipeline.analysis.branches.equilibria import EquilibriumProblem, OneParameter
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem
 
 ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section")
 """Reasons why a branch ends: ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as
@@ -34,27 +33,14 @@ def problem_of(family: Family) -> OneParameter:
 
 @dataclass(eq=False)
 class Branch:
-    """A branch: orbits of one period, or equilibria, along one parameter.
+    """A branch: orbits of one period, or equilibria, along one parameter."""
 
-    Attributes
-    ----------
-    family : Family
-        Period, system and parameters of the orbits.
-    points : list of Point
-        Orbits in order.
-    bifurcations : list of Bifurcation
-        Located bifurcations in the order of the points.
-    ends : tuple of str
-        Reasons for the first and the last end, of `ENDS`; ``start`` stands for the bifurcation at its origin.
-    origin : Bifurcation or None
-        Bifurcation from which it branches.
-    """
-
-    family: Family
-    points: list[Point]
-    bifurcations: list[Bifurcation]
+    family: Family  # period, system and parameters of the orbits
+    points: list[Point]  # orbits in order
+    bifurcations: list[Bifurcation]  # located bifurcations in the order of the points
+    # reasons for the first and the last end, of `ENDS`; ``start`` stands for the bifurcation at its origin
     ends: tuple[str, str]
-    origin: Bifurcation | None = None
+    origin: Bifurcation | None = None  # bifurcation from which it branches
 
     def __post_init__(self) -> None:
         settle_sides(self.points, self.bifurcations)

@@ -9,13 +9,19 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from pipeline.analysis.branches.deflation import FoundOrbit, coverage, expected_index, index_sums, search_orbits
+from pipeline.analysis.branches.problems import state_units
 from pipeline.analysis.branches.starting_orbits import parameters_at
-from pipeline.analysis.branches.units import state_units
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.tabular import Row, Words, aligned, counted
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import model_attribute, model_of, parameters_of, section_attributes, split_dims
+from pipeline.layout.vocabulary import (
+    model_attribute,
+    model_of,
+    parameters_of,
+    periods_of,
+    section_attributes,
+    split_dims,
+)
 from pipeline.products.branches import OrbitOptions
 from pipeline.products.product import Table
 
@@ -23,7 +29,7 @@ WIDER = 1.5
 """Side of the box of random starts, in units of that which the cells' sections span."""
 
 
-def needs_point(run: Run, options: OrbitOptions) -> None:
+def needs_point(run: OpenRun, options: OrbitOptions) -> None:
     """Raise ValueError unless the options choose exactly one parameter point."""
     point_of(run.cube(), options)
 
@@ -34,7 +40,7 @@ def point_of(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
     return part.isel(dict.fromkeys(split_dims(part["status"])[0], 0))
 
 
-def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
+def orbits(run: OpenRun, options: OrbitOptions) -> xr.Dataset:
     """Search for all periodic orbits, stable or not, up to a given period at one parameter point."""
     cube = run.cube()
     point, base = point_of(cube, options), parameters_of(cube)

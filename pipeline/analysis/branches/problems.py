@@ -15,7 +15,9 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from magpend_core.engine.system import System
+from magpend_core.models.model import Model
 from magpend_core.orbits import wrap_angles
+from magpend_core.pointwise import jacobian_at, rates_at
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 
 FREQUENCY = FREQUENCY_DIM
@@ -34,7 +36,6 @@ ONE_SIDED_STEP = 1e-7
 STATE_STEP = 1e-6
 """Step of central differences of the monodromy matrix, in units of the system's scales."""
 
-
 SMALL_GAP, SMALL_RESIDUAL = 1e-9, 1e-8
 """Largest gap between the periods of an orbit whose residual is small: its multipliers are wanted to nine digits.
 
@@ -50,24 +51,12 @@ WIDEST_GAP, MOST_TRIES = 0.05, 6
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """End points of integrated trajectories, with their derivatives and durations.
+    """End points of integrated trajectories, with their derivatives and durations."""
 
-    Attributes
-    ----------
-    starts : ndarray, (m, n_states)
-        Start states of the trajectories.
-    images : ndarray, (m, period, n_states)
-        Sections after 1, 2, ... drive periods or returns.
-    monodromy : ndarray, (m, n_states, n_states)
-        Derivative of the last image by the start.
-    times : ndarray, (m, period)
-        Duration of each drive period or return [s].
-    """
-
-    starts: np.ndarray
-    images: np.ndarray
-    monodromy: np.ndarray
-    times: np.ndarray
+    starts: np.ndarray  # (m, n_states): start states of the trajectories
+    images: np.ndarray  # (m, period, n_states): sections after 1, 2, ... drive periods or returns.
+    monodromy: np.ndarray  # (m, n_states, n_states): derivative of the last image by the start
+    times: np.ndarray  # (m, period): duration of each drive period or return [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,29 +113,14 @@ class Problem(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Periodic orbits of one period, or equilibria, of a system with one or two free parameters.
-
-    Attributes
-    ----------
-    system : System
-    period : int
-        In drive periods or returns; 0 for equilibria.
-    frequency_hz : float
-        Used unless it is free.
-    parameters : ndarray
-        Packed vector; entries that are free do not matter.
-    free : tuple of str
-        Names of the free parameters.
-    scales : tuple of float
-        Change of each free parameter that counts as 1.
-    """
+    """Periodic orbits of one period, or equilibria, of a system with one or two free parameters."""
 
     system: System
-    period: int
-    frequency_hz: float
-    parameters: np.ndarray
-    free: tuple[str, ...]
-    scales: tuple[float, ...]
+    period: int  # in drive periods or returns; 0 for equilibria
+    frequency_hz: float  # used unless it is free
+    parameters: np.ndarray  # packed vector; entries that are free do not matter
+    free: tuple[str, ...]  # names of the free parameters
+    scales: tuple[float, ...]  # change of each free parameter that counts as 1
 
     @property
     def unit(self) -> np.ndarray:
@@ -396,3 +370,86 @@ class BifurcationProblem(FamilyProblem):
             ends.monodromy[0],
             float(ends.times[0].sum()),
         )
+
+
+@dataclass(eq=False)
+class EquilibriumProblem(FamilyProblem):
+    """Equations for the equilibria of a flow along one free parameter. Their value needs no integration."""
+
+    family: Family
+    _unit: float = field(default=0.0, init=False, repr=False)
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """Return no trajectories to integrate: the equations for equilibria need none."""
+        return self.family.rows(u[None][:0])
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Compute the scaled rates at a state, and their derivatives with respect to the state and the parameter."""
+        step = np.zeros(self.size)
+        step[-1] = PARAMETER_STEP
+        rows, scales = self.family.rows(np.stack([u, u + step, u - step])), np.asarray(self.system.scales)
+        rates = [rates_at(self.system, rows.states[:1], p)[0] / scales for p in rows.parameters]
+        jacobian = jacobian_at(self.system, rows.states[:1], rows.parameters[0])[0]
+        slope = (rates[1] - rates[2]) / (2.0 * PARAMETER_STEP)
+        unit = self._unit_of(jacobian)
+        derivative = np.column_stack([self.family.scaled(jacobian), slope]) * unit
+        return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
+
+    def _unit_of(self, jacobian: np.ndarray) -> float:
+        """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
+        call.
+        """
+        if not self._unit:
+            norm = float(np.linalg.norm(self.family.scaled(jacobian)))
+            self._unit = 1.0 / norm if norm > 0.0 and np.isfinite(norm) else 1.0
+        return self._unit
+
+
+@dataclass(frozen=True, eq=False)
+class HopfProblem(FamilyProblem):
+    """Equations for equilibria at a Hopf point, with two free parameters: the rates and `hopf_test` are zero."""
+
+    n_free = 2
+    family: Family
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """Return no trajectories to integrate: the equations for equilibria need none."""
+        return self.family.rows(u[None][:0])
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Compute the scaled rates and the Hopf test function, and their derivatives by central differences."""
+        n, scales = self.family.system.n_states, np.asarray(self.system.scales)
+        steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
+        rows = self.family.rows(np.concatenate([u[None], u + np.diag(steps), u - np.diag(steps)]))
+        at = list(zip(rows.states[:, None], rows.parameters, strict=True))
+        jacobians = [jacobian_at(self.system, state, p)[0] for state, p in at]
+        norm = float(np.linalg.norm(self.family.scaled(jacobians[0]))) or 1.0
+        tests = np.array([hopf_test(j) if np.isfinite(j).all() else np.nan for j in jacobians])
+        rates = np.array([rates_at(self.system, state, p)[0] for state, p in at]) / scales / norm
+        both = np.column_stack([rates, tests])
+        derivative = (both[1 : 1 + self.size] - both[1 + self.size :]).T / (2.0 * steps)
+        return Value(both[0], derivative, rows.states[:1], jacobians[0], is_rest=True)
+
+
+OneParameter = OrbitProblem | EquilibriumProblem
+"""The problems with one free parameter, whose solutions are branches."""
+
+
+def hopf_test(jacobian: np.ndarray) -> float:
+    """Compute the product of the normalised sums of all pairs of eigenvalues; it is zero at a Hopf point."""
+    values = np.linalg.eigvals(jacobian)
+    i, j = np.triu_indices(len(values), 1)
+    sums, sizes = values[i] + values[j], np.abs(values[i]) + np.abs(values[j])
+    return float(np.prod(sums / np.where(sizes > 0.0, sizes, 1.0)).real)
+
+
+def parameter_units(parameter: str, model: Model | None) -> str:
+    """Return the unit of a parameter or of the drive frequency; an empty text if there is no model."""
+    if parameter == FREQUENCY:
+        return "Hz"
+    return model.parameter(parameter).unit if model is not None else ""
+
+
+def state_units(model: Model | None) -> str:
+    """Return the units of the states, separated by commas; "1" if there is no model."""
+    return ", ".join(model.state_units) if model is not None else "1"

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import PERIODIC
 from pipeline.products.lyapunov import LyapunovFlag
 
@@ -263,21 +263,11 @@ def _over(values: Any, counts: Any) -> Floats:
 
 @dataclass(frozen=True)
 class JacobianSpectrum:
-    """Lyapunov exponents of a map along its trajectories, per iteration of the map.
+    """Lyapunov exponents of a map along its trajectories, per iteration of the map."""
 
-    Attributes
-    ----------
-    exponents : ndarray, (..., state)
-        Exponents in falling order.
-    stderr : ndarray, (..., state)
-        Standard errors by block means.
-    blocks : ndarray, (..., block, state)
-        Mean growth in each block, in the order of `exponents`.
-    """
-
-    exponents: Floats
-    stderr: Floats
-    blocks: Floats
+    exponents: Floats  # (..., state): exponents in falling order
+    stderr: Floats  # (..., state): standard errors by block means
+    blocks: Floats  # (..., block, state): mean growth in each block, in the order of `exponents`
 
 
 def spectrum_of_jacobians(jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0) -> JacobianSpectrum:

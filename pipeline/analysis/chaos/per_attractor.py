@@ -47,12 +47,12 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from magpend_core.multipliers import orbit_exponents
+from magpend_core.orbits import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
-from pipeline.layout.attributes import code_flags
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     APERIODIC,
     CHAOTIC_SET,

@@ -46,30 +46,14 @@ MOST_GENERATIONS = 60
 
 @dataclass(frozen=True, eq=False)
 class Saddle:
-    """A saddle orbit of the section map, with its system, its parameters, one section point and the monodromy matrix.
+    """A saddle orbit of the section map: system, parameters, one section point and the monodromy matrix."""
 
-    Attributes
-    ----------
-    system : System
-        System of equations to integrate.
-    frequency_hz : float
-        Drive frequency [Hz].
-    packed : ndarray
-        Packed parameters.
-    state : ndarray, (n_states,)
-        A section point of the orbit.
-    period : int
-        Period [drive periods or returns].
-    monodromy : ndarray, (n_states, n_states)
-        Derivative of the section map over the period.
-    """
-
-    system: System
-    frequency_hz: float
-    packed: np.ndarray
-    state: np.ndarray
-    period: int
-    monodromy: np.ndarray
+    system: System  # system of equations to integrate
+    frequency_hz: float  # drive frequency [Hz]
+    packed: np.ndarray  # packed parameters
+    state: np.ndarray  # (n_states,): a section point of the orbit
+    period: int  # period [drive periods or returns]
+    monodromy: np.ndarray  # (n_states, n_states): derivative of the section map over the period
 
     @property
     def scales(self) -> np.ndarray:
@@ -127,24 +111,14 @@ class Resolution:
 
 @dataclass(eq=False)
 class Manifold:
-    """One side of a manifold of a saddle orbit: its points from the orbit outwards, and the reason why it ends.
+    """One side of a manifold of a saddle orbit: its points from the orbit outwards, and the reason why it ends."""
 
-    Attributes
-    ----------
-    points : ndarray, (n, n_states)
-        Section points in order.
-    time : ndarray, (n,)
-        Generation and the place within it: one more is the next image (of a stable manifold: the next preimage).
-    stable : bool
-        Whether trajectories approach the orbit along it.
-    end : str
-        Reason for its end: ``length``, ``most`` points, ``generations``, or ``lost`` where a point has no image
-        or preimage.
-    """
-
-    points: np.ndarray
+    points: np.ndarray  # (n, n_states): section points in order
+    # (n,): generation and the place within it: one more is the next image (of a stable manifold: the next preimage)
     time: np.ndarray
-    stable: bool
+    stable: bool  # whether trajectories approach the orbit along it
+    # reason for its end: ``length``, ``most`` points, ``generations``, or ``lost`` where a point has no image or
+    # preimage
     end: str = field(default="length")
 
 

@@ -11,11 +11,13 @@ from scipy.signal import find_peaks
 
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.status import Status
-from pipeline.analysis.noise.cells import PointCells, cells_at_points, coordinates_of, point_dims
 from pipeline.analysis.noise.escapes import mean_and_spread
-from pipeline.analysis.run import Run
+from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, point_dims
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, points_of, values
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.noise import DensityOptions
+from pipeline.products.product import Table
 
 MOST_PEAKS = 16
 """Most peaks whose places are kept."""
@@ -90,7 +92,7 @@ def find_density_peaks(
     return smoothed, bins[np.argsort(-smoothed[bins], kind="stable")]
 
 
-def density(run: Run, options: DensityOptions) -> xr.Dataset:
+def density(run: OpenRun, options: DensityOptions) -> xr.Dataset:
     """Compute the density of a state's section points at each parameter point, moments and peaks.
 
     Returns
@@ -195,3 +197,37 @@ def _fill(
     tables["n_effective"][at], tables["bandwidth"][at], tables["n_peaks"][at] = n_effective, bandwidth, len(bins)
     places = 0.5 * (edges[bins] + edges[bins + 1])[:MOST_PEAKS]
     tables["peak"][(*at, slice(0, len(places)))] = places
+
+
+_DENSITY = ("n_points", "n_effective", "variance", "skewness", "kurtosis", "bandwidth", "n_peaks")
+
+
+def density_table(ds: xr.Dataset) -> Table:
+    """Return a row per parameter point: points, moments, bandwidth, number and places of the peaks."""
+    dims = [str(d) for d in ds["n_peaks"].dims]
+    state = str(ds.attrs["density_of"])
+    rows: list[Row] = []
+    for at, where in points_of(ds, dims):
+        one = ds.isel(at)
+        row = {**where, "state": state, "mean": float(one["mean"].sel(state=state)), **values(one, *_DENSITY)}
+        rows.append(row | {"peaks": [float(x) for x in one["peak"].values if np.isfinite(x)]})
+    rule = "Silverman's rule with the effective number of points"
+    lines = [f"density of {state} at the sections; bandwidth by {rule}"]
+    lines += aligned([_density_words(ds, row, dims) for row in rows])
+    for row in rows:
+        row["peaks"] = " ".join(f"{x:.6g}" for x in row["peaks"])
+    return Table(rows, lines)
+
+
+def _density_words(ds: xr.Dataset, row: Row, dims: list[str]) -> Words:
+    return {
+        **at_point(ds, row, dims),
+        "points": str(row["n_points"]),
+        "independent": number(row["n_effective"], ".0f"),
+        "mean": number(row["mean"], ".4g"),
+        "variance": number(row["variance"], ".4g"),
+        "skewness": number(row["skewness"], ".2f"),
+        "kurtosis": number(row["kurtosis"], ".2f"),
+        "bandwidth": number(row["bandwidth"], ".2g"),
+        "peaks": f"{row['n_peaks']}: {', '.join(f'{x:.3g}' for x in sorted(row['peaks']))}",
+    }

@@ -1,28 +1,63 @@
-"""Compute at which rate noisy cells leave a set, where they go, and the stretch of sections before."""
+"""Define the analysis ``escapes``: at which rate noisy cells leave a set, where they go, and how they get there."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.model import Model
 from magpend_core.sizes import NOISE_PREFIX
 from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.noise.cells import PointCells, cells_at_points, coordinates_of, point_dims
-from pipeline.analysis.noise.exits import Exits, find_exits, labels_of
-from pipeline.analysis.noise.passages import find_passages
-from pipeline.analysis.noise.rates import NO_FIT, KramersFit, constancy, fit_kramers, rate_interval
-from pipeline.analysis.run import Run
+from pipeline.analysis.noise.exits import (
+    Exits,
+    PointCells,
+    cells_at_points,
+    coordinates_of,
+    find_exits,
+    find_passages,
+    labels_of,
+    point_dims,
+)
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, points_of, unit_of, values, words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.noise import EscapeOptions
+from pipeline.products.product import Table
 
 _IN_AND_OUT = ("inside", "outside")
 
 
-def needs_set(run: Run, options: EscapeOptions) -> None:
+_MOST_ITERATIONS = 100
+
+_CONVERGED = 1e-12
+
+_LARGEST_STEP = 2.0
+
+_LEAST_EVENTS, _LEAST_POINTS = 2, 3
+
+_ESCAPE = (
+    "n_cells",
+    "n_left",
+    "at_risk",
+    "rate",
+    "rate_low",
+    "rate_high",
+    "rate_halved",
+    "left_share",
+    "left_low",
+    "left_high",
+    "constant_p",
+)
+
+_UNEVEN = 0.01
+"""Level below which a rate counts as changing along the record."""
+
+
+def needs_set(run: OpenRun, options: EscapeOptions) -> None:
     """Raise ValueError unless the options say which set cells leave, in states of the model."""
     model = run.model
     for name, given in (("low", options.low), ("high", options.high), ("centre", options.centre)):
@@ -46,7 +81,7 @@ def needs_set(run: Run, options: EscapeOptions) -> None:
         )
 
 
-def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
+def escapes(run: OpenRun, options: EscapeOptions) -> xr.Dataset:
     """Compute rates of escape, exit places and last stretches at each parameter point.
 
     Returns
@@ -251,3 +286,184 @@ def _with_kramers(ds: xr.Dataset, dims: list[str], options: EscapeOptions) -> xr
             fit = fit_kramers(ds[along].values, n, m, t, options.confidence)
         fits[(slice(None), *index)] = fit
     return ds.assign({name: (others, value) for name, value in zip(_FIT, fits, strict=True)})
+
+
+def rate_interval(
+    n_events: np.ndarray, n_risked: np.ndarray, interval: np.ndarray, confidence: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a rate and its confidence interval from events that are seen at even instants, with censoring.
+
+    `n_events` follow in `n_risked` intervals of time at whose begin a cell was still there. For a constant rate k
+    the probability of an event in an interval is p = 1 - exp(-k T); the number of events is taken as Poisson's,
+    with Garwood's exact interval (Biometrika 28, 437, 1936), which is conservative for the binomial number.
+
+    Parameters
+    ----------
+    n_events, n_risked
+        Numbers of events, and of intervals at risk, the censored ones included.
+    interval
+        Length T of an interval [s].
+    confidence
+        Two-sided level.
+
+    Returns
+    -------
+    rate, low, high
+        [1/s]; NaN without an interval at risk, a low end of 0 without events.
+    """
+    n, m, t = np.broadcast_arrays(np.asarray(n_events, float), np.asarray(n_risked, float), np.asarray(interval, float))
+    tail = 0.5 * (1.0 - confidence)
+    low = np.where(n > 0, stats.chi2.ppf(tail, np.maximum(2 * n, 1)) / 2, 0.0)
+    high = stats.chi2.ppf(1.0 - tail, 2 * n + 2) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rate, below, above = (-np.log1p(-np.minimum(x / m, 1.0)) / t for x in (n, low, high))
+    known = m > 0
+    return tuple(np.where(known, x, np.nan) for x in (rate, below, above))  # type: ignore[return-value]
+
+
+def constancy(n_early: int, n_late: int, risked_early: int, risked_late: int) -> float:
+    """Return the p-value of the hypothesis that the rate is the same early and late in the record; NaN without data."""
+    if n_early + n_late == 0 or risked_early + risked_late == 0:
+        return float("nan")
+    share = risked_early / (risked_early + risked_late)
+    return float(stats.binomtest(n_early, n_early + n_late, share).pvalue)
+
+
+class KramersFit(NamedTuple):
+    """Fit of Kramers' law, rate = factor exp(-slope/s**2), to rates over the noise's strength s.
+
+    For dx = -U'(x) dt + s dW the slope is twice the height of the barrier of U.
+    """
+
+    slope: float
+    low: float
+    high: float
+    log_factor: float  # of the rate in 1/s
+    n_points: int
+    misfit: float  # p-value of the deviance: small where the law does not hold
+
+
+_NAN = float("nan")
+NO_FIT = KramersFit(_NAN, _NAN, _NAN, _NAN, 0, _NAN)
+
+
+def fit_kramers(
+    strength: np.ndarray, n_events: np.ndarray, n_risked: np.ndarray, interval: np.ndarray, confidence: float
+) -> KramersFit:
+    """Fit Kramers' law by maximum likelihood, with the numbers of events as Poisson's.
+
+    Parameters
+    ----------
+    strength
+        Strengths of the noise; those that are 0 are left out.
+    n_events, n_risked, interval, confidence
+        See `rate_interval`; arrays over the strengths.
+
+    Returns
+    -------
+    KramersFit
+        `NO_FIT` unless three strengths have cells at risk and two of these have events. The interval of the slope
+        is that of the likelihood's curvature.
+    """
+    strength, n, m = (np.asarray(x, np.float64) for x in (strength, n_events, n_risked))
+    t = np.broadcast_to(np.asarray(interval, np.float64), n.shape)
+    # where nearly every interval at risk has an event the rate is no rate any more
+    use = (strength > 0) & (m > 0) & (n < 0.5 * m)
+    if use.sum() < _LEAST_POINTS or (n[use] > 0).sum() < _LEAST_EVENTS:
+        return NO_FIT
+    x, n = -1.0 / strength[use] ** 2, n[use]
+    # -m log(1 - n/m) events of a constant rate over the whole time at risk
+    exposure = m[use] * t[use] * np.where(n > 0, n / (-m[use] * np.log1p(-n / m[use]) + (n == 0)), 1.0)
+    design = np.stack([np.ones_like(x), x], axis=1)
+    some = n > 0
+    line = np.polyfit(x[some], np.log(n[some] / exposure[some]), 1)
+    beta = np.array([line[1], line[0]])
+    for _ in range(_MOST_ITERATIONS):
+        mean = exposure * np.exp(np.clip(design @ beta, -700.0, 700.0))
+        step = np.linalg.solve(design.T @ (mean[:, None] * design), design.T @ (n - mean))
+        beta = beta + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+        if np.abs(step).max() < _CONVERGED * (1.0 + np.abs(beta).max()):
+            break
+    mean = exposure * np.exp(design @ beta)
+    error = float(np.sqrt(np.linalg.inv(design.T @ (mean[:, None] * design))[1, 1]))
+    z = float(stats.norm.ppf(0.5 + 0.5 * confidence))
+    deviance = 2.0 * float(np.sum(np.where(some, n * np.log(np.where(some, n, 1.0) / mean), 0.0) - (n - mean)))
+    misfit = float(stats.chi2.sf(deviance, len(n) - 2))
+    slope = float(beta[1])
+    return KramersFit(slope, slope - z * error, slope + z * error, float(beta[0]), len(n), misfit)
+
+
+def escapes_table(ds: xr.Dataset) -> Table:
+    """Return a row per parameter point and set: cells, cells that left, rate with interval, where they went."""
+    dims = [str(d) for d in ds["rate"].dims if d != "set"]
+    sets = words_of(ds["set"])
+    targets = words_of(ds["set"])
+    rows: list[Row] = []
+    for at, where in points_of(ds, dims):
+        for k in range(ds.sizes["set"]):
+            one = ds.isel({**at, "set": k})
+            row = {**where, "begins": sets[int(one["set"])], **values(one, *_ESCAPE)}
+            row |= {f"to_{word}": int(n) for word, n in zip(targets, one["n_to"].values, strict=False)}
+            row |= {f"exit_{s}": float(one["exit_mean"].sel(state=s)) for s in ds["state"].values.tolist()}
+            rows.append(row)
+    level = f"{100 * ds.attrs['confidence']:g} %"
+    looked = "in every step" if np.isfinite(ds["rate_halved"]).any() else "at the sections"
+    lines = [
+        f"escapes, looked for {looked}, intervals of {level}",
+        *aligned([_escape_words(ds, row, dims) for row in rows]),
+    ]
+    lines += [line for row in rows if (line := _uneven_line(ds, row, dims))]
+    lines += _kramers_lines(ds, dims)
+    return Table(rows, lines, "" if any(row["n_cells"] for row in rows) else "no cell begins in the set")
+
+
+def _escape_words(ds: xr.Dataset, row: Row, dims: list[str]) -> Words:
+    to = ", ".join(f"{n} {key[3:]}" for key, n in row.items() if key.startswith("to_") and n)
+    mean = 1.0 / row["rate"] if 0.0 < row["rate"] < np.inf else np.nan
+    interval = f"{number(row['rate_low'], '.3g')} to {number(row['rate_high'], '.3g')}"
+    halved = {} if np.isnan(row["rate_halved"]) else {"halved steps": number(row["rate_halved"], ".4g")}
+    return {
+        **at_point(ds, row, dims),
+        "begins": row["begins"],
+        "cells": str(row["n_cells"]),
+        "left": str(row["n_left"]),
+        "to": to or "-",
+        "rate [1/s]": number(row["rate"], ".4g"),
+        "interval": interval,
+        **halved,
+        "mean time [s]": number(mean, ".4g"),
+    }
+
+
+def _uneven_line(ds: xr.Dataset, row: Row, dims: list[str]) -> str:
+    """Return a warning if cells leave at another rate early in the record than late."""
+    if not row["constant_p"] < _UNEVEN:
+        return ""
+    place = ", ".join(f"{d} {row[d]:g}{unit_of(ds, d)}" for d in dims)
+    return (
+        f"  warning: {place or 'here'}: the rate early in the record differs from that late in it "
+        f"(p = {row['constant_p']:.1g}); raise n_transient or --skip, or the set holds more than one attractor"
+    )
+
+
+def _kramers_lines(ds: xr.Dataset, dims: list[str]) -> list[str]:
+    """Return the lines on the fit of Kramers' law."""
+    if "barrier" not in ds:
+        return []
+    along = strength_dim(dims)
+    others = [d for d in dims if d != along]
+    lines = []
+    for at, where in points_of(ds, others):
+        for k in range(ds.sizes["set"]):
+            one = ds.isel({**at, "set": k})
+            place = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
+            head = f"  {place + ': ' if place else ''}{words_of(ds['set'])[int(one['set'])]}: "
+            if not np.isfinite(float(one["barrier"])):
+                lines.append(f"{head}no fit of Kramers' law: three strengths are needed, two of them with escapes")
+                continue
+            value, low, high = (float(one[name]) for name in ("barrier", "barrier_low", "barrier_high"))
+            lines.append(
+                f"{head}rate = {np.exp(float(one['log_factor'])):.4g} /s exp(-{value:.4g}/{along}²), exponent "
+                f"{low:.4g} to {high:.4g}, {int(one['n_fitted'])} strengths, misfit p = {float(one['misfit_p']):.2g}"
+            )
+    return lines

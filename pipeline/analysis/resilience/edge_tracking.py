@@ -5,6 +5,10 @@ them apart along the unstable direction while it contracts them within the bound
 they are bisected again. So the pair follows a trajectory on the boundary to its edge state (Skufca, Yorke and
 Eckhardt, Phys. Rev. Lett. 96, 174101, 2006). All pairs are tracked in step, and a bisection tries several states of
 a segment at once.
+
+Where the boundary is fractal, the edge is a chaotic saddle: a path on it never settles, and saddle orbits lie dense
+in it. Newton's method from points of the path finds the shortest ones. An orbit is on the boundary if arbitrarily
+close to it, along its unstable direction, states of both basins are found.
 """
 
 from __future__ import annotations
@@ -19,11 +23,12 @@ from magpend_core.sampling import sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.attractors.extension.clouds import is_stationary
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct
 from pipeline.analysis.attractors.finding.equilibria import equilibria_near
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
-from pipeline.analysis.resilience.edge_orbits import n_unstable, separates
+from pipeline.analysis.branches.deflation import search_orbits
+from pipeline.analysis.sets import nearest_distances
 from pipeline.analysis.tolerances import PORTRAIT_RTOL, RECURRENCE
 from pipeline.products.reporting import report
 
@@ -40,7 +45,6 @@ MOST_DIVISIONS = 40
 CLOSE = 10.0
 """Distance within which a path recurs, and from its edge state, in units of the pair's largest distance."""
 
-
 WIDEST = 100.0
 """Distance of a pair after one section, in units of the largest distance, beyond which it no longer shows where the
 boundary is: the segment between its states may cross other parts of it."""
@@ -48,50 +52,45 @@ boundary is: the segment between its states may cross other parts of it."""
 INSTANTS = 1024
 """Instants between two sections at which it is seen where a trajectory is slow."""
 
+MOST_RECURRENCES, N_STARTS = 64, 336
+"""Points of the paths from which Newton's method starts, for each period: those that recur most closely, and others
+drawn at random."""
+
+BESIDE = 0.05
+"""Scaled standard deviation by which the random ones are moved: strongly unstable orbits attract Newton's method from a
+narrow strip, which few points of a path hit."""
+
+ROUNDS = 6
+"""Most rounds of the search in which known orbits are deflated."""
+
+SHIFTS = 10.0 ** np.arange(-8.0, -3.0, 0.25)
+"""Scaled distances from an orbit at which both basins are looked for."""
+
+NEAREST = len(SHIFTS) // 2
+"""How many of the smaller distances must show both basins."""
+
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the tracking.
+    """Limits of the tracking."""
 
-    Attributes
-    ----------
-    closest, farthest : float
-        Scaled distance to which a pair is bisected, and beyond which it is bisected again.
-    returns : int
-        Most sections of a path.
-    longest : int
-        Longest period of an edge orbit.
-    """
-
+    # scaled distance to which a pair is bisected, and beyond which it is bisected again
     closest: float
     farthest: float
-    returns: int
-    longest: int
+    returns: int  # most sections of a path
+    longest: int  # longest period of an edge orbit
 
 
 @dataclass
 class Pair:
-    """A pair of states, one in each basin, and its path along the boundary.
+    """A pair of states, one in each basin, and its path along the boundary."""
 
-    Attributes
-    ----------
-    start : ndarray, (2, state)
-        The two initial states.
-    ends : ndarray, (2, state)
-        The two states now.
-    path : list of ndarray
-        Middle of the pair at each section after the first bisection.
-    found : Orbit, Equilibrium, ndarray or None
-        Edge state: an orbit, an equilibrium, or section points (n, state) of a bounded set.
-    reason : int
-        Index into `REASONS`.
-    """
-
-    start: np.ndarray
-    ends: np.ndarray
-    path: list[np.ndarray] = field(default_factory=list)
+    start: np.ndarray  # (2, state): the two initial states
+    ends: np.ndarray  # (2, state): the two states now
+    path: list[np.ndarray] = field(default_factory=list)  # middle of the pair at each section after the first bisection
+    # edge state: an orbit, an equilibrium, or section points (n, state) of a bounded set
     found: Orbit | Equilibrium | np.ndarray | None = None
-    reason: int = NONE
+    reason: int = NONE  # index into `REASONS`
 
     @property
     def goes_on(self) -> bool:
@@ -166,21 +165,21 @@ class Tracking:
 
     def _advance(self, pairs: Sequence[Pair]) -> None:
         """Integrate pairs to the next section."""
-        found = self._there.advance(np.concatenate([pair.ends for pair in pairs]), 1)
-        states = found.section[:, 0, -1].reshape(len(pairs), 2, -1)
-        last = found.final_state[:, 0].reshape(len(pairs), 2, -1)
-        status = found.status[:, 0].reshape(len(pairs), 2)
-        for i, (pair, own, end, codes) in enumerate(zip(pairs, states, last, status, strict=True)):
+        flight = self._there.fly(np.concatenate([pair.ends for pair in pairs]))
+        found = flight.advance(1)
+        states = found.state.reshape(len(pairs), 2, -1)
+        status = found.status.reshape(len(pairs), 2)
+        for i, (pair, own, codes) in enumerate(zip(pairs, states, status, strict=True)):
             if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all() and (own[0] != own[1]).any():
                 before, pair.ends = pair.ends[0], own
                 if self._width(pair) > WIDEST * self._limits.farthest:
                     pair.reason = PARTED
-                    if self._there.point.can_rest and found.return_time is not None:
-                        self._pass(pair, before, float(found.return_time[2 * i, 0, -1]))
+                    if self._there.point.is_flow:
+                        self._pass(pair, before, float(flight.seconds[2 * i, 0]))
                 continue
             pair.reason = LOST
             if self._there.point.can_rest and (codes == Status.NO_RETURN).any():
-                self._rest(pair, end[codes == Status.NO_RETURN])
+                self._rest(pair, own[codes == Status.NO_RETURN])
 
     # ---- bisection -----------------------------------------------------------------------------
 
@@ -240,16 +239,7 @@ class Tracking:
         period = int(np.argmax(np.array(lags) <= near)) + 1
         if self._there.point.can_rest and self._rest(pair, path[-1:]):
             return
-        point = self._there.point
-        orbit = polish(
-            point.packed[None],
-            np.array([point.frequency]),
-            path[-1:],
-            np.array([period]),
-            geometry=self._geometry,
-            system=point.integrates,
-            tolerance=self._there.settings.residual,
-        )[0]
+        (orbit,) = self._there.polished(path[-1:], np.array([period]))
         if orbit is None or n_unstable(orbit) != 1:
             return
         if self._geometry.distance(orbit.points, path[-1]).min() <= near:
@@ -321,3 +311,86 @@ def nearest_pairs(
     chosen = np.random.default_rng(seed).permutation(closer)[:n]
     starts = [np.stack([first[nearest[k]], second[k]]) for k in chosen]
     return [Pair(start, start) for start in starts]
+
+
+def orbits_on(
+    paths: Sequence[np.ndarray], there: Destinations, between: tuple[int, int], max_period: int
+) -> list[Orbit]:
+    """Return the saddle orbits on the boundary that Newton's method finds from points of paths along it, and that the
+    paths come near.
+
+    Parameters
+    ----------
+    paths
+        Section points of paths on the boundary, shape (n, state) each.
+    there
+        Attractors of the parameter point.
+    between
+        Ids of the two attractors.
+    max_period
+        Longest period [drive periods or returns].
+    """
+    point = there.point
+    if not paths or not max_period or (point.can_rest and not point.is_flow):
+        return []
+    starts = [_starts(paths, period, there) for period in range(1, max_period + 1)]
+    periods = np.repeat(np.arange(1, max_period + 1), [len(own) for own in starts])
+    found = search_orbits(
+        np.concatenate(starts), periods, point.frequency, point.packed, point.integrates, rounds=ROUNDS
+    )
+    polished = there.polished(
+        np.array([one.points[0] for one in found]).reshape(len(found), point.n_states),
+        np.array([one.period for one in found], np.int64),
+    )
+    every = np.concatenate(paths)
+    near = [
+        one
+        for one in polished
+        if one is not None
+        and n_unstable(one) == 1
+        and nearest_distances(one.points, every, there.geometry).min() <= RECURRENCE
+    ]
+    return [one for one in distinct(near, there.geometry) if is_on_boundary(one, there, between)]
+
+
+def _starts(paths: Sequence[np.ndarray], period: int, there: Destinations) -> np.ndarray:
+    """Return points of the paths that nearly recur after a period, and states beside others."""
+    lags = np.concatenate([there.geometry.distance(path[period:], path[:-period]) for path in paths])
+    recurring = np.concatenate([path[:-period] for path in paths])
+    closest = recurring[np.argsort(lags, kind="stable")[:MOST_RECURRENCES]]
+    every, rng = np.concatenate(paths), np.random.default_rng(0)
+    drawn = every[rng.integers(len(every), size=N_STARTS)]
+    moved = drawn + BESIDE * np.asarray(there.geometry.scales) * rng.standard_normal(drawn.shape)
+    return np.concatenate([closest, moved])
+
+
+def n_unstable(orbit: Orbit) -> int:
+    """Return how many multipliers of an orbit lie outside the unit circle, by more than their error."""
+    return int((np.abs(orbit.multipliers) > 1.0 + orbit.multiplier_error).sum())
+
+
+def is_on_boundary(orbit: Orbit, there: Destinations, between: tuple[int, int]) -> bool:
+    """Return whether states of both basins lie arbitrarily close to a saddle orbit, along its unstable direction."""
+    values, vectors = np.linalg.eig(orbit.derivative)
+    direction = vectors[:, int(np.abs(values).argmax())].real
+    labels = _beside(orbit.points[0], direction, there)
+    return set(between) <= set(labels[:, :NEAREST].ravel().tolist())
+
+
+def separates(rest: Equilibrium, there: Destinations, between: tuple[int, int]) -> bool:
+    """Return whether an equilibrium has one unstable direction, and leaving along it leads to one of two attractors on
+    one side, and to the other on the other side.
+    """
+    if (rest.eigenvalues.real > rest.eigenvalue_error).sum() != 1:
+        return False
+    values, vectors = np.linalg.eig(rest.jacobian)
+    direction = vectors[:, int(values.real.argmax())].real * np.asarray(there.geometry.scales)
+    sides = [set(own.tolist()) - {UNDECIDED} for own in _beside(rest.state, direction, there)]
+    return sorted(map(sorted, sides)) == [[number] for number in sorted(between)]
+
+
+def _beside(state: np.ndarray, direction: np.ndarray, there: Destinations) -> np.ndarray:
+    """Return the labels of states beside another along a direction, shape (side, shift)."""
+    direction = direction / np.abs(direction / np.asarray(there.geometry.scales)).max()
+    shifts = np.concatenate([SHIFTS, -SHIFTS])
+    return np.asarray(there.follow(state + shifts[:, None] * direction).label.reshape(2, -1))

@@ -16,13 +16,23 @@ and Wagemakers, Chaos 33, 073151, 2023), after Halekotte and Feudel (Sci. Rep. 1
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import xarray as xr
 
-from pipeline.analysis.attractors.destinations import UNDECIDED
+from magpend_core.models.model import Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.sampling import Drive, sample
+from magpend_core.status import Status
+from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
+from pipeline.analysis.outcomes import DIVERGED
+from pipeline.analysis.together import run_together
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
+from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.products.reporting import report
 
 Norm = Literal["euclidean", "largest"]
 
@@ -57,20 +67,16 @@ BESIDE = (-5.0, -0.3)
 """Decimal logarithms of the least and largest relative distance from the best ray at which shocks are tried."""
 
 
+MOST_POINTS = 8
+"""Most section points of a set that does not close from which shocks start."""
+
+
 @dataclass(frozen=True)
 class Trials:
-    """Shocks whose ends are wanted.
+    """Shocks whose ends are wanted."""
 
-    Attributes
-    ----------
-    base : ndarray of int64, (n,)
-        Number of the base state.
-    shock : ndarray, (n, dim)
-        Scaled jump of each of the shocked states.
-    """
-
-    base: np.ndarray
-    shock: np.ndarray
+    base: np.ndarray  # int64, (n,): number of the base state
+    shock: np.ndarray  # (n, dim): scaled jump of each of the shocked states
 
 
 Search = Generator[Trials, np.ndarray, "Found"]
@@ -79,30 +85,14 @@ Search = Generator[Trials, np.ndarray, "Found"]
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a search.
+    """Settings of a search."""
 
-    Attributes
-    ----------
-    largest : float
-        Largest scaled size of a shock.
-    directions : int
-        Number of directions of a shell, if more than one state is shocked.
-    norm : str
-        ``"euclidean"`` or ``"largest"``, of the scaled jumps.
-    precision : float
-        Relative length to which the last ray is divided.
-    confirmations : int
-        Random smaller shocks that are tried in a round of confirmation.
-    seed : int
-        Seed of directions and random shocks.
-    """
-
-    largest: float
-    directions: int
-    norm: Norm
-    precision: float
-    confirmations: int
-    seed: int
+    largest: float  # largest scaled size of a shock
+    directions: int  # number of directions of a shell, if more than one state is shocked
+    norm: Norm  # ``"euclidean"`` or ``"largest"``, of the scaled jumps
+    precision: float  # relative length to which the last ray is divided
+    confirmations: int  # random smaller shocks that are tried in a round of confirmation
+    seed: int  # seed of directions and random shocks
 
     def size(self, shocks: np.ndarray) -> np.ndarray:
         """Return the scaled sizes of shocks (..., dim)."""
@@ -126,35 +116,18 @@ class Settings:
 
 @dataclass(frozen=True)
 class Found:
-    """The smallest shock that leads away from an attractor.
+    """The smallest shock that leads away from an attractor."""
 
-    Attributes
-    ----------
-    low, high : float
-        Scaled sizes. Every shock smaller than `low` that was tried stayed. The shock of size `high` leads away;
-        infinite if none was found. The ends of some shocks between them are not known.
-    shock : ndarray, (dim,)
-        The shock of size `high`; NaN if none was found.
-    base : int
-        Number of its base state, -1 if none was found.
-    leads_to : int
-        Label of the end, `UNDECIDED` if none was found.
-    safe : float
-        Size of the largest shell below `low` of which all shocks stayed; 0 if there is none.
-    n_below : int
-        Number of shocks smaller than `low` that were tried; all of them stayed.
-    n_undecided : int
-        Number of shocks smaller than `high` whose end is not known.
-    """
-
+    # scaled sizes. Every shock smaller than `low` that was tried stayed. The shock of size `high` leads away;
+    # infinite if none was found. The ends of some shocks between them are not known.
     low: float
     high: float
-    shock: np.ndarray
-    base: int
-    leads_to: int
-    safe: float
-    n_below: int
-    n_undecided: int
+    shock: np.ndarray  # (dim,): the shock of size `high`; NaN if none was found
+    base: int  # number of its base state, -1 if none was found
+    leads_to: int  # label of the end, `UNDECIDED` if none was found
+    safe: float  # size of the largest shell below `low` of which all shocks stayed; 0 if there is none
+    n_below: int  # number of shocks smaller than `low` that were tried; all of them stayed
+    n_undecided: int  # number of shocks smaller than `high` whose end is not known
 
 
 @dataclass
@@ -399,3 +372,151 @@ class ShockSearch:
         n_below = int(((size <= low) & (code == 0)).sum())
         n_unknown = int(((size < high) & (code == -1)).sum())
         return Found(low, high, shock, base, label, safe, n_below, n_unknown)
+
+
+@dataclass(frozen=True)
+class Bases:
+    """States on an attractor from which shocks start."""
+
+    states: np.ndarray  # (n, state): neighbours in time next to each other
+    # (n,): time since the section before each state, as a share of the drive period, or of the period of an orbit of
+    # a flow
+    phase: np.ndarray
+    # bool, (n,): whether each state lies on the section, so that its grid of initial states applies
+    at_section: np.ndarray
+
+    @property
+    def sections(self) -> Bases:
+        """The states that lie on the section."""
+        return Bases(self.states[self.at_section], self.phase[self.at_section], self.at_section[self.at_section])
+
+
+def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases: int) -> Bases:
+    """Sample the states on an attractor at equally spaced phases.
+
+    Parameters
+    ----------
+    one
+        Attractor: variables of `match` without parameter dims and `attractor`.
+    parameters, frequency
+        Parameters of the point, and drive frequency [Hz].
+    n_phases
+        Number of phases in a drive period, or in the period of an orbit of a flow.
+    """
+    stored = one["attractor_points"].transpose("point", "state").values
+    points = stored[np.isfinite(stored).all(axis=-1)]
+    kind = int(one["kind"])
+    if kind == EQUILIBRIUM:
+        return Bases(points[:1], np.zeros(1), np.ones(1, bool))
+    if parameters.model.autonomous:
+        if kind == PERIODIC_ORBIT:
+            period = float(one["period_s"])
+            return _sampled(of_flow(parameters), points[:1], period, n_phases)
+        points = points[:MOST_POINTS]
+        return Bases(points, np.zeros(len(points)), np.ones(len(points), bool))
+    n = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else MOST_POINTS
+    return _sampled(parameters, points[:n], 1.0 / frequency, n_phases)
+
+
+def _sampled(parameters: Parameters, points: np.ndarray, period: float, n_phases: int) -> Bases:
+    """Integrate from section points, and return the states at equally spaced phases of the next period."""
+    phase = np.arange(n_phases) / n_phases
+    n = len(points)
+    states = points[:, None]
+    if n_phases > 1:
+        found = sample(
+            parameters.model.system,
+            np.tile(parameters.pack(), (n, 1)),
+            points,
+            [phase * period],
+            piece=np.zeros(n, np.int64),
+            drives=[Drive(np.array([period]))],
+            rtol=PORTRAIT_RTOL,
+            atol=PORTRAIT_RTOL,
+        )
+        states = found.states
+    at_section = np.tile(phase == 0.0, n)
+    return Bases(states.reshape(-1, points.shape[1]), np.tile(phase, n), at_section)
+
+
+class Shocked:
+    """Shocked trajectories at a parameter point: brings them to the next section, and tells where they end."""
+
+    def __init__(self, destinations: Destinations) -> None:
+        self._destinations, self._point = destinations, destinations.point
+
+    def labels(self, states: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        """Return the label of the attractor on which each trajectory ends; see `Destinations.follow`.
+
+        Parameters
+        ----------
+        states
+            Shocked states, shape (n, state).
+        phase
+            Share of the drive period at which each shock happens, shape (n,).
+        """
+        label = np.full(len(states), UNDECIDED, np.int64)
+        states, status = self._to_section(states, phase)
+        label[status == Status.DIVERGED] = DIVERGED
+        good = np.flatnonzero(status == Status.BOUNDED)
+        label[good] = self._destinations.follow(states[good]).label
+        return label
+
+    def _to_section(self, states: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Integrate trajectories that start within a drive period to its end; return their states and status."""
+        states, status = states.copy(), np.full(len(states), int(Status.BOUNDED), np.int64)
+        rows = np.flatnonzero(phase > 0.0) if not self._point.can_rest else np.zeros(0, np.int64)
+        if not len(rows):
+            return states, status
+        phases, piece = np.unique(phase[rows], return_inverse=True)
+        period, settings = 1.0 / self._point.frequency, self._destinations.settings
+        found = sample(
+            self._point.integrates,
+            np.tile(self._point.packed, (len(rows), 1)),
+            states[rows],
+            [np.array([period * (1.0 - p)]) for p in phases],
+            piece=piece,
+            drives=[Drive(np.array([period]), start_s=float(p) * period) for p in phases],
+            rtol=settings.rtol,
+            atol=settings.atol,
+        )
+        states[rows], status[rows] = found.states[:, 0], found.status
+        return states, status
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A search for shocks, with the base states and the states that are shocked."""
+
+    search: Search  # see `shocks.ShockSearch.run`
+    bases: Bases
+    which: np.ndarray  # numbers of the shocked states
+
+
+def search_together(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, Found]:
+    """Run searches for shocks in step, so that their trajectories fill the engine's lanes together.
+
+    Returns
+    -------
+    dict
+        Result of each search.
+    """
+    n_followed = 0
+
+    def answer(trials: dict[str, Trials], results: Mapping[str, Found]) -> dict[str, np.ndarray]:
+        nonlocal n_followed
+        report(what, n_followed, 0)
+        states, phase = zip(*(_states(trial, asked[key], scales) for key, trial in trials.items()), strict=True)
+        found = shocked.labels(np.concatenate(states), np.concatenate(phase))
+        n_followed += len(found)
+        ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
+        return dict(zip(trials, np.split(found, ends), strict=True))
+
+    return run_together({key: one.search for key, one in asked.items()}, answer)
+
+
+def _states(trials: Trials, asked: Asked, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shocked states and their phases."""
+    states = asked.bases.states[trials.base].copy()
+    states[:, asked.which] += trials.shock * scales[asked.which]
+    return states, asked.bases.phase[trials.base]

@@ -10,9 +10,9 @@ import xarray as xr
 
 from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, aligned, counted, number, unit_of
-from pipeline.layout.moving import at_section
+from pipeline.layout.cells import at_section
 from pipeline.layout.vocabulary import drift_attributes, model_attribute, model_of, split_dims
 from pipeline.products.product import Table
 from pipeline.products.tipping import DelayOptions
@@ -65,7 +65,7 @@ def left_at(lag: np.ndarray, distance: float) -> np.ndarray:
     return np.where(leaves.any(axis=-1), leaves.argmax(axis=-1), -1)
 
 
-def needs_sections(run: Run, options: DelayOptions) -> None:
+def needs_sections(run: OpenRun, options: DelayOptions) -> None:
     """Raise ValueError unless the parameter moves and enough sections are kept."""
     spec = run.spec
     name = moving_parameter(spec.ramps, options.moving)
@@ -95,7 +95,7 @@ def moving_parameter(ramps: Sequence[Ramp], wanted: str) -> str:
     return wanted or names[0]
 
 
-def delay(run: Run, options: DelayOptions) -> xr.Dataset:
+def delay(run: OpenRun, options: DelayOptions) -> xr.Dataset:
     """Find for each cell the value of the moving parameter at which it leaves an orbit of a given period."""
     cube, model = run.cube(), model_of(run.cube())
     name = moving_parameter(run.spec.ramps, options.moving)

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core import Status, run_branches
+from magpend_core import Status
 from magpend_core.models.drift.ramps import motions_of
 from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
+from pipeline.motion.steady import Inputs, Steady
 from pipeline.products.tipping import TippingOptions
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 
@@ -28,16 +29,9 @@ NONE = -1
 
 @dataclass(frozen=True)
 class Final:
-    """The constant parameters at which trajectories go on after the drift.
+    """The constant parameters at which trajectories go on after the drift."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        Of the model whose parameters do not move.
-    frequency_hz : float
-    """
-
-    parameters: Parameters
+    parameters: Parameters  # of the model whose parameters do not move
     frequency_hz: float
 
     @property
@@ -81,33 +75,18 @@ def ends_s(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarr
 
 @dataclass(frozen=True)
 class Group:
-    """Cells that go on at the same final parameters, with what became of them.
-
-    Attributes
-    ----------
-    final : Final
-    cells : ndarray of int
-        Their numbers.
-    ids : Dataset
-        Result of `identify`; its cells are those that were integrated on.
-    integrated : ndarray of int
-        Their numbers.
-    settled : ndarray, (len(integrated), n_states)
-        Their states after the integration.
-    outcome : ndarray of int, (len(cells),)
-        Attractors' ids in `ids`, `DIVERGED`, or `NONE`.
-    """
+    """Cells that go on at the same final parameters, with what became of them."""
 
     final: Final
-    cells: np.ndarray
-    ids: xr.Dataset | None
-    integrated: np.ndarray
-    settled: np.ndarray
-    outcome: np.ndarray
+    cells: np.ndarray  # their numbers
+    ids: xr.Dataset | None  # result of `identify`; its cells are those that were integrated on
+    integrated: np.ndarray  # their numbers
+    settled: np.ndarray  # (len(integrated), n_states): their states after the integration
+    outcome: np.ndarray  # int, (len(cells),): attractors' ids in `ids`, `DIVERGED`, or `NONE`
 
 
 def endings(
-    run: Run, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
+    run: OpenRun, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
 ) -> Iterator[Group]:
     """Integrate cells on at their final parameters, and find the attractors on which they end.
 
@@ -139,33 +118,21 @@ def endings(
         yield Group(final, cells, ids, going, settled, outcome)
 
 
-def _going_on(run: Run, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
+def _going_on(run: OpenRun, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
     """Return a cube of trajectories that go on from given states at constant parameters, as of a sweep."""
-    integration, model = run.spec.integration, final.parameters.model
-    n = len(states)
-    found = run_branches(
-        np.tile(final.parameters.pack(), (n, 1, 1)),
-        np.full((n, 1), final.frequency_hz),
-        states,
-        n_transient=options.settle,
-        n_keep=options.keep,
-        rtol=integration.rtol,
-        atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period,
-        closure_tolerance=integration.closure_tolerance,
-        max_orbit_period=integration.max_orbit_period,
-        system=model.system,
-        method=integration.method,
-    )
+    model, n = final.parameters.model, len(states)
+    length = {"n_transient": options.settle, "n_keep": options.keep}
+    motion = Steady(model, run.spec.integration.model_copy(update={**length, "stop_when_closed": False}))
+    inputs = Inputs(np.tile(final.parameters.pack(), (n, 1, 1)), np.full((n, 1), final.frequency_hz), states)
+    found, _ = motion.integrate(inputs, None)
     names = ("status", "orbit_period", "n_periods", "n_steps", "n_rejected", "step_size")
     data: dict[str, Any] = {name: ((START,), getattr(found, name)[:, 0]) for name in names}
     data["section"] = ((START, "period_index", "state"), found.section[:, 0])
     if model.angles:
         data["turns"] = ((START, model.angle_dim), found.turns[:, 0])
     attrs = {
-        **integration.model_dump(),
-        "n_transient": options.settle,
-        "n_keep": options.keep,
+        **run.spec.integration.model_dump(),
+        **length,
         "kind": "sweep",
         "model": model_attribute(model),
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in final.parameters.items()),

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.basins import check_starts
+from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import Run
+from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, place
 from pipeline.analysis.tabular import Row, aligned, with_interval
-from pipeline.analysis.tipping.table import outcome_word
+from pipeline.analysis.tipping.analysis import outcome_word
 from pipeline.layout.vocabulary import axis_name
 from pipeline.products.product import Table
 from pipeline.products.tipping import OverlapOptions
@@ -51,7 +51,7 @@ def overlap_counts(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, n
     return first, last, counts
 
 
-def needs_basins(run: Run, options: OverlapOptions) -> None:
+def needs_basins(run: OpenRun, options: OverlapOptions) -> None:
     """Raise ValueError unless the run has basins at both values of the parameter."""
     cube = run.cube()
     check_starts(cube)
@@ -62,7 +62,7 @@ def needs_basins(run: Run, options: OverlapOptions) -> None:
         place(cube[axis], value)
 
 
-def overlaps(run: Run, options: OverlapOptions) -> xr.Dataset:
+def overlaps(run: OpenRun, options: OverlapOptions) -> xr.Dataset:
     """Compute the probability of tipping from each attractor before to each attractor after a jump of a parameter.
 
     The definition is that of Kaszas, Feudel and Tel (Sci. Rep. 9, 8654, 2019): the overlap of two basins over the

@@ -1,29 +1,34 @@
 """Export a run's interactive page for a browser without a server, as one file or as a folder.
 
-A copy computes nothing: its orbits were integrated when it was made, and it lists its gaps.
+A copy computes nothing: its orbits were integrated when it was made, and it lists its gaps. The page of a folder
+loads its data when needed.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.explorer.copies.columns import Fitted, fit
-from pipeline.explorer.copies.content import Column, Copied, add_planes, column, gather
-from pipeline.explorer.copies.html import inline_html
+from pipeline.explorer.copies.content import Column, Copied, Fitted, add_planes, column, fit, gather, place_of
 from pipeline.explorer.copies.orbits import Room, add_orbits, choose
-from pipeline.explorer.copies.packing import packed, packed_json
+from pipeline.explorer.data.arrays import pack_zipped, zip_json
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.layout.writing import write_atomically
+from pipeline.explorer.data.verticals import vertical
+from pipeline.explorer.html import folder_html, inline_html, static_text
+from pipeline.layout.writing import sync_folder, temporary_beside, write_atomically, writing
 from pipeline.products.reporting import track
+from pipeline.store.consolidate import Layer, write_cube
 from pipeline.store.errors import RefusedError
-from pipeline.store.local import refuse_place, unwritable
-from pipeline.store.run import Run
+from pipeline.store.files import CUBE, entry_of
+from pipeline.store.local import refuse_place, remove_tree, unwritable
+from pipeline.store.run import RunDirectory
 
-MOST_BYTES = 20_000_000
+MOST_PAGE_BYTES = 20_000_000
 """Size of a copy in one file: beyond some 20 to 30 MB, browsers have trouble with a page."""
 
 MOST_ORBITS = 2000
@@ -37,30 +42,22 @@ RESERVE = 10_000
 
 @dataclass(frozen=True)
 class Exported:
-    """Result of an export: its path, its size, its number of orbits, and notes for the user.
-
-    Attributes
-    ----------
-    size : int
-        Size of everything written [bytes].
-    sentences : list of str
-        Notes that the export shows to its readers.
-    """
+    """Result of an export: its path, its size, its number of orbits, and notes for the user."""
 
     path: Path
-    size: int
+    size: int  # size of everything written [bytes]
     orbits: int
-    sentences: list[str] = field(default_factory=list)
+    sentences: list[str] = field(default_factory=list)  # notes that the export shows to its readers
 
 
 def export_page(
-    source: Run,
+    source: RunDirectory,
     out: Path,
     *,
     force: bool = False,
     quantities: Sequence[str] = (),
     most_orbits: int = MOST_ORBITS,
-    most_bytes: int = MOST_BYTES,
+    most_bytes: int = MOST_PAGE_BYTES,
 ) -> Exported:
     """Write the interactive page of a run as one HTML file.
 
@@ -92,7 +89,7 @@ def export_page(
     check_place(out, force)
     copied = gather(ExploredRun.of(source), quantities)
     columns, layers = read_columns(copied)
-    copied.objects["cells"] = packed(layers)
+    copied.objects["cells"] = pack_zipped(layers)
     add_planes(copied, PLANES_SHARE * most_bytes * 3 / 4)
     room = Room(most_orbits, ORBITS_SHARE * most_bytes * 3 / 4, brief=True)
     orbits = add_all_orbits(copied, columns, layers, room)
@@ -127,20 +124,18 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
 
 
 def check_place(out: Path, force: bool) -> None:
-    """Raise RefusedError if a file exists already or cannot be written, before anything is computed.
-
-    Raises
-    ------
-    RefusedError
-        Saying why.
-    """
-    if not out.parent.is_dir():
-        raise RefusedError(f"{out.parent}: no such folder; make it first.")
-    refuse_place(out)
-    if problem := unwritable(out.parent):
-        raise RefusedError(f"{problem}; give another place.")
+    """Raise RefusedError if a file exists already or cannot be written, before anything is computed."""
     if out.is_dir():
         raise RefusedError(f"{out}: is a folder; give a file.")
+    refuse_place(out)
+    _check_new(out, force)
+
+
+def _check_new(out: Path, force: bool) -> None:
+    if not out.parent.is_dir():
+        raise RefusedError(f"{out.parent}: no such folder; make it first.")
+    if problem := unwritable(out.parent):
+        raise RefusedError(f"{problem}; give another place.")
     if (out.exists() or out.is_symlink()) and not force:
         raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
 
@@ -171,7 +166,7 @@ def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mappin
 def finished(copied: Copied) -> dict[str, bytes]:
     """Return all packed data of an export by name, with the description of the run."""
     about = {**copied.about, "notice": notice(copied)}
-    return {"view": packed_json({"view": copied.view, "about": about}), **copied.objects}
+    return {"view": zip_json({"view": copied.view, "about": about}), **copied.objects}
 
 
 def notice(copied: Copied) -> str:
@@ -182,3 +177,135 @@ def notice(copied: Copied) -> str:
         f"magpend {view['version']}. Nothing is computed here: live integration is off."
     )
     return " ".join([first, *copied.sentences])
+
+
+INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.txt"
+
+QUANTITY = "quantity_"
+"""What the names of quantities in the cube begin with."""
+
+MOST_FOLDER_BYTES = 500_000_000
+"""What orbits, and planes, may take of a folder each."""
+
+
+def export_folder(
+    source: RunDirectory,
+    out: Path,
+    *,
+    force: bool = False,
+    quantities: Sequence[str] = (),
+    most_orbits: int = MOST_ORBITS,
+) -> Exported:
+    """Write the interactive page of a run, and its data, as a folder that any static web host can serve.
+
+    In it are the page, the cube with its metadata in one file and its chunks cut by columns, and
+    ``objects.json`` with the sha256 of every object, whose own sha256 stands in the page.
+
+    Parameters
+    ----------
+    source
+        An opened run. What is not committed reads as pending in the new cube, too.
+    out
+        Folder to make.
+    force
+        Whether a folder that an export has made there makes way; nothing else does.
+    quantities
+        Those of the model that can be on the vertical axis, besides states and kept extremes.
+    most_orbits
+        Orbits that are integrated for it, one for each attractor at each parameter point.
+
+    Raises
+    ------
+    SpecError
+        If the model has no such quantity.
+    RefusedError
+        If something is at its place, or nothing can be written there.
+    DamagedError
+        If what is read of the run is not what was written.
+    """
+    check_folder(out, force)
+    temporary = temporary_beside(out)
+    try:
+        with writing(out):
+            temporary.mkdir()
+            exported = _write_folder(ExploredRun.of(source), temporary, quantities, most_orbits)
+        if out.exists():
+            before = temporary_beside(out)
+            out.rename(before)
+            temporary.rename(out)
+            remove_tree(before)
+        else:
+            temporary.rename(out)
+        sync_folder(out.parent)
+    except BaseException:
+        remove_tree(temporary)
+        raise
+    return Exported(out, exported.size, exported.orbits, exported.sentences)
+
+
+def check_folder(out: Path, force: bool) -> None:
+    """Raise RefusedError if a folder exists already or cannot be written, before anything is computed."""
+    refuse_place(out.parent)
+    _check_new(out, force)
+    own = {INDEX, LIST, DATA, LICENCES, CUBE}
+    if out.is_symlink() or (out.exists() and (not out.is_dir() or {p.name for p in out.iterdir()} - own)):
+        raise RefusedError(f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it.")
+
+
+def _write_folder(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbits: int) -> Exported:
+    copied = gather(run, quantities)
+    columns, codes = read_columns(copied)
+    add_planes(copied, MOST_FOLDER_BYTES)
+    orbits = add_all_orbits(copied, columns, codes, Room(most_orbits, MOST_FOLDER_BYTES, brief=False))
+    layers = _layers_of(copied, codes)
+    for name in columns:
+        if name in quantities:
+            layers[f"{QUANTITY}{name}"] = _quantity(run, name, columns[name])
+            copied.about["columns"][name] = {"variable": f"{QUANTITY}{name}", "own": [None]}
+        else:
+            variable, own = place_of(run, vertical(run, name))
+            copied.about["columns"][name] = {"variable": variable, "own": own}
+    along = next((a.name for a in run.axes if a.swept), None)
+    entries = write_cube(run, folder, along, layers)
+    (folder / DATA).mkdir()
+    for name, content in finished(copied).items():
+        key = f"{DATA}/{name}.bin"
+        (folder / key).write_bytes(content)
+        entries[key] = entry_of(content)
+    listed = json.dumps(entries, sort_keys=True, separators=(",", ":")).encode()
+    (folder / LIST).write_bytes(listed)
+    digest = hashlib.sha256(listed).hexdigest()
+    html = folder_html(run.info.title, f"magpend {copied.view['version']}", digest).encode()
+    (folder / INDEX).write_bytes(html)
+    # code of others is in the page's script
+    licences = static_text(LICENCES).encode()
+    (folder / LICENCES).write_bytes(licences)
+    size = sum(entry["size"] for entry in entries.values()) + len(listed) + len(html) + len(licences)
+    return Exported(folder, size, orbits, copied.sentences)
+
+
+def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
+    """Return a quantity of the model at the drawn section points, in the shape of the cube; NaN elsewhere."""
+    values = np.full((run.plan.n_cells, run.n_keep), np.nan)
+    values[np.arange(run.n_keep) < column.count[:, None]] = column.y
+    quantity = run.model.quantity(name)
+    attrs = {"long_name": f"{quantity.meaning}, at the sections that are drawn", "units": quantity.unit}
+    return Layer(values.reshape(*run.plan.shape, run.n_keep), attrs, ("period_index",))
+
+
+def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, Layer]:
+    """Return the colour codes of the cells in the shape of the result cube, with the meaning of each code."""
+    shape = copied.run.plan.shape
+    titles = {f"colour_{c['name']}": c for c in copied.view["colours"]}
+    return {
+        name: Layer(
+            values.reshape(shape),
+            {
+                "long_name": titles[name]["title"],
+                "flag_values": [c["id"] for c in titles[name]["categories"]],
+                "comment": "; ".join(f"{c['id']} {c['label']}" for c in titles[name]["categories"]),
+            },
+        )
+        for name, values in layers.items()
+        if name != "status"
+    }

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.explorer import RequestError
 from pipeline.explorer.copies.content import Copied
-from pipeline.explorer.copies.packing import packed
-from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import orbit
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.arrays import pack_zipped, unpack_arrays
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import orbit
 from pipeline.products.reporting import report
 
 NONE = np.uint32(0xFFFFFFFF)
@@ -34,55 +34,29 @@ SAMPLE = 6
 
 @dataclass(frozen=True)
 class Room:
-    """Limits of the exported orbits: their number, their bytes, and whether they are shortened.
-
-    Attributes
-    ----------
-    n_bytes : float
-        Before they are written as text.
-    brief : bool
-        Whether fewer digits and periods are kept, so that there are more of them.
-    """
+    """Limits of the exported orbits: their number, their bytes, and whether they are shortened."""
 
     orbits: int
-    n_bytes: float
-    brief: bool
+    n_bytes: float  # before they are written as text
+    brief: bool  # whether fewer digits and periods are kept, so that there are more of them
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Cells whose orbits are exported, and the exported orbit that is shown for each cell.
+    """Cells whose orbits are exported, and the exported orbit that is shown for each cell."""
 
-    Attributes
-    ----------
-    cells : ndarray of int64, (n,)
-        Cells whose orbits are integrated.
-    orbit : ndarray of uint32, (n_cells,)
-        Index into `cells`, or `NONE`.
-    how : ndarray of uint8, (n_cells,)
-    groups : int
-        Attractors at all parameter points; `cells` are fewer where there was no room.
-    """
-
-    cells: np.ndarray
-    orbit: np.ndarray
-    how: np.ndarray
-    groups: int
+    cells: np.ndarray  # int64 (n,); cells whose orbits are integrated
+    orbit: np.ndarray  # uint32 (n_cells,); index into `cells`, or `NONE`
+    how: np.ndarray  # uint8 (n_cells,)
+    groups: int  # attractors at all parameter points; `cells` are fewer where there was no room
 
 
 def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray, most: int) -> Chosen:
     """Choose the cells whose orbits are exported, and the exported orbit that is shown for each cell.
 
-    Parameters
-    ----------
-    run
-        The run.
-    layers
-        Codes by cell: ``colour_attractor``, or else ``colour_motion``; ``orbit_period`` and ``status``.
-    count
-        Number of each cell's points.
-    most
-        Orbits at most. Where there are more attractors, some values of the horizontal axis go without.
+    `layers` are codes by cell: ``colour_attractor``, or else ``colour_motion``; ``orbit_period`` and ``status``.
+    `count` is the number of each cell's points. Where there are more attractors than `most`, some values of the
+    horizontal axis go without.
     """
     labels = _labels(layers)
     point, axis = _parameter_points(run)
@@ -125,9 +99,7 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the exported orbit that is shown for each group of cells: its own, or the nearest one, if possible of the
-    same attractor.
-    """
+    """Return the orbit shown for each group of cells: its own, or the nearest, if possible of the same attractor."""
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
     number[taken], means[taken] = np.arange(len(taken)), same
@@ -141,18 +113,9 @@ def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int)
 
 
 def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndarray, room: Room) -> int:
-    """Integrate the chosen orbits, and add them to an export. Return their number.
+    """Integrate the orbits that `choosing` chooses, at most as many as it is told, and add them to an export.
 
-    Parameters
-    ----------
-    copied
-        Export to which the orbits are added.
-    choosing
-        Function that chooses at most a given number of orbits.
-    count
-        Number of each cell's points; an orbit starts from the last.
-    room
-        Limits on number and size of the orbits.
+    An orbit starts from the last of the cell's points, whose number is `count`. Return the number of orbits.
     """
     if obstacle := copied.run.spec.motion.obstacle:
         missing = f"This copy has no orbits: {obstacle}."
@@ -173,8 +136,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
             arrays, said[str(k)] = _orbit(copied.run, int(chosen.cells[k]), count, room)
             held |= {f"{k}.{name}": values for name, values in arrays.items()}
             report("integrating orbits", k + 1, n)
-        copied.objects[f"orbits-{number}"] = packed(held, said)
-    copied.objects["orbit-index"] = packed({"orbit": chosen.orbit, "how": chosen.how})
+        copied.objects[f"orbits-{number}"] = pack_zipped(held, said)
+    copied.objects["orbit-index"] = pack_zipped({"orbit": chosen.orbit, "how": chosen.how})
     missing = "" if n else "This copy was made without orbits; magpend explore integrates them."
     copied.about["orbits"] = {"blocks": blocks, "missing": missing}
     copied.sentences += [missing] if missing else []
@@ -191,7 +154,7 @@ def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -
     sizes = []
     for cell in some.tolist():
         arrays, attrs = _orbit(copied.run, cell, count, room)
-        sizes.append(len(packed(arrays, attrs)))
+        sizes.append(len(pack_zipped(arrays, attrs)))
     return max(1.0, float(np.mean(sizes))) if sizes else 1.0
 
 
@@ -199,7 +162,7 @@ def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[
     """Integrate the orbit from the last section point of a cell, and round it to the precision of the export."""
     try:
         arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
-    except (ExplorerError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
+    except (RequestError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
         return {}, {"cell": cell, "failed": str(error)}
     del arrays["section"]  # the columns have it, of every cell
     if room.brief:

@@ -5,11 +5,13 @@ what follows begins at a multiple of 8; then come the arrays in C order, each pa
 
     {"attrs": {...}, "arrays": {"y": {"dtype": "float64", "shape": [3, 2], "offset": 0}, ...}}
 
-Offsets count from the end of the header. `page/src/arrays.js` is the other end.
+Offsets count from the end of the header. `page/src/arrays.js` is the other end, and `page/src/export-data.js` that
+of the zipped objects of an exported page.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -27,19 +29,9 @@ def _padding(length: int) -> int:
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Pack arrays and attributes into one byte string.
+    """Pack arrays, of a type in `DTYPES`, and attributes that JSON can store into one byte string.
 
-    Parameters
-    ----------
-    arrays
-        Arrays by name, of a type in `DTYPES`.
-    attrs
-        Values that JSON can store. NaN and infinity are not allowed; None stands for a missing value.
-
-    Raises
-    ------
-    ValueError
-        If an array's type is none of `DTYPES`, or an attribute has no place in JSON.
+    NaN and infinity are no attributes; None stands for a missing value. Raise ValueError for what cannot be packed.
     """
     places: dict[str, Any] = {}
     parts: list[Any] = []
@@ -68,3 +60,31 @@ def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         count = int(np.prod(shape, dtype=np.int64))
         arrays[name] = np.frombuffer(data, dtype, count, begin + place["offset"]).reshape(shape)
     return arrays, header["attrs"]
+
+
+GZIP_LEVEL = 6
+"""Of gzip: beyond it, data of this kind shrink by less than a percent."""
+
+
+def pack_zipped(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
+    """Pack arrays and attributes as `pack_arrays` does, and compress them by gzip."""
+    apart: dict[str, dict[str, Any]] = {}
+    stored = {}
+    for name, values in arrays.items():
+        stored[name] = values
+        if values.dtype.itemsize > 1:
+            apart[name] = {"dtype": values.dtype.name, "shape": list(values.shape)}
+            plain = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+            planes = plain.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize)
+            stored[name] = np.ascontiguousarray(planes.T)
+    return _zipped(pack_arrays(stored, {**(attrs or {}), "apart": apart}))
+
+
+def zip_json(value: Any) -> bytes:
+    """Pack a JSON value into gzip-compressed bytes; ValueError if it has NaN or infinity."""
+    return _zipped(json.dumps(value, allow_nan=False, separators=(",", ":")).encode())
+
+
+def _zipped(content: bytes) -> bytes:
+    # no time stamp, so that equal content gives equal bytes
+    return gzip.compress(content, GZIP_LEVEL, mtime=0)

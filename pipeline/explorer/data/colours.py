@@ -13,7 +13,7 @@ from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import N_IDS
 from pipeline.layout.vocabulary import BRANCH, split_dims
 from pipeline.plots import palette, style
-from pipeline.plots.motions import motion_codes, motions_of
+from pipeline.plots.palette import motion_codes, motions_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,33 +50,26 @@ class Category:
     label: str
     colour: str
 
+    def describe(self) -> dict[str, Any]:
+        """Return the code as a dictionary for the page."""
+        return {"id": self.number, "label": self.label, "colour": self.colour}
+
 
 @dataclass(frozen=True)
 class Scheme:
-    """A colour scheme for cells: a function that computes their codes, and the labels and colours of the codes.
-
-    Attributes
-    ----------
-    codes : callable
-        ``codes(block)``: code of each cell of a loaded part of the cube, an array that broadcasts to those
-        of ``status``; negative for none.
-    needs : tuple of str
-        Variables of the cube that `codes` reads besides ``status``.
-    """
+    """A colour scheme for cells: a function that computes their codes, and the labels and colours of the codes."""
 
     name: str
     title: str
     categories: tuple[Category, ...]
+    # ``codes(block)``: code of each cell of a loaded part of the cube, an array that broadcasts to those of
+    # ``status``; negative for none
     codes: Callable[[xr.Dataset], xr.DataArray]
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # variables of the cube that `codes` reads besides ``status``
 
     def describe(self) -> dict[str, Any]:
         """Return the colour scheme as a dictionary for the page."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "categories": [{"id": c.number, "label": c.label, "colour": c.colour} for c in self.categories],
-        }
+        return {"name": self.name, "title": self.title, "categories": [c.describe() for c in self.categories]}
 
 
 def schemes(run: ExploredRun) -> list[Scheme]:
@@ -147,8 +140,7 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Return a colour code for each cell: its attractor, or a grey category such as an unstable set. Return also the
-    grey categories that occur.
+    """Return a code for each cell (its attractor, or a grey such as an unstable set), and the greys that occur.
 
     Cells that diverged, failed or are pending have none.
     """

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import NONE, Scheme, schemes
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.verticals import Vertical, vertical
 from pipeline.layout.vocabulary import PENDING
 from pipeline.plots.points import DRAWN, selections
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 MOST_POINTS = 20_000_000
 """Points of one diagram; 8 bytes each go to the page."""
@@ -28,56 +29,23 @@ MOST_POINTS = 20_000_000
 
 @dataclass(frozen=True)
 class Points:
-    """Points of a diagram, cell by cell along the horizontal axis.
+    """Points of a diagram, cell by cell along the horizontal axis."""
 
-    Attributes
-    ----------
-    x : ndarray, (n_x,)
-        Values of the horizontal axis, ascending.
-    cell : ndarray of uint32, (m,)
-        Flat numbers of the cells, sorted by `at`.
-    at : ndarray of uint32, (m,)
-        Place of each cell in `x`.
-    first : ndarray of uint32, (m + 1,)
-        A cell's points are ``y[first[i] : first[i + 1]]``.
-    y : ndarray, (n,)
-    status : ndarray of int8, (m,)
-    codes : dict
-        Colour codes by scheme, uint16 (m,).
-    kept : int
-        Number of section points shown per cell, the last ones.
-    """
-
-    x: np.ndarray
-    cell: np.ndarray
-    at: np.ndarray
-    first: np.ndarray
-    y: np.ndarray
-    status: np.ndarray
-    codes: Mapping[str, np.ndarray]
-    kept: int
+    x: np.ndarray  # (n_x,); values of the horizontal axis, ascending
+    cell: np.ndarray  # uint32 (m,); flat numbers of the cells, sorted by `at`
+    at: np.ndarray  # uint32 (m,); place of each cell in `x`
+    first: np.ndarray  # uint32 (m + 1,); a cell's points are ``y[first[i] : first[i + 1]]``
+    y: np.ndarray  # (n,)
+    status: np.ndarray  # int8 (m,)
+    codes: Mapping[str, np.ndarray]  # colour codes by scheme, uint16 (m,)
+    kept: int  # number of section points shown per cell, the last ones
 
 
-def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
-    """Return the points of a bifurcation diagram as arrays and attributes, packed for the page.
+def diagram(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> bytes:
+    """Return the points of a bifurcation diagram, packed for the page.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    x
-        Name of a swept axis.
-    y
-        Vertical axis: a state, or a kept extreme such as ``NAME.max``.
-    at
-        Index on each other swept axis.
-
-    Raises
-    ------
-    ExplorerError
-        If an axis or an index is not there, or the cells are too many.
-    DamagedError
-        If a chunk is not what was written.
+    `x` is a swept axis, `y` a state, a quantity of the model or a kept extreme such as ``NAME.max``, and `at` the index
+    on each other swept axis. Raise RequestError if one is not there, or the cells are too many.
     """
     explored = ExploredRun.of(run)
     upwards = vertical(explored, y)
@@ -109,7 +77,7 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
     sizes = tuple(ds.sizes[d] for d in run.plan.dims)
     n_cells = int(np.prod(sizes, dtype=np.int64))
     if n_cells > MOST_POINTS:
-        raise ExplorerError(
+        raise RequestError(
             f"a diagram shows {MOST_POINTS:,} cells at most, and there are {n_cells:,} here; "
             "look at the plane of initial states, or at a zoom of the run."
         )

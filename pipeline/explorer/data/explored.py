@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from pipeline.explorer import RequestError
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
-from pipeline.motion.inputs import Inputs
+from pipeline.motion.steady import Inputs
 from pipeline.runs.derive import stored, stored_each
 from pipeline.specification.problems import unknown_name
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,92 +32,63 @@ MOST_LARGE = 2
 """Diagrams that are kept in memory, of up to some 200 MB each."""
 
 
-class ExplorerError(ValueError):
-    """Raised if the page requests something that does not exist; the page shows the message."""
-
-
 @dataclass(frozen=True)
 class Axis:
-    """Axis of a run that a diagram can have as its horizontal axis.
+    """Axis of a run that a diagram can have as its horizontal axis."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the cube's dim; in a run that sweeps nothing, name of the one value that it has.
-    parameter : str
-        Its name in a specification.
-    values : ndarray
-        In the order of the cube.
-    swept : bool
-        Whether it is a dim of the cube.
-    """
-
-    name: str
-    parameter: str
-    values: np.ndarray
-    swept: bool = True
+    name: str  # name of the cube's dim; in a run that sweeps nothing, name of the one value that it has
+    parameter: str  # its name in a specification
+    values: np.ndarray  # in the order of the cube
+    swept: bool = True  # whether it is a dim of the cube
 
 
 @dataclass(frozen=True)
-class ExploredRun(Run):
+class ExploredRun(RunDirectory):
     """A run opened for the explorer. It reads its result cube and its stored analyses only once.
 
     Reading never computes: what is not in the cube or in ``derived/`` is not there.
-
-    Attributes
-    ----------
-    curves : Run or None
-        Run whose bifurcation curves are shown; None for those of the run itself.
     """
 
-    curves: Run | None = None
+    curves: RunDirectory | None = None  # run whose bifurcation curves are shown; None for those of the run itself
 
     _opened: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     _lock: Any = field(default_factory=threading.RLock, compare=False, repr=False)
 
     @classmethod
-    def of(cls, source: str | Path | Run) -> ExploredRun:
+    def of(cls, source: str | Path | RunDirectory) -> ExploredRun:
         """Open a run directory for the explorer, or convert a run that is open already."""
-        run = Run.open(source)
+        run = RunDirectory.open(source)
         if isinstance(run, cls):
             return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(Run)})
+        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)})
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Return the run's result cube as a lazy dataset; each chunk is verified when it is read."""
         if chunks is not None or check is not None:
             return super().cube(chunks, check=check)
-        with self._lock:
-            if "cube" not in self._opened:
-                opened = super().cube()
-                # once: each use of a coordinate would read it again
-                self._opened["cube"] = opened.assign_coords({n: c.load() for n, c in opened.coords.items()})
-            found: xr.Dataset = self._opened["cube"]
-            return found
+        return self.remembered("cube", self._loaded_cube)
+
+    def _loaded_cube(self) -> xr.Dataset:
+        opened = super().cube()
+        # each use of a coordinate would read it again
+        return opened.assign_coords({n: c.load() for n, c in opened.coords.items()})
 
     def kept(self, name: str) -> xr.Dataset | None:
         """Return the stored result of an analysis; None if it has not been computed."""
-        with self._lock:
-            key = f"derived {name}"
-            if key not in self._opened:
-                self._opened[key] = stored(self, name)
-            found: xr.Dataset | None = self._opened[key]
-            return found
+        return self.remembered(f"derived {name}", lambda: stored(self, name))
 
     def kept_each(self, name: str) -> list[xr.Dataset]:
         """Return all stored results of an analysis, such as one for each pair of attractors; see `stored_each`."""
         return self.remembered(f"each {name}", lambda: list(stored_each(self, name)))
 
     def bifurcation_curves(self) -> xr.Dataset | None:
-        """Return the stored bifurcation curves of this run, or of the other run named for them; None if there are
-        none.
-        """
+        """Return the stored bifurcation curves of this run, or of the run named for them; None if there are none."""
         return self.kept("curves") if self.curves is None else ExploredRun.of(self.curves).kept("curves")
 
     def refreshed(self) -> ExploredRun:
         """Return the run as it is now, with the cells and results that were added since it was opened."""
         if not self.complete:
-            return replace(ExploredRun.of(Run.open(self.info.files)), curves=self.curves)
+            return replace(ExploredRun.of(RunDirectory.open(self.info.files)), curves=self.curves)
         if self._derived_names() == self.remembered("derived names", self._derived_names):
             return self
         # the cells of a complete run stay as they are
@@ -164,9 +136,7 @@ class ExploredRun(Run):
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Axes that a diagram can have as its horizontal axis: the swept parameters or, if there are none, one fixed
-        parameter.
-        """
+        """Axes that a diagram can have: the swept parameters or, if there are none, one fixed parameter."""
         swept = tuple(Axis(a.dim, a.parameter, a.values) for a in parameter_axes(self.spec))
         if swept:
             return swept
@@ -176,11 +146,11 @@ class ExploredRun(Run):
         return (Axis(first, first, np.array([self.parameters[first]]), False),)
 
     def axis(self, name: str) -> Axis:
-        """Return an axis by name; raise ExplorerError with similar names if there is none."""
+        """Return an axis by name; raise RequestError with similar names if there is none."""
         for axis in self.axes:
             if axis.name == name:
                 return axis
-        raise ExplorerError(unknown_name("axis", name, [a.name for a in self.axes]))
+        raise RequestError(unknown_name("axis", name, [a.name for a in self.axes]))
 
     @property
     def start_dims(self) -> tuple[str, ...]:
@@ -193,52 +163,33 @@ class ExploredRun(Run):
         return int(self.plan.sizes["period_index"])
 
     def check_axes(self, at: Mapping[str, int]) -> None:
-        """Raise ExplorerError if the run has no axis of one of the given names."""
+        """Raise RequestError if the run has no axis of one of the given names."""
         known = [a.name for a in self.axes]
         for name in at:
             if name not in known:
-                raise ExplorerError(unknown_name("axis", name, known or ["none"]))
+                raise RequestError(unknown_name("axis", name, known or ["none"]))
 
     def place(self, at: Mapping[str, int], *, but: str = "") -> dict[str, int]:
-        """Check an index on every swept axis except `but`, and return these indices by axis name.
-
-        Parameters
-        ----------
-        at
-            Index by axis.
-        but
-            The axis that is left out.
-
-        Raises
-        ------
-        ExplorerError
-            If an axis is unknown or missing, or an index lies off it.
-        """
+        """Return the index on every swept axis except `but`; raise RequestError if one is unknown or missing."""
         wanted = {a.name: len(a.values) for a in self.axes if a.swept and a.name != but}
         shared = {a.name for a in self.axes if not a.swept or a.name == but}
         for name in at:
             if name not in wanted and name not in shared:
-                raise ExplorerError(unknown_name("axis", name, list(wanted) or ["none"]))
+                raise RequestError(unknown_name("axis", name, list(wanted) or ["none"]))
         found = {}
         for name, size in wanted.items():
             index = at.get(name, 0 if size == 1 else None)
             if index is None:
-                raise ExplorerError(f"at.{name} is missing: give an index from 0 to {size - 1}.")
+                raise RequestError(f"at.{name} is missing: give an index from 0 to {size - 1}.")
             if not 0 <= index < size:
-                raise ExplorerError(f"at.{name} = {index} is out of bounds: it must be 0 to {size - 1}.")
+                raise RequestError(f"at.{name} = {index} is out of bounds: it must be 0 to {size - 1}.")
             found[name] = int(index)
         return found
 
     def cell(self, number: int) -> dict[str, int]:
-        """Convert the flat number of a cell to its index on each dim of the result cube.
-
-        Raises
-        ------
-        ExplorerError
-            If there is no such cell.
-        """
+        """Convert the flat number of a cell to its index on each dim; raise RequestError if there is none."""
         if not 0 <= number < self.plan.n_cells:
-            raise ExplorerError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
+            raise RequestError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
         index = np.unravel_index(number, self.plan.shape)
         return {dim: int(i) for dim, i in zip(self.plan.dims, index, strict=True)}
 

@@ -1,4 +1,4 @@
-"""Read the results that are drawn with a diagram: curves over the axis, branches of orbits, and attractors.
+"""Read the results that the page draws with a diagram: curves, branches, attractors, critical shocks and edge states.
 
 All of it is read from the cube and from ``derived/``; what no analysis has found is not there.
 """
@@ -12,22 +12,32 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.bifurcations import KINDS as BIFURCATIONS
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.outcomes import share_interval
 from pipeline.analysis.ragged import dense, isel
-from pipeline.explorer.data.clicked_orbit import finite, shown
+from pipeline.analysis.resilience.analysis import end_of
+from pipeline.analysis.tabular import sets_of
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import finite, parts_of, share_bounds, shown
 from pipeline.explorer.data.verticals import vertical
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.period_names import periods_of
-from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, model_of
+from pipeline.explorer.data.view import can_have
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BRANCH,
+    FREQUENCY_DIM,
+    KINDS,
+    PERIODIC_ORBIT,
+    letter,
+    model_of,
+    periods_of,
+)
 from pipeline.plots import palette
 from pipeline.plots.branches import NAMES, SHORT, pieces
 from pipeline.plots.labels import state_measure
 from pipeline.plots.lyapunov import EXPONENT_COLOURS
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 SAME_VALUE = 1e-9
 """Largest relative difference between a value of an axis and that at which branches were followed."""
@@ -39,28 +49,11 @@ MOST_SECTION = 2000
 # ---------------------------------------------------------------- curves under a diagram
 
 
-def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
+def curves(run: RunDirectory, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the curves of Lyapunov exponents and basin fractions along the horizontal axis of a diagram.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    x
-        Name of the horizontal axis.
-    at
-        Index on each other swept axis.
-
-    Returns
-    -------
-    dict
-        ``curves``: each with a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x``
-        rising, and ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
-
-    Raises
-    ------
-    ExplorerError
-        If an axis or an index is not there.
+    Each of ``curves`` has a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x`` rising, and
+    ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
     """
     explored = ExploredRun.of(run)
     axis, place = explored.axis(x), explored.place(at, but=x)
@@ -73,9 +66,7 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Yield the curves of the Lyapunov exponents: the mean over initial conditions, and a band from minimum to
-    maximum.
-    """
+    """Yield the curves of the Lyapunov exponents: the mean over initial conditions, and the range as a band."""
     cube = run.cube()
     if "lyapunov" not in cube:
         return
@@ -148,28 +139,11 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
 # ---------------------------------------------------------------- branches over a diagram
 
 
-def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
+def branches(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
     """Return the branches of periodic orbits that are drawn over a diagram, and their bifurcations.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    x, y
-        Names of its axes; branches have section points, so there are none for an extreme.
-    at
-        Index on each other swept axis; branches that were followed at other values are left out.
-
-    Returns
-    -------
-    dict
-        ``branches`` with segments of one stability, cut where an angle wraps; ``points``; ``note``: why there
-        is nothing, if there is not.
-
-    Raises
-    ------
-    ExplorerError
-        If an axis or an index is not there.
+    ``branches`` have segments of one stability, cut where an angle wraps; ``note`` says why there is nothing. Branches
+    that were followed at other values than `at` are left out; extremes have none.
     """
     explored = ExploredRun.of(run)
     place, upwards = explored.place(at, but=x), vertical(explored, y)
@@ -233,7 +207,7 @@ def _motion(found: xr.Dataset, branch: int) -> str | None:
 
 
 def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
-    branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
+    branch, kind = int(found["of_branch"][k]), BIFURCATIONS[int(found["kind"][k])]
     period = int(found["orbit_period"][branch])
     criticality = CRITICALITIES[int(found["criticality"][k])]
     values = found["bifurcation_section"].sel(state=y).values[k, : max(period, 1)]
@@ -253,25 +227,10 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 # ---------------------------------------------------------------- attractors at a point
 
 
-def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the attractors and other sets at a parameter point; the set with the largest basin fraction comes first.
+def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
+    """Return the attractors and other sets at a parameter point, the largest basin fraction first.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    at
-        Index on every swept axis.
-
-    Returns
-    -------
-    dict
-        ``attractors``, and ``note``: how to get them, where they are not known.
-
-    Raises
-    ------
-    ExplorerError
-        If an axis or an index is not there.
+    ``note`` says how to get them, where they are not known.
     """
     explored = ExploredRun.of(run)
     place = explored.place(at)
@@ -281,22 +240,17 @@ def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
     cast = palette.cast_of(found)
     here = dense(isel(found, place), points=True)
     present = np.flatnonzero(here["kind"].values > 0).tolist()
-    listed = [_attractor(explored, here.isel(attractor=i), i, cast) for i in present]
+    listed = [_set(explored, here.isel(attractor=i), i, cast) for i in present]
     return {"attractors": sorted(listed, key=lambda a: -(a["share"] or 0.0)), "note": None}
 
 
-def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> dict[str, Any]:
+def _set(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> dict[str, Any]:
     classifier = run.model.classifier
     side = int(one["side"]) if "side" in one else 0
     points = one["attractor_points"].transpose("point", "state").values
     points = points[np.isfinite(points).all(axis=1)][:MOST_SECTION]
     multipliers = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
     closed = int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(multipliers).all()
-    count = int(one["n_cells"])
-    interval: tuple[float | None, float | None] = (None, None)
-    if BRANCH not in run.start_dims:
-        low, high = share_interval(np.array([count]), np.array([float(one["share"])]))
-        interval = (finite(low[0]), finite(high[0]))
     exponent = finite(one["lyapunov_max"])
     return {
         "id": number,
@@ -308,11 +262,114 @@ def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cas
         "periods": periods_of(run.model),
         "motion": classifier.words[side] if classifier is not None and side > 0 else None,
         "share": finite(one["share"]),
-        "low": interval[0],
-        "high": interval[1],
-        "n_starts": count,
+        **share_bounds(run, one),
+        "n_starts": int(one["n_cells"]),
         "colour": rgb(cast.colours[number]),
-        "multipliers": [[float(m.real), float(m.imag)] for m in multipliers] if closed else None,
+        "multipliers": parts_of(multipliers) if closed else None,
         "exponents": None if exponent is None else [exponent],
         "section": points.tolist(),
     }
+
+
+def disturbances(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
+    """Return the critical shocks of the attractors at a parameter point, and the edge states between them.
+
+    ``shocks`` has for each attractor ``smallest`` (of the states that the analysis shocked, at any phase) and
+    ``shortest`` (of all states, at the section); ``notes`` say how to get what is not stored for this point. States are
+    lists in the order of the model's.
+    """
+    explored = ExploredRun.of(run)
+    place = explored.place(at)
+    shocks = next((list(_shocks(explored, one)) for one in _here(explored, "resilience", place)), None)
+    edges = [edge for one in _here(explored, "edge", place) for edge in _edges(one)]
+    notes = []
+    if run_has_basins(explored):
+        if shocks is None:
+            notes.append("critical shocks are not computed here: magpend analyse resilience DIR")
+        if not edges:
+            point = "".join(f" --at {name}=VALUE" for name in place)
+            notes.append(f"edge states are not computed here: magpend analyse edge DIR --between A B{point}")
+    return {"shocks": shocks or [], "edges": edges, "notes": notes}
+
+
+def run_has_basins(run: ExploredRun) -> bool:
+    """Return whether shocks of a run's attractors and edge states can be computed; they need independent starts."""
+    return run.remembered("has basins", lambda: can_have(run, "resilience"))
+
+
+def _here(run: ExploredRun, name: str, place: Mapping[str, int]) -> Iterator[xr.Dataset]:
+    """Yield the stored results of an analysis at a parameter point that name the attractors as the page does."""
+    for one in run.kept_each(name):
+        index = _index(run, one, place)
+        if index is not None:
+            yield isel(one, index).load()
+
+
+def _index(run: ExploredRun, found: xr.Dataset, place: Mapping[str, int]) -> dict[str, int] | None:
+    """Return the index of a parameter point in a result that may have some points only; None if it lacks it."""
+    index = {}
+    for name, i in place.items():
+        if name not in found.coords:
+            return None
+        value = float(run.axis(name).values[i])
+        near = [math.isclose(v, value, rel_tol=SAME_VALUE, abs_tol=1e-300) for v in np.atleast_1d(found[name].values)]
+        if True not in near:
+            return None
+        if name in found.dims:
+            index[name] = near.index(True)
+    return index
+
+
+def _shocks(run: ExploredRun, found: xr.Dataset) -> Iterator[dict[str, Any]]:
+    """Yield the critical shocks of each attractor."""
+    largest = float(found.attrs["resilience_largest"])
+    for _, one in sets_of(found, found["stability"].values == ATTRACTS):
+        number = int(one["attractor"])
+        yield {
+            "attractor": number,
+            "letter": letter(number),
+            "largest": largest,
+            "states": [name.strip() for name in str(found.attrs["resilience_states"]).split(",")],
+            "smallest": _shock(run, one, "shock"),
+            "shortest": _shock(run, one, "distance"),
+        }
+
+
+def _shock(run: ExploredRun, one: xr.Dataset, name: str) -> dict[str, Any] | None:
+    """Return a critical shock; None if no shock that was tried leads away."""
+    jump, before = one[name].values, one[f"{name}_from"].values
+    if not (np.isfinite(jump).all() and np.isfinite(before).all()):
+        return None
+    phase, to = float(one[f"{name}_phase"]), int(one[f"{name}_to"])
+    return {
+        "low": finite(one[f"{name}_low"]),
+        "high": finite(one[f"{name}_high"]),
+        "phase": phase,
+        # the motion of a flow from a state does not depend on the time
+        "startable": phase == 0.0 or run.model.autonomous,
+        "from": before.tolist(),
+        "jump": jump.tolist(),
+        "to": to,
+        "leads_to": end_of(to),
+        "n_undecided": int(one[f"{name}_n_undecided"]),
+    }
+
+
+def _edges(found: xr.Dataset) -> Iterator[dict[str, Any]]:
+    """Yield the edge states between two attractors."""
+    for i in range(found.sizes["edge"]):
+        one = found.isel(edge=i)
+        yield {
+            "between": str(found.attrs["between_letters"]).split(),
+            "kind": KINDS[int(one["kind"])].replace("_", " "),
+            "period": int(one["orbit_period"]) or None,
+            "n_pairs": int(one["n_pairs"]),
+            "section": one["section"].values[: min(int(one["n_points"]), MOST_SECTION)].tolist(),
+            "multipliers": _complex(one, "multiplier"),
+            "eigenvalues": _complex(one, "eigenvalue"),
+        }
+
+
+def _complex(one: xr.Dataset, name: str) -> list[list[float]] | None:
+    parts = np.stack([one[f"{name}_real"].values, one[f"{name}_imag"].values], axis=-1)
+    return parts.tolist() if np.isfinite(parts).all() else None

@@ -13,35 +13,24 @@ from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
-from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
-from pipeline.explorer.data.series import fixed_points, orbit_series
-from pipeline.layout.units import shown_unit
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import TOLERANCE, fixed_points, orbit_series, parts_of
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
-from pipeline.plots.branches import NAMES
-from pipeline.plots.curve_lines import POINT_NAMES
+from pipeline.plots.branches import NAMES, POINT_NAMES
 from pipeline.plots.labels import swept_label
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or name their run with --curves"
 
 
-def parameter_plane(run: Run) -> dict[str, Any]:
-    """Return the bifurcation curves of a run, with the number of attractors over the plane if the run sweeps both
-    parameters.
+def parameter_plane(run: RunDirectory) -> dict[str, Any]:
+    """Return the bifurcation curves of a run, and over their plane the number of attractors if the run sweeps it.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-
-    Returns
-    -------
-    dict
-        ``axes``: names and labels across and upwards; ``curves`` and ``points`` of codimension two; ``map``: values
-        of both axes, the number of attractors at each point, and colours, or None; ``note``: why there are no
-        curves, or None.
+    ``axes`` are across and upwards, ``points`` those of codimension two; ``map`` has values of both axes, the number of
+    attractors at each point, and colours; ``note`` says why there are no curves.
     """
     explored = ExploredRun.of(run)
     found = explored.bifurcation_curves()
@@ -84,9 +73,7 @@ def _special(found: xr.Dataset, k: int) -> dict[str, Any]:
 
 
 def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
-    """Return the number of attractors at each point of the plane of two parameters; None unless the run sweeps just
-    these two.
-    """
+    """Return the number of attractors over the plane of two parameters; None unless the run sweeps just these."""
     attractors = run.kept("attractors")
     if attractors is None:
         return None
@@ -108,31 +95,19 @@ def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
     }
 
 
-def curve_orbit(run: Run, curve: int, point: int) -> bytes:
-    """Integrate the orbit at a point of a bifurcation curve; return arrays and attributes, packed for the page.
+def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
+    """Integrate the orbit at a point of a bifurcation curve; return it packed for the page.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    curve, point
-        Number of the curve, and of its point.
-
-    Raises
-    ------
-    ExplorerError
-        If there is no such point.
-    ArithmeticError
-        If the trajectory ends early.
+    Raise RequestError if there is no such point, ArithmeticError if the trajectory ends early.
     """
     explored = ExploredRun.of(run)
     found = explored.bifurcation_curves()
     n_curves = 0 if found is None else found.sizes["curve"]
     if found is None or not 0 <= curve < n_curves:
-        raise ExplorerError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
+        raise RequestError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
     n_points = int(found["n_points"][curve])
     if not 0 <= point < n_points:
-        raise ExplorerError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
+        raise RequestError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
     source = explored if explored.curves is None else ExploredRun.of(explored.curves)
     parameters, clock_hz = _parameters_at(source, found.isel(curve=curve, point=point))
     state, period = found["section"].values[curve, point], int(found["orbit_period"][curve])
@@ -169,7 +144,7 @@ def _attrs(
         "status_meaning": f"an orbit on a curve of bifurcations: {kind}",
         "kind": f"{kind}, period {period}",
         "stable": None,
-        "multipliers": [[finite(m.real), finite(m.imag)] for m in multipliers],
+        "multipliers": parts_of(multipliers),
         "note": None,
         "exponents_from": None,
         "seeds": [],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,7 @@ from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import Category, Scheme, rgb, schemes
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.vocabulary import DIVERGED, grid_dim, is_grid_dim
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 NONE = -1
 """Label of a start that leads to nothing known."""
@@ -23,65 +23,29 @@ _DIVERGED = -2
 
 @dataclass(frozen=True)
 class Plane:
-    """Plane of initial states: its two states, and the label of each initial state.
+    """Plane of initial states: its two states, and the label of each initial state."""
 
-    Attributes
-    ----------
-    states : tuple of str
-        Across and upwards.
-    u, v : ndarray
-        Their values, ascending; empty if the starts are no grid.
-    label : ndarray of int16, (v, u)
-    fixed : dict
-        Values of the other states, those that all starts share.
-    source : str or None
-        ``basins`` where labels are attractors, ``starts`` where they say what the cells themselves tell; None
-        where there is no grid.
-    starts : ndarray, (n, 2)
-        Starts that are no grid.
-    start_label : ndarray of int16, (n,)
-    """
-
-    states: tuple[str, str]
-    u: np.ndarray
-    v: np.ndarray
-    label: np.ndarray
-    fixed: Mapping[str, float]
+    states: tuple[str, str]  # across and upwards
+    fixed: Mapping[str, float]  # values of the other states, those that all starts share
     categories: list[Category]
-    source: str | None
-    starts: np.ndarray
-    start_label: np.ndarray
+    # ``basins`` where labels are attractors, ``starts`` where they say what the cells themselves tell; None where
+    # there is no grid
+    source: str | None = None
+    u: np.ndarray = field(default_factory=lambda: np.empty(0))  # u, v: values of the states, ascending
+    v: np.ndarray = field(default_factory=lambda: np.empty(0))
+    label: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.int16))  # (v, u)
+    starts: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))  # (n, 2); starts that are no grid
+    start_label: np.ndarray = field(default_factory=lambda: np.empty(0, np.int16))  # (n,)
 
 
-def plane(run: Run, at: Mapping[str, int]) -> bytes:
-    """Return the labelled plane of initial states at a parameter point, packed for the page.
-
-    Parameters
-    ----------
-    run
-        An opened run.
-    at
-        Index on every swept axis.
-
-    Raises
-    ------
-    ExplorerError
-        If an axis or an index is not there.
-    DamagedError
-        If a chunk is not what was written.
-    """
+def plane(run: RunDirectory, at: Mapping[str, int]) -> bytes:
+    """Return the labelled plane of initial states at a parameter point, packed for the page."""
     found = plane_of(ExploredRun.of(run), at)
-    arrays = {
-        "u": found.u,
-        "v": found.v,
-        "label": found.label,
-        "starts": found.starts,
-        "start_label": found.start_label,
-    }
+    arrays = {name: getattr(found, name) for name in ("u", "v", "label", "starts", "start_label")}
     attrs = {
         "states": list(found.states),
         "fixed": dict(found.fixed),
-        "labels": [{"id": c.number, "label": c.label, "colour": c.colour} for c in found.categories],
+        "labels": [c.describe() for c in found.categories],
         "source": found.source,
     }
     return pack_arrays(arrays, attrs)
@@ -117,14 +81,12 @@ def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: l
     states = (_state_of(run, across), _state_of(run, upwards))
     return Plane(
         states,
-        u[columns],
-        v[rows],
-        label.values[np.ix_(rows, columns)],
         _fixed(run, part, states),
         _categories(scheme, label.values),
         "basins" if scheme.name == "attractor" else "starts",
-        np.empty((0, 2)),
-        np.empty(0, np.int16),
+        u[columns],
+        v[rows],
+        label.values[np.ix_(rows, columns)],
     )
 
 
@@ -138,19 +100,8 @@ def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Pl
     part = _part(run, scheme, place)
     label = _labels(part, scheme)
     columns = [_spread(part, grid_dim(name), label) for name in states]
-    shown = label.values.ravel()
-    source = None
-    return Plane(
-        states,
-        np.empty(0),
-        np.empty(0),
-        np.empty((0, 0), np.int16),
-        _fixed(run, part, states),
-        _categories(scheme, shown),
-        source,
-        np.stack(columns, axis=1),
-        shown,
-    )
+    shown, starts = label.values.ravel(), np.stack(columns, axis=1)
+    return Plane(states, _fixed(run, part, states), _categories(scheme, shown), starts=starts, start_label=shown)
 
 
 def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:

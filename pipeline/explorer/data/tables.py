@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import orbit
 from pipeline.explorer.data.colours import Scheme, schemes
 from pipeline.explorer.data.diagram import points
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import orbit
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane_of
 from pipeline.explorer.data.verticals import vertical
-from pipeline.layout.units import shown_unit
+from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
 from pipeline.layout.writing import netcdf_bytes
-from pipeline.plots.files import with_provenance
+from pipeline.plots.figure import with_provenance
 from pipeline.specification.problems import unknown_name
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 FORMATS = {"csv": "text/csv; charset=utf-8", "nc": "application/x-netcdf"}
 """Formats by name, and what they are called in an answer."""
@@ -36,29 +37,16 @@ _ROWS_AT_ONCE = 65_536
 Asked = Mapping[str, Any]
 
 
-def table(run: Run, kind: str, asked: Asked, form: str = "csv") -> bytes:
-    """Return the numbers of what the page shows (diagram, orbit, plane, ...) as the bytes of a CSV or NetCDF file.
+def table(run: RunDirectory, kind: str, asked: Asked, form: str = "csv") -> bytes:
+    """Return the numbers of what the page shows as the bytes of a file, in one of `FORMATS`.
 
-    Parameters
-    ----------
-    run
-        An opened run.
-    kind
-        ``diagram``, ``curves``, ``branches``, ``orbit``, ``plane`` or ``attractors``.
-    asked
-        Arguments of the view: ``x``, ``y``, ``at``, ``cell``, ``point``, if the view takes them.
-    form
-        One of `FORMATS`.
-
-    Raises
-    ------
-    ExplorerError
-        If the kind, the format or what is asked for does not exist, or the rows are too many for CSV.
+    `kind` is one of `_TABLES`; `asked` has the arguments that it takes of ``x``, ``y``, ``at``, ``cell`` and ``point``.
+    Raise RequestError if one of these does not exist, or the rows are too many for CSV.
     """
     if kind not in _TABLES:
-        raise ExplorerError(unknown_name("view", kind, list(_TABLES)))
+        raise RequestError(unknown_name("view", kind, list(_TABLES)))
     if form not in FORMATS:
-        raise ExplorerError(unknown_name("format", form, list(FORMATS)))
+        raise RequestError(unknown_name("format", form, list(FORMATS)))
     explored = ExploredRun.of(run)
     ds = _TABLES[kind](explored, asked)
     ds = ds.assign_attrs({"title": f"{kind} of a run", **ds.attrs})
@@ -195,7 +183,7 @@ _TABLES: dict[str, Callable[[ExploredRun, Asked], xr.Dataset]] = {
 
 def _needed(asked: Asked, name: str) -> Any:
     if asked.get(name) in (None, ""):
-        raise ExplorerError(f"{name} is missing.")
+        raise RequestError(f"{name} is missing.")
     return asked[name]
 
 
@@ -224,7 +212,7 @@ def _of_rows(rows: list[tuple[Any, ...]], names: tuple[str, ...]) -> xr.Dataset:
 def _csv(ds: xr.Dataset) -> bytes:
     n = ds.sizes.get("row", 0)
     if n > MOST_ROWS:
-        raise ExplorerError(f"{n:,} rows are too many for CSV, {MOST_ROWS:,} at most; take NetCDF.")
+        raise RequestError(f"{n:,} rows are too many for CSV, {MOST_ROWS:,} at most; take NetCDF.")
     text = io.StringIO()
     for name, value in ds.attrs.items():
         text.write(f"# {name}: {' '.join(str(value).split())}\n")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.explorer.data.explored import ExplorerError
-from pipeline.explorer.data.plain_text import plain
+from pipeline.explorer import RequestError
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim, parameter_name
 from pipeline.specification.problems import unknown_name
 
@@ -18,28 +19,64 @@ if TYPE_CHECKING:
 
     from pipeline.explorer.data.explored import ExploredRun
 
+
+_SUBSCRIPTS = str.maketrans("0123456789+-aehijklmnoprstuvx", "₀₁₂₃₄₅₆₇₈₉₊₋ₐₑₕᵢⱼₖₗₘₙₒₚᵣₛₜᵤᵥₓ")
+
+_ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "hat": "\u0302", "bar": "\u0304", "tilde": "\u0303"}
+
+_ACCENT = re.compile(r"\\(dot|ddot|hat|bar|tilde)\s*(?:\{([^{}]*)\}|(\\[A-Za-z]+|.))")
+_FONT = re.compile(r"\\(?:mathrm|mathit|mathbf|text|operatorname)\s*\{([^{}]*)\}")
+_SUBSCRIPT = re.compile(r"_(?:\{([^{}]*)\}|(.))")
+
+
+def _letter(name: str) -> str:
+    known = name.lower().removeprefix("var")
+    case = "SMALL" if name[0].islower() else "CAPITAL"
+    # Unicode spells lambda differently
+    spelled = {"lambda": "lamda"}.get(known, known).upper()
+    try:
+        return unicodedata.lookup(f"GREEK {case} LETTER {spelled}")
+    except KeyError:
+        return name
+
+
+def plain(symbol: str, name: str) -> str:
+    r"""Convert a LaTeX symbol (or a name without one) to plain text with Greek letters, accents and subscripts.
+
+    Examples
+    --------
+    >>> plain(r"\dot{\theta}_1", "rate")
+    'θ̇₁'
+    """
+    if not symbol:
+        return name.replace("_", " ")
+    text = _FONT.sub(lambda found: f"{{{found[1]}}}", symbol)
+    text = _ACCENT.sub(lambda found: f"{found[2] or found[3]}{{{_ACCENTS[found[1]]}}}", text)
+    text = re.sub(r"\\([A-Za-z]+)", lambda found: _letter(found[1]), text)
+    text = re.sub(r"\{([\u0300-\u036f])\}", r"\1", text)
+    return _SUBSCRIPT.sub(_lowered, text).replace("{", "").replace("}", "").strip()
+
+
+def _lowered(found: re.Match[str]) -> str:
+    """Convert a subscript to Unicode's subscript characters, or to ``_TEXT`` if one character has no such form."""
+    text = (found[1] if found[1] is not None else found[2]).replace(" ", "")
+    small = text.translate(_SUBSCRIPTS)
+    return small if all(a != b for a, b in zip(text, small, strict=True)) else f"_{text}"
+
+
 _WORDS = {"min": "least", "max": "largest", "mean": "mean"}
 
 
 @dataclass(frozen=True)
 class Vertical:
-    """A number that a diagram can show on its vertical axis.
-
-    Attributes
-    ----------
-    angle : bool
-        Whether full turns do not matter.
-    variable : str
-        Name of the cube's variable.
-    values : callable
-        ``values(part)`` returns the values in a part of the cube, on the dims of its cells and ``period_index``.
-    """
+    """A number that a diagram can show on its vertical axis."""
 
     name: str
     label: str
     unit: str
-    angle: bool
-    variable: str
+    angle: bool  # whether full turns do not matter
+    variable: str  # name of the cube's variable
+    # ``values(part)`` returns the values in a part of the cube, on the dims of its cells and ``period_index``
     values: Callable[[xr.Dataset], xr.DataArray]
 
     def describe(self) -> dict[str, Any]:
@@ -74,10 +111,10 @@ def _verticals(run: ExploredRun) -> list[Vertical]:
 
 
 def vertical(run: ExploredRun, name: str) -> Vertical:
-    """Return a vertical axis by name; raise ExplorerError with similar names if there is none."""
+    """Return a vertical axis by name; raise RequestError with similar names if there is none."""
     known = {v.name: v for v in verticals(run)}
     if name not in known:
-        raise ExplorerError(unknown_name("vertical axis", name, list(known)))
+        raise RequestError(unknown_name("vertical axis", name, list(known)))
     return known[name]
 
 

@@ -13,15 +13,13 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import FRACTION, NON_NEGATIVE, POSITIVE, Parameter
 from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import Axis, ExploredRun
-from pipeline.explorer.data.plain_text import plain
-from pipeline.explorer.data.series import fixed_points
-from pipeline.explorer.data.verticals import verticals
-from pipeline.layout.period_names import period_of, section_name
-from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
+from pipeline.explorer.data.orbits import fixed_points
+from pipeline.explorer.data.verticals import plain, verticals
+from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim, period_of, section_name
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 FORMAT = 1
 """Of the answers; a page refuses another one."""
@@ -29,25 +27,11 @@ FORMAT = 1
 _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
-def describe_view(run: Run, live: bool) -> dict[str, Any]:
-    """Return a dictionary with all that the page needs to know about a run when it loads.
+def describe_view(run: RunDirectory, live: bool) -> dict[str, Any]:
+    """Return all that the page needs to know about a run when it loads, as JSON can say it.
 
-    Parameters
-    ----------
-    run
-        An opened run; only coordinates, the cells' status and what is kept in ``derived/`` are read.
-    live
-        Whether the page can have trajectories integrated while one watches.
-
-    Returns
-    -------
-    dict
-        What JSON can say. Values of states and parameters are in the model's own units.
-
-    Raises
-    ------
-    DamagedError
-        If a chunk is not what was written.
+    Only coordinates, the cells' status and what is kept in ``derived/`` are read. `live` says whether the page can have
+    trajectories integrated while one watches. Values of states and parameters are in the model's own units.
     """
     explored = ExploredRun.of(run)
     return {
@@ -72,7 +56,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
     }
 
 
-def _name(run: Run) -> str:
+def _name(run: RunDirectory) -> str:
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 
@@ -114,35 +98,17 @@ def _model(run: ExploredRun) -> dict[str, Any]:
         "section": _section(model),
         "period": period_of(model),
         "forced": not model.autonomous,
-        "states": [_state(s) for s in model.states],
-        "quantities": [
-            {
-                "name": q.name,
-                "label": plain(q.symbol, q.name),
-                "meaning": q.meaning,
-                "unit": q.unit,
-                "angle": False,
-                "scale": 1.0,
-                "rate": None,
-            }
-            for q in model.quantities
-        ],
+        "states": [_named(s, s.on_circle, s.scale, s.rate or None) for s in model.states],
+        "quantities": [_named(q, False, 1.0, None) for q in model.quantities],
         "parameters": [_parameter(run, p) for p in model.parameters],
         "portraits": [list(pair) for pair in model.portraits],
         "drawing": _drawing(run),
     }
 
 
-def _state(state: Any) -> dict[str, Any]:
-    return {
-        "name": state.name,
-        "label": plain(state.symbol, state.name),
-        "meaning": state.meaning,
-        "unit": state.unit,
-        "angle": state.on_circle,
-        "scale": state.scale,
-        "rate": state.rate or None,
-    }
+def _named(one: Any, angle: bool, scale: float, rate: str | None) -> dict[str, Any]:
+    named = {"name": one.name, "label": plain(one.symbol, one.name), "meaning": one.meaning, "unit": one.unit}
+    return {**named, "angle": angle, "scale": scale, "rate": rate}
 
 
 def _section(model: Model) -> str:

@@ -1,3 +1,1 @@
-"""Compute while the user watches: trajectories, slices of basins, orbits along a parameter, runs of a selected
-region.
-"""
+"""Compute while the user watches: trajectories, slices of basins, orbits along a parameter, runs of regions."""

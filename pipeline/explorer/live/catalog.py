@@ -12,19 +12,16 @@ for each motion that the model's classifier tells, and are not settled.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.analysis.attractors.describing import features
-from pipeline.analysis.attractors.extension.clouds import Cloud, members
-from pipeline.analysis.attractors.finding.assigning import decide
+from pipeline.analysis.attractors import features
+from pipeline.analysis.attractors.destinations import KnownSets
 from pipeline.analysis.attractors.finding.cell_blocks import Block
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, polish, raw_orbit
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, raw_orbit
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.limit_cycles import number_of_cycle, tell_cycles
@@ -33,7 +30,7 @@ from pipeline.analysis.attractors.finding.spirals import Recurrence
 from pipeline.analysis.ragged import N_IDS, dense, dims_of, isel
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import SAME_SECONDS, STRICT
-from pipeline.explorer.data.series import orbit_series
+from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.settling import Place
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
 from pipeline.products.attractors import IdentifyOptions
@@ -41,64 +38,35 @@ from pipeline.products.attractors import IdentifyOptions
 MOST_ENTRIES = 64
 """Attractors told apart besides those of the run; what closes elsewhere is told by its period alone."""
 
+BLOCK_CELLS = 4096
+"""Cells of the run that are read at once."""
+
 SAME_REST = 1e-5
 """Largest scaled distance between an equilibrium of the run and the same one found again."""
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor.
+    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the entry in slices: the run's id of an attractor, or a larger number for any other entry.
-    attractor : int or None
-        The run's id.
-    kind : int
-        Of `vocabulary.KINDS`; absent for a class of cells that is no attractor.
-    period : int
-        Drive periods or returns; 0 if not closed.
-    motion : int
-        Code of the model's classifier.
-    status : int
-        Code of `Status`, of a class of cells that ended; 0 else.
-    points : ndarray, (n, state)
-        Section points; none of a class of cells.
-    seconds : float
-        Period of a limit cycle; NaN else.
-    stability : int
-        Of `vocabulary.STABILITIES`; 0 of a class of cells that ended.
-    """
-
-    number: int
-    attractor: int | None
-    kind: int
-    period: int
-    motion: int
-    status: int
-    points: np.ndarray
-    seconds: float = np.nan
-    stability: int = 0
+    number: int  # number of the entry in slices: the run's id of an attractor, or a larger number for any other entry
+    attractor: int | None  # the run's id
+    kind: int  # of `vocabulary.KINDS`; absent for a class of cells that is no attractor
+    period: int  # drive periods or returns; 0 if not closed
+    motion: int  # code of the model's classifier
+    status: int  # code of `Status`, of a class of cells that ended; 0 else
+    points: np.ndarray  # (n, state); section points; none of a class of cells
+    seconds: float = np.nan  # period of a limit cycle; NaN else
+    stability: int = 0  # of `vocabulary.STABILITIES`; 0 of a class of cells that ended
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """The attractors and cells that a run holds at one parameter point; None where it holds none.
+    """The attractors and cells that a run holds at one parameter point; None where it holds none."""
 
-    Attributes
-    ----------
-    attractors : Dataset or None
-        Attractors of all parameter points of the run.
-    cells : Dataset or None
-        The cube at the point; None where it has no such point.
-    index : tuple of int or None
-        Index of the point in the cube.
-    """
-
-    attractors: xr.Dataset | None = None
-    cells: xr.Dataset | None = None
-    index: tuple[int, ...] | None = None
+    attractors: xr.Dataset | None = None  # attractors of all parameter points of the run
+    cells: xr.Dataset | None = None  # the cube at the point; None where it has no such point
+    index: tuple[int, ...] | None = None  # index of the point in the cube
 
     def here(self) -> xr.Dataset | None:
         """Return the stored attractors of this parameter point; None if there are none."""
@@ -109,46 +77,35 @@ class Known:
 
 
 class Catalog:
-    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it.
-
-    Parameters
-    ----------
-    place
-        The point.
-    known
-        Stored attractors and cells of the run at the point.
-    closure_tolerance
-        Closure tolerance of the run.
-    """
+    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it."""
 
     def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:
         self.place, self.model = place, place.parameters.model
-        self._packed = place.parameters.pack()
         self._geometry = Geometry.of(self.model)
         here = known.here()
         self.options = IdentifyOptions.from_attrs({} if here is None else here.attrs)
         self.tolerance = _tolerance_of(here, closure_tolerance)
+        self._point = self._point_of(known.cells)
+        self._sets = KnownSets(self._point, self._geometry, self.tolerance, self.options.residual)
         self._lock = threading.RLock()
         self.entries: list[Entry] = []
-        self._orbits: list[Orbit] = []
-        self._orbit_entries: list[int] = []
-        self._sets: list[tuple[Entry, Cloud]] = []
         self.n_ids = 0 if known.attractors is None else int(known.attractors.attrs[N_IDS])
-        if here is not None and known.cells is not None:
-            self._take(here, known.cells)
+        if here is not None:
+            self._take(here)
 
     # ---- what the run knows ------------------------------------------------------------------
 
-    def _take(self, here: xr.Dataset, cells: xr.Dataset) -> None:
+    def _take(self, here: xr.Dataset) -> None:
         """Add the run's stored attractors of this parameter point to the catalog."""
         present = np.flatnonzero(here["kind"].values != ABSENT)
         points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
         periods = here["orbit_period"].values
         closed = [i for i in points if here["kind"].values[i] == PERIODIC_ORBIT and periods[i] > 0]
-        orbits = self._polished(
+        orbits = self._sets.polished(
             np.array([points[i][0] for i in closed]), np.array([periods[i] for i in closed], np.int64)
         )
         found = dict(zip(closed, orbits, strict=True))
+        ids = here["attractor_id"].transpose(*self._point.start_dims).values.ravel()
         for i, own in points.items():
             kind = int(here["kind"].values[i])
             side = int(here["side"].values[i]) if "side" in here else 0
@@ -157,38 +114,9 @@ class Catalog:
             entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds, stability)
             self.entries.append(entry)
             if i in found:
-                self._add_orbit(found[i] or raw_orbit(own, self._geometry), entry)
+                self._sets.add_orbit(found[i] or raw_orbit(own, self._geometry), i)
             elif kind in APERIODIC:
-                cloud = self._cloud_of(here, cells, i)
-                if cloud is not None:
-                    self._sets.append((entry, cloud))
-
-    def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
-        """Return the section points of the run's cells on a non-periodic set, in a search tree; None if it has no
-        cells.
-        """
-        block = self._point(cells).whole()
-        ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
-        own = np.flatnonzero((ids == number) & block.is_bounded)
-        if not len(own):
-            return None
-        return Cloud.of(list(block.section[own]), self._geometry, self.tolerance)
-
-    def _polished(self, points: np.ndarray, period: np.ndarray) -> list[Orbit | None]:
-        n = len(points)
-        return polish(
-            np.tile(self._packed, (n, 1)),
-            np.full(n, self.place.frequency),
-            points,
-            period,
-            geometry=self._geometry,
-            system=self.model.system,
-            tolerance=self.options.residual,
-        )
-
-    def _add_orbit(self, orbit: Orbit, entry: Entry) -> None:
-        self._orbits.append(orbit)
-        self._orbit_entries.append(entry.number)
+                self._sets.add_cloud(ids, i, self.tolerance)
 
     # ---- where trajectories are ----------------------------------------------------------------
 
@@ -196,17 +124,10 @@ class Catalog:
         """Return the catalog number of the periodic orbit that each cell has reached or surely will reach; -1 for
         none.
         """
-        with self._lock:
-            orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
-        if not orbits:
-            return np.full(len(block.status), -1, np.int64)
-        label, _ = decide(block, orbits, self.tolerance, self._geometry)
-        return np.asarray(numbers[label])
+        return self._sets.on_orbits(block)
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return the undecided cells that nearly return to earlier section points, so that they are worth integrating
-        further.
-        """
+        """Return the undecided cells that nearly return to earlier section points: they are worth integrating on."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -216,17 +137,10 @@ class Catalog:
         return near
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the catalog number of the attractor on which each cell ends. An unknown periodic orbit becomes a new
-        entry.
+        """Return the catalog number of the attractor on which each cell ends. An unknown orbit becomes a new entry.
 
-        Parameters
-        ----------
-        block
-            Cells at their end.
-        final
-            Whether every cell is to get one; else -1 stays for what is neither on an orbit nor at rest.
-        strictly
-            Whether cells count as closed within a small distance, however loosely the run's own do.
+        With `final` every cell gets one; else -1 stays for what is neither on an orbit nor at rest. With `strictly`
+        cells count as closed within a small distance, however loosely the run's own do.
         """
         numbers = np.full(len(block.status), -1, np.int64)
         if self.model.autonomous:
@@ -244,7 +158,7 @@ class Catalog:
         """Decide which cells of a flow end at equilibria or on limit cycles, and write their catalog numbers into
         `numbers`.
         """
-        point = self._point(_dataset_of(block, self.model))
+        point = self._point.holding(block)
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
             here = self._entry_near(EQUILIBRIUM, found.state)
@@ -263,7 +177,7 @@ class Catalog:
                 )
                 numbers[own] = entry.number
         status = np.where(numbers >= 0, np.int8(Status.NO_RETURN), block.status)
-        return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
+        return replace(block, status=status)
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
         """Add the periodic orbits of undecided cells to the catalog, and write their catalog numbers into `numbers`."""
@@ -272,30 +186,25 @@ class Catalog:
                 continue
             own = block.section[row]
             period = min(int(block.orbit_period[row]), len(own))
-            orbit = self._polished(own[-1:], np.array([period]))[0]
+            (orbit,) = self._sets.polished(own[-1:], np.array([period]))
             self._enter(orbit or raw_orbit(own[-period:], self._geometry))
             again = self.on_orbits(block)
             numbers[numbers < 0] = again[numbers < 0]
 
     def _enter(self, orbit: Orbit) -> None:
         with self._lock:
-            if number_of(orbit, self._orbits, self._geometry) == len(self._orbits):
+            if number_of(orbit, self._sets.orbits, self._geometry) == len(self._sets.orbits):
                 motion = self._motion_of(orbit)
                 entry = self._new(
                     PERIODIC_ORBIT, orbit.period, orbit.points, motion, seconds=orbit.seconds, stability=orbit.stability
                 )
-                self._add_orbit(orbit, entry)
+                self._sets.add_orbit(orbit, entry.number)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Decide which cells are on the run's non-periodic attractors, and write their catalog numbers into
-        `numbers`.
-        """
+        """Write into `numbers` which cells are on the run's non-periodic attractors."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
-        if not len(rows) or not self._sets:
-            return
-        own = members(block.section[rows], [cloud for _, cloud in self._sets])
-        for row, k in zip(rows[own >= 0], own[own >= 0].tolist(), strict=True):
-            numbers[row] = self._sets[k][0].number
+        if len(rows):
+            numbers[rows] = self._sets.on_clouds(block.section[rows])
 
     # ---- entries -------------------------------------------------------------------------------
 
@@ -341,9 +250,7 @@ class Catalog:
         return [*alike, None][number_of_cycle(cycle, states, near, point, self._geometry)]
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the catalog entry for cells without an attractor that share status, period and motion with a given
-        cell.
-        """
+        """Return the entry for cells without an attractor that share status, period and motion with a given cell."""
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
         period = int(block.orbit_period[row]) if alive else 0
@@ -375,27 +282,21 @@ class Catalog:
         place = self.place
         return int(features.sides_of(orbit.points[None], turns[None], place.frequency, place.parameters)[0])
 
-    def _point(self, cells: xr.Dataset) -> _WholePoint:
-        return _WholePoint(
-            cells,
+    def _point_of(self, cells: xr.Dataset | None) -> Point:
+        """Return this parameter point with the run's cells there."""
+        return Point(
+            xr.Dataset() if cells is None else cells,
             {},
-            split_dims(cells["status"])[1],
+            () if cells is None else split_dims(cells["status"])[1],
             self.place.frequency,
-            self._packed,
+            self.place.parameters.pack(),
             self.place.parameters,
             sum(self._geometry.is_angle),
-            cells["status"].size,
+            BLOCK_CELLS,
             self.model.system,
             is_flow=self.model.crossing is not None,
             can_rest=self.model.autonomous,
         )
-
-
-class _WholePoint(Point):
-    """A parameter point that holds all its cells in one block."""
-
-    def whole(self) -> Block:
-        return next(self.blocks())
 
 
 def _finite(points: np.ndarray) -> np.ndarray:
@@ -406,16 +307,3 @@ def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
     """Return the distance within which a cell counts as on a known orbit, as in the run's stored analysis."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
-
-
-def _dataset_of(block: Block, model: Model) -> xr.Dataset:
-    dims = "initial_condition"
-    variables: dict[str, Any] = {
-        "section": ((dims, "period_index", "state"), block.section),
-        "status": ((dims,), block.status),
-        "orbit_period": ((dims,), block.orbit_period),
-        "turns": ((dims, model.angle_dim), block.turns),
-    }
-    if block.rest is not None:
-        variables["rest_state"] = ((dims, "state"), block.rest)
-    return xr.Dataset(variables)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from magpend_core.models.parameters import ParameterError
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
-from pipeline.explorer.live.messages import Request, RequestError
+from pipeline.explorer.live.messages import Request
 from pipeline.explorer.live.settling import CancelledError
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import StoreError
@@ -21,20 +22,14 @@ LOG = logging.getLogger(__name__)
 PATIENCE_S = 8.0
 """Time that the run of a region has to end in order, until it is killed [s]."""
 
-Answer = dict[str, Any] | bytes
+Piece = dict[str, Any] | bytes
 """JSON, or what `pack_arrays` gives."""
 
-Emit = Callable[[Answer], None]
+Emit = Callable[[Piece], None]
 
 
 class Job:
-    """A live job: a request of the page, with the functions that send its answers.
-
-    Parameters
-    ----------
-    request
-        Request that the job answers.
-    """
+    """A live job: a request of the page, with the functions that send its answers."""
 
     def __init__(self, request: Request) -> None:
         self.request, self.id = request, request.id
@@ -71,7 +66,7 @@ class Job:
         self._emit(pack_arrays(arrays, {"id": self.id, "kind": kind, **attrs}))
 
 
-def _nowhere(answer: Answer) -> None:
+def _nowhere(answer: Piece) -> None:
     """Ignore an answer; used until a job has a receiver."""
 
 
@@ -79,15 +74,7 @@ Work = Callable[[Job], None]
 
 
 class Desk:
-    """Queue of live jobs of one kind. One job runs at a time, in a thread that exists only while there are jobs.
-
-    Parameters
-    ----------
-    emit
-        Takes answers.
-    work
-        Does a job.
-    """
+    """Queue of live jobs of one kind. One job runs at a time, in a thread that exists only while there are jobs."""
 
     def __init__(self, emit: Emit, work: Work) -> None:
         self._emit, self._work = emit, work

@@ -1,4 +1,4 @@
-"""Hold what all live sessions of a run share: compiled code, known attractors, opened data."""
+"""Hold what all live sessions of a run share: compiled code, known attractors with their colours, opened data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
@@ -17,18 +17,122 @@ import xarray as xr
 from magpend_core.equilibria import newton_steps
 from magpend_core.models.parameters import ParameterError
 from magpend_core.orbits import section_map
-from pipeline.explorer.data.series import orbit_series
-from pipeline.explorer.live.catalog import Catalog, Known
+from magpend_core.status import Status
+from pipeline.analysis.ragged import dims_of, isel
+from pipeline.explorer import RequestError
+from pipeline.explorer.data.colours import rgb
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import orbit_series
+from pipeline.explorer.live.catalog import Catalog, Entry, Known
 from pipeline.explorer.live.jobs import PATIENCE_S
-from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.messages import RequestError
-from pipeline.explorer.live.settling import Flight, Place
+from pipeline.explorer.live.settling import LiveFlight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
-from pipeline.layout.domains import check_states
-from pipeline.layout.vocabulary import axis_name
+from pipeline.layout.evaluation import check_states
+from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES, axis_name
+from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
+from pipeline.plots.palette import MOTION_COLOURS as MOTION_COLOURS
 from pipeline.runs.derive import stored
 from pipeline.specification.tables import FREQUENCY
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
+
+
+class Legend:
+    """Names and colours for the entries of a catalog, those of the run's attractors if they are known."""
+
+    def __init__(self, catalog: Catalog, attractors: xr.Dataset | None) -> None:
+        self._catalog, self._model = catalog, catalog.model
+        self._known = attractors is not None
+        ids = [e.attractor for e in catalog.entries if e.attractor is not None]
+        self._names: dict[int, str] = {}
+        self._colours: dict[int, str] = {}
+        if attractors is not None:
+            index = catalog.place.index
+            part = attractors if index is None else isel(attractors, dict(zip(dims_of(attractors), index, strict=True)))
+            cast = cast_of(attractors, part)
+            self._names, self._colours = cast.names, cast.colours
+        taken = {self._colours[i] for i in ids}
+        self._free = [colour for colour in COLOURS if colour not in taken] or [OTHERS]
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Return the number, label, colour and attractor id of every catalog entry, sorted by number."""
+        new = 0
+        found: list[dict[str, Any]] = []
+        for entry in sorted(list(self._catalog.entries), key=lambda e: e.number):
+            colour = self._colour(entry, new)
+            new += entry.attractor is None and entry.kind != ABSENT and entry.stability == ATTRACTS
+            name = self.name(entry)
+            again = sum(line["label"].partition(" #")[0] == name for line in found)
+            found.append(
+                {
+                    "id": entry.number,
+                    "label": f"{name} #{again + 1}" if again else name,
+                    "colour": colour,
+                    "attractor": entry.attractor,
+                }
+            )
+        return found
+
+    def line(self, entry: Entry) -> dict[str, Any]:
+        """Return the number, label, colour and attractor id of one catalog entry."""
+        return next(line for line in self.lines() if line["id"] == entry.number)
+
+    def name(self, entry: Entry) -> str:
+        """Return the name of a catalog entry, such as ``period 3``."""
+        if entry.attractor is not None:
+            return self._names[entry.attractor]
+        if entry.status:
+            return _status_word(entry.status)
+        if entry.kind == EQUILIBRIUM:
+            told = "at rest"
+        elif entry.period:
+            told = f"period {entry.period}"
+        elif np.isfinite(entry.seconds):
+            told = f"limit cycle ({entry.seconds:.4g} s)"
+        else:
+            told = "not periodic"
+        motion = self.motion(entry.motion)
+        text = ", ".join(filter(None, (told, motion, _shown(entry.stability))))
+        return f"not among the run's: {text}" if self._known and entry.kind != ABSENT else text
+
+    def motion(self, code: int) -> str:
+        """Return the name of a class of motion from its code; an empty text if it has none."""
+        classifier = self._model.classifier
+        if classifier is None or not code or code in classifier.neutral:
+            return ""
+        return classifier.words[code]
+
+    def _colour(self, entry: Entry, new: int) -> str:
+        if entry.status:
+            return rgb(GREYS.get(_status_word(entry.status), GREYS["failed"]))
+        if entry.kind != ABSENT and entry.stability in GREY_OF:
+            return rgb(GREY_OF[entry.stability])
+        if entry.attractor is not None:
+            return self._colours[entry.attractor]
+        if entry.kind != ABSENT:
+            return self._free[new % len(self._free)]
+        motion = self.motion(entry.motion)
+        # paler than any attractor's: a class of cells is none
+        return (
+            _pale(rgb(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]))
+            if motion
+            else rgb(GREYS["not settled"])
+        )
+
+
+def _status_word(status: int) -> str:
+    if status in (Status.STEP_LIMIT, Status.STEP_UNDERFLOW, Status.UNREACHED):
+        return "failed"
+    return Status(status).name.lower().replace("_", " ")
+
+
+def _shown(stability: int) -> str:
+    return "" if stability in (0, ATTRACTS) else STABILITIES[stability].replace("_", " ")
+
+
+def _pale(colour: str) -> str:
+    parts = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return "#" + "".join(f"{(part + 2 * 235) // 3:02x}" for part in parts)
+
 
 LOG = logging.getLogger(__name__)
 
@@ -47,7 +151,7 @@ CLOSING_S = PATIENCE_S + 2.0
 """Time that all jobs have to end when the run is closed [s]."""
 
 
-def live_problem(run: Run) -> str | None:
+def live_problem(run: RunDirectory) -> str | None:
     """Return the reason why trajectories of a run cannot be computed live; None if they can."""
     if problem := run.spec.motion.refusal("a live trajectory"):
         return f"{run.name}: {problem}"
@@ -73,19 +177,13 @@ class Session(Protocol):
 
 
 class LiveRun:
-    """A run for live computation, with the state that all its sessions share.
+    """A run for which `live_problem` has nothing to say, with the state that all its live sessions share."""
 
-    Parameters
-    ----------
-    run
-        An opened run for which `live_problem` has nothing to say.
-    """
-
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RunDirectory) -> None:
         problem = live_problem(run)
         if problem is not None:
             raise RequestError(problem)
-        self.run, self.model, self.spec = run, run.model, run.spec
+        self.run, self.model, self.spec = ExploredRun.of(run), run.model, run.spec
         self.integration = run.spec.integration
         self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
         self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
@@ -93,7 +191,6 @@ class LiveRun:
         self._lock = threading.Lock()
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None
-        self._cube: xr.Dataset | None = None
         self._sessions: set[Session] = set()
         self._warming = Warming(self)
 
@@ -129,12 +226,9 @@ class LiveRun:
     # ---- parameter points --------------------------------------------------------------------
 
     def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
-        """Return the parameter point for given values; values that are not given are those of the run.
+        """Return the parameter point for given values; the other values are those of the run.
 
-        Raises
-        ------
-        RequestError, ParameterError
-            If a name is unknown, or a value out of bounds.
+        Raise RequestError or ParameterError if a name is unknown, or a value out of bounds.
         """
         parameters = self.spec.values.replace(**values)
         hertz = self._frequency(frequency)
@@ -182,13 +276,7 @@ class LiveRun:
         return tuple(found)
 
     def state(self, values: Mapping[str, float], place: Place) -> np.ndarray:
-        """Return an initial state from values by name; states that are not given are 0.
-
-        Raises
-        ------
-        RequestError
-            If the model has no such state.
-        """
+        """Return an initial state from values by name, 0 for other states; raise RequestError for an unknown name."""
         names = self.model.state_names
         unknown = [name for name in values if name not in names]
         if unknown:
@@ -239,10 +327,7 @@ class LiveRun:
     @property
     def cube(self) -> xr.Dataset:
         """Result cube of the run, opened once."""
-        with self._lock:
-            if self._cube is None:
-                self._cube = self.run.cube()
-            return self._cube
+        return self.run.cube()
 
     def legend(self, catalog: Catalog) -> Legend:
         """Return the names and colours of the attractors of a catalog."""
@@ -306,9 +391,8 @@ class Warming:
     def _sections(self) -> None:
         live = self._live
         place, start = live.first_start()
-        flight = Flight(place, live.integration, start[None], lambda: None)
-        section, _ = flight.advance(np.array([0]), 1)
-        flight.closed(section, live.integration)
+        flight = LiveFlight(place, live.integration, start[None], lambda: None)
+        flight.advance(1)
         if live.model.autonomous:  # where it rests is told at its end
             newton_steps(live.model.system, start[None], place.parameters.pack())
 

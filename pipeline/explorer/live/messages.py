@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from pipeline.explorer import RequestError
+
 MOST_BYTES = 65_536
 """Longest message [bytes]."""
 
@@ -28,20 +30,6 @@ Values = Annotated[dict[Name, float], Field(max_length=200)]
 Pair = tuple[float, float]
 
 
-class RequestError(ValueError):
-    """Raised if a message of the page is invalid or cannot be carried out.
-
-    Attributes
-    ----------
-    job : int or None
-        Its ``id``, if that could be read.
-    """
-
-    def __init__(self, sentence: str, job: int | None = None) -> None:
-        super().__init__(sentence)
-        self.job = job
-
-
 class Message(BaseModel):
     """Base of all messages of the page: strict types, no unknown keys, no NaN, no infinity."""
 
@@ -55,24 +43,17 @@ class Job(Message):
 
 
 class StartRequest(Job):
-    """Message that requests to integrate one initial state and to name the attractor that it reaches.
-
-    Attributes
-    ----------
-    noise
-        Strength of white noise on the rates, in units of their scales over the square root of a second. With
-        noise no attractor is named.
-    seed
-        Seed of the noise.
-    """
+    """Message that requests to integrate one initial state and to name the attractor that it reaches."""
 
     do: Literal["start"]
     parameters: Values = {}
     frequency: float | None = Field(None, gt=0)
     state: Values = {}
     periods: int | None = Field(None, ge=1, le=MOST_PERIODS)
+    # strength of white noise on the rates, in units of their scales over the square root of a second. With noise
+    # no attractor is named.
     noise: float = Field(0.0, ge=0, le=MOST_NOISE)
-    seed: int = Field(0, ge=0, le=2**53)
+    seed: int = Field(0, ge=0, le=2**53)  # seed of the noise
 
 
 class SliceRequest(Job):
@@ -110,23 +91,15 @@ class FollowRequest(Job):
 
 
 class Region(Message):
-    """Region that the user has selected on the page: intervals of parameters or of initial states.
+    """Region that the user has selected on the page: intervals of parameters or of initial states."""
 
-    Attributes
-    ----------
-    x, y
-        Intervals in the units of the cube.
-    axes
-        Names of what `x` and `y` are intervals of: axes of the cube, or states of the starts; by default
-        `x` is of the axis that is walked, or of the first. What is neither, such as a diagram's vertical
-        axis, is left as it was.
-    at
-        Index on each other axis that the new run is to have one value of.
-    """
-
-    x: Pair
+    x: Pair  # x, y: intervals in the units of the cube
     y: Pair | None = None
+    # names of what `x` and `y` are intervals of: axes of the cube, or states of the starts; by default `x` is of
+    # the axis that is walked, or of the first. What is neither, such as a diagram's vertical axis, is left as it
+    # was.
     axes: tuple[Name, Name | None] | None = None
+    # index on each other axis that the new run is to have one value of
     at: Annotated[dict[Name, int], Field(max_length=200)] = {}
 
 
@@ -149,19 +122,21 @@ _READER: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discriminat
 
 
 def read_request(text: str | bytes) -> Request:
-    """Read and check a message of the page; raise RequestError if it is invalid.
-
-    Raises
-    ------
-    RequestError
-        With one sentence that says what is wrong with it.
-    """
+    """Read and check a message of the page; raise RequestError with one sentence if it is invalid."""
     if len(text) > MOST_BYTES:
         raise RequestError(f"the message has {len(text)} bytes; the limit is {MOST_BYTES}.")
     try:
         return _READER.validate_json(text)
     except ValidationError as error:
         raise RequestError(sentence_of(error), number_in(text)) from None
+
+
+def read_region(text: bytes) -> Region:
+    """Read and check a region of the page; raise RequestError if it is invalid."""
+    try:
+        return Region.model_validate_json(text)
+    except ValidationError as error:
+        raise RequestError(sentence_of(error)) from None
 
 
 def sentence_of(error: ValidationError) -> str:

@@ -17,15 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magpend_core.multipliers import orbit_exponents
+from magpend_core.orbits import orbit_exponents
 from magpend_core.status import Status
-from pipeline.analysis.attractors.describing import features
+from pipeline.analysis.attractors import features
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.lockstep import run_alone
 from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
-from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.explorer import RequestError
+from pipeline.explorer.data.orbits import attractor_of, fixed_points, orbit_series, parts_of
 from pipeline.explorer.live.jobs import Job
-from pipeline.explorer.live.messages import CellPoint, FollowRequest, RequestError
+from pipeline.explorer.live.messages import CellPoint, FollowRequest
 from pipeline.explorer.live.settling import Place, system_at
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.vocabulary import PERIODIC_ORBIT, axis_name
@@ -59,51 +60,25 @@ HALVED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A periodic orbit that a page can refer to: its parameter point, its period and a section point.
-
-    Attributes
-    ----------
-    period : int
-        Drive periods or returns.
-    state : ndarray
-        A section point.
-    """
+    """A periodic orbit that a page can refer to: its parameter point, its period and a section point."""
 
     place: Place
-    period: int
-    state: np.ndarray
+    period: int  # drive periods or returns
+    state: np.ndarray  # a section point
 
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Result of following an orbit: the parameter value and the orbit that were reached, and why it went no further.
+    """Result of following an orbit: the parameter value and the orbit that were reached, and why it went no further."""
 
-    Attributes
-    ----------
-    value : float
-        Parameter value that was reached.
-    point : Point
-        The orbit at this value.
-    sentence : str
-        Why no farther; empty if it was followed to the value wanted.
-    lost : bool
-        Whether there is none beyond, rather than no time.
-    """
-
-    value: float
-    point: Point
-    sentence: str
-    lost: bool
+    value: float  # parameter value that was reached
+    point: Point  # the orbit at this value
+    sentence: str  # why no farther; empty if it was followed to the value wanted
+    lost: bool  # whether there is none beyond, rather than no time
 
 
 class Follower:
-    """Handles a session's requests to follow orbits, and remembers the orbits it has found.
-
-    Parameters
-    ----------
-    live
-        The run.
-    """
+    """Handles a session's requests to follow orbits, and remembers the orbits it has found."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._lock = live, threading.Lock()
@@ -196,21 +171,9 @@ def _value(place: Place, name: str) -> float:
 
 
 def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
-    """Return the periodic orbit of a cell: its parameter point, its period and one of its section points.
+    """Return the periodic orbit of a cell: its parameter point, its period and one of its stored section points.
 
-    Parameters
-    ----------
-    live
-        The run.
-    cell
-        Number of the cell in C order.
-    point
-        Number of one of its stored section points.
-
-    Raises
-    ------
-    RequestError
-        If there is no such cell, or it is on no closed orbit.
+    Raise RequestError if there is no such cell or point, or the cell is on no closed orbit.
     """
     status = live.cube["status"]
     if cell >= status.size:
@@ -237,14 +200,8 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
 
 def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
     """Return the period of the stored attractor on which a cell ends; 0 if that is no periodic orbit."""
-    attractors = live.attractors
-    if attractors is None:
-        return 0
-    here = attractors.isel({d: i for d, i in at.items() if d in attractors["attractor_id"].dims})
-    number = int(here["attractor_id"].values)
-    if number < 0 or int(here["kind"].isel(attractor=number).values) != PERIODIC_ORBIT:
-        return 0
-    return int(here["orbit_period"].isel(attractor=number).values)
+    here = attractor_of(live.attractors, at)
+    return 0 if here is None or int(here["kind"]) != PERIODIC_ORBIT else int(here["orbit_period"])
 
 
 def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
@@ -341,7 +298,7 @@ def described(
         "attractor": None,
         "share": None,
         "stable": bool(np.abs(multipliers).max() < 1.0),
-        "multipliers": [[float(m.real), float(m.imag)] for m in multipliers],
+        "multipliers": parts_of(multipliers),
         "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, is_flow)],
         "seeds": [],
         "at": None,

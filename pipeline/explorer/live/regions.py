@@ -16,19 +16,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import KEY
+from pipeline.explorer import RequestError
 from pipeline.explorer.live.jobs import PATIENCE_S, Job
-from pipeline.explorer.live.messages import Region, RequestError, RunRequest
+from pipeline.explorer.live.messages import Region, RunRequest
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.identity import canonical
-from pipeline.layout.limits import check_plan
-from pipeline.layout.plan import make_plan
+from pipeline.layout.plan import check_plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name
 from pipeline.runs.status import state
 from pipeline.runs.zoom import Changes, to_toml, zoom
-from pipeline.specification.parsing import Spec
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, RandomStarts
 from pipeline.store.errors import StoreError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
@@ -45,25 +45,19 @@ DIGITS = 4
 _PACKAGES = Path(__file__).parents[3]
 
 
-def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
-    """Return the specification for a selected region, and notes on the parts of it that lie outside the run.
-
-    Raises
-    ------
-    SpecError, RequestError
-        If the region is none of this run's.
-    """
+def zoomed(run: RunDirectory, region: Region) -> tuple[Spec, list[str]]:
+    """Return the specification for a selected region, and notes on the parts of it that lie outside the run."""
     return zoom(run.spec, changes_of(run, region))
 
 
-def zoom_toml(run: Run, region: Region) -> str:
+def zoom_toml(run: RunDirectory, region: Region) -> str:
     """Return the specification for a selected region as TOML, with comments on its origin."""
     spec, notes = zoomed(run, region)
     head = [f"# Zoom into a run, digest {run.info.digest}.", *(f"# note: {_one_line(note)}" for note in notes)]
     return "\n".join([*head, to_toml(spec)])
 
 
-def changes_of(run: Run, region: Region) -> Changes:
+def changes_of(run: RunDirectory, region: Region) -> Changes:
     """Return the changes that restrict the specification of a run to a selected region."""
     swept = {axis.parameter: axis for axis in parameter_axes(run.spec)}
     first, second = _names(run, region, list(swept))
@@ -83,7 +77,7 @@ def changes_of(run: Run, region: Region) -> Changes:
     return Changes(ranges, pins)
 
 
-def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
+def _names(run: RunDirectory, region: Region, swept: list[str]) -> tuple[str, str | None]:
     """Return the names of the one or two axes or states that a selected region restricts."""
     walk = run.spec.continuation
     if region.axes is None:
@@ -123,7 +117,7 @@ def _one_line(text: str) -> str:
 # ---- running it ----------------------------------------------------------------------------------
 
 
-def region_name(run: Run, spec: Spec) -> str:
+def region_name(run: RunDirectory, spec: Spec) -> str:
     """Return the name of the directory for the run of a region; equal specifications have equal names."""
     digest = hashlib.sha256(canonical(spec.as_dict()).encode()).hexdigest()[:8]
     base = re.sub(r"-zoom-[0-9a-f]{8}$", "", run.directory.resolve().name)
@@ -131,13 +125,7 @@ def region_name(run: Run, spec: Spec) -> str:
 
 
 class RegionRunner:
-    """Computes the runs of selected regions, one at a time for all users.
-
-    Parameters
-    ----------
-    live
-        The run.
-    """
+    """Computes the runs of selected regions, one at a time for all users."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._busy = live, live.region_lock

@@ -9,12 +9,28 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 
-from pipeline.explorer.live import handlers
-from pipeline.explorer.live.jobs import Answer, Desk, Job
+from pipeline.explorer import RequestError
+from pipeline.explorer.live.jobs import Desk, Job, Piece, Work
 from pipeline.explorer.live.live import LiveRun
-from pipeline.explorer.live.messages import CancelRequest, Request, RequestError, read_request
+from pipeline.explorer.live.messages import CancelRequest, Request, read_request
+from pipeline.explorer.live.orbit_following import Follower
+from pipeline.explorer.live.regions import RegionRunner
+from pipeline.explorer.live.slices import slice_of
+from pipeline.explorer.live.starting import start
+
+
+def works(live: LiveRun) -> Mapping[str, Work]:
+    """Return the function that does each kind of live job, by the kind's name."""
+    return {
+        "start": partial(start, live),
+        "slice": partial(slice_of, live),
+        "follow": Follower(live).follow,
+        "run": RegionRunner(live).run,
+    }
+
 
 LOG = logging.getLogger(__name__)
 
@@ -22,25 +38,20 @@ LOG = logging.getLogger(__name__)
 class LiveSession:
     """Live session of one page: its queues of jobs, and the function that sends answers.
 
-    Parameters
-    ----------
-    live
-        Run with the state that all sessions share.
-    emit
-        Function that sends an answer; called from threads of jobs, one call at a time for each kind of job.
+    `emit` is called from threads of jobs, one call at a time for each kind of job.
     """
 
-    def __init__(self, live: LiveRun, emit: Callable[[Answer], None]) -> None:
+    def __init__(self, live: LiveRun, emit: Callable[[Piece], None]) -> None:
         self.live = live
         self._emit, self._closed = emit, threading.Event()
-        self._desks = {kind: Desk(self._emit_open, work) for kind, work in handlers.works(live).items()}
+        self._desks = {kind: Desk(self._emit_open, work) for kind, work in works(live).items()}
         live.enter(self)
         live.warm(self._tell_warming)
 
     def _tell_warming(self, done: int, total: int) -> None:
         self._emit_open({"id": None, "kind": "progress", "what": "warming", "done": done, "total": total})
 
-    def _emit_open(self, answer: Answer) -> None:
+    def _emit_open(self, answer: Piece) -> None:
         if not self._closed.is_set():
             self._emit(answer)
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from magpend_core.engine.observers import window_of
 from magpend_core.engine.system import System
-from magpend_core.extension import more_sections, orbit_periods
 from magpend_core.models.model import Model, Parameters
-from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.flight import Flight
 from pipeline.analysis.tolerances import EXTEND_CLOSURE, EXTEND_RTOL
-from pipeline.explorer.live.messages import RequestError
+from pipeline.explorer import RequestError
 from pipeline.specification.tables import Integration
 
 MOST_STEPS = 200_000
@@ -59,19 +58,11 @@ Check = Callable[[], None]
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A parameter point: parameters, frequency and, if it is a point of the run, its index there.
-
-    Attributes
-    ----------
-    frequency : float
-        As the engine takes it [Hz]: of the drive; of a flow seen at crossings one over the longest wait.
-    index : tuple of int or None
-        Index on each axis of the cube's parameters; None where the cube has no such point.
-    """
+    """A parameter point: parameters, frequency and, if it is a point of the run, its index there."""
 
     parameters: Parameters
-    frequency: float
-    index: tuple[int, ...] | None
+    frequency: float  # as the engine takes it [Hz]: of the drive; of a flow seen at crossings one over the longest wait
+    index: tuple[int, ...] | None  # index on each axis of the cube's parameters; None where the cube has no such point
 
     @property
     def key(self) -> tuple[float, ...]:
@@ -84,8 +75,8 @@ def system_at(place: Place, integration: Integration) -> System:
     return replace(place.parameters.model.system, method=integration.method)
 
 
-class Flight:
-    """Trajectories at one parameter point that are integrated a few periods at a time.
+class LiveFlight(Flight):
+    """Trajectories of a live job, which are integrated in short calls so that the job can be cancelled in between.
 
     Parameters
     ----------
@@ -97,99 +88,54 @@ class Flight:
         Initial states, shape (n, n_states).
     check
         Asked before every call of the kernel.
-
-    Attributes
-    ----------
-    status : ndarray of int8, (n,)
-        ``BOUNDED`` for those that go on, else what ended them.
-    state : ndarray, (n, n_states)
-        Current state of each trajectory.
     """
 
     def __init__(self, place: Place, integration: Integration, starts: np.ndarray, check: Check) -> None:
-        self._place, self._system, self._check = place, system_at(place, integration), check
-        self._packed = place.parameters.pack()
-        self.state = np.array(starts, np.float64)
-        self._step = np.zeros(len(starts))
-        self.status = np.full(len(starts), int(Status.BOUNDED), np.int8)
-        self._options: dict[str, Any] = {
-            "rtol": integration.rtol,
-            "atol": integration.atol,
-            "system": self._system,
-            "max_steps_per_period": min(integration.max_steps_per_period, MOST_STEPS),
-        }
-        self._seconds = 0.0
+        super().__init__(
+            system_at(place, integration),
+            place.parameters.pack(),
+            place.frequency,
+            starts,
+            rtol=integration.rtol,
+            atol=integration.atol,
+            max_steps=min(integration.max_steps_per_period, MOST_STEPS),
+            closure=integration.closure_tolerance,
+            longest=integration.max_orbit_period,
+            most=window_of(integration.max_orbit_period),
+        )
+        self._check, self._call_s = check, 0.0
 
-    def advance(self, rows: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate the trajectories `rows` over `n` periods, in short calls so that the job can be cancelled in
-        between.
-
-        Returns
-        -------
-        section : ndarray, (row, n, state)
-            NaN from where a cell ended.
-        turns : ndarray, (row, angle)
-            Full turns since the section before.
-        """
-        section = np.full((len(rows), n, self.state.shape[1]), np.nan)
-        turns = np.zeros((len(rows), sum(self._system.is_angle)), np.int64)
+    def _calls(self, n: int) -> Iterator[int]:
         done = 0
         while done < n:
-            going = np.flatnonzero(self.status[rows] == Status.BOUNDED)
-            if not len(going):
-                break
             self._check()
-            most = FIRST_CALL if not self._seconds else max(1, int(CALL_S / (self._seconds * len(going))))
-            k = min(n - done, most)
-            started = time.perf_counter()
-            section[going, done : done + k], more = self._call(rows[going], k)
-            self._seconds = max((time.perf_counter() - started) / (k * len(going)), 1e-9)
-            turns[going] += more
+            going = self.flying.sum()
+            most = FIRST_CALL if not self._call_s else max(1, int(CALL_S / (self._call_s * max(going, 1))))
+            k, started = min(n - done, most), time.perf_counter()
+            yield k
+            self._call_s = max((time.perf_counter() - started) / (k * going), 1e-9)
             done += k
-        return section, turns
 
-    def _call(self, rows: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        m = len(rows)
-        packed = np.tile(self._packed, (m, 1, 1))
-        frequency = np.full((m, 1), self._place.frequency)
-        found = more_sections(packed, frequency, self.state[rows], self._step[rows], n_more=n, **self._options)
-        self.status[rows], self.state[rows] = found.status[:, 0], found.final_state[:, 0]
-        self._step[rows] = np.nan_to_num(found.step_size[:, 0])
-        return found.section[:, 0], found.turns[:, 0]
-
-    def closed(self, section: np.ndarray, integration: Integration) -> np.ndarray:
-        """Return the orbit period of each trajectory, from its last section points; 0 if it has not closed on an
-        orbit.
-        """
-        return orbit_periods(
-            section,
-            closure_tolerance=integration.closure_tolerance,
-            max_orbit_period=integration.max_orbit_period,
-            system=self._system,
-        )
-
-    def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
-        """Return trajectories as a `Block` for the analyses, with the status that cells of a run would have."""
-        status = self.status[rows].copy()
-        kept = status == Status.BOUNDED
-        status[kept & (period > 0)] = Status.PERIODIC
-        section = np.where(kept[:, None, None], section, np.nan)
-        rest = np.where((status == Status.NO_RETURN)[:, None], self.state[rows], np.nan)
-        own = np.where(kept, period, 0).astype(np.int16)
-        return Block(slice(0, len(rows)), section, status, own, np.where(kept[:, None], turns, 0), rest)
+    def look(self, ends: Ends, *, strictly: bool = False) -> np.ndarray:
+        """Return the catalog number of the orbit that each trajectory has reached; -1 if it is not decided yet."""
+        no_turns = np.zeros((len(self.rows), sum(ends.model.is_angle)), np.int64)
+        block = self.block(self.section, no_turns, self.closed(self.section))
+        if ends.model.autonomous:  # an equilibrium is told at the end alone
+            return ends.on_orbits(block)
+        return ends.conclude(block, final=False, strictly=strictly)
 
 
 Tell = Callable[[np.ndarray, int], None]
 """Is given new sections (k, n_states), and the number of periods done."""
 
 
-def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
+def run_start(flight: LiveFlight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
     """Integrate one initial state like a cell of the run, and report its section points as they are computed.
 
     Parameters
     ----------
     flight
-        Integration of one cell.
+        Trajectory of one cell.
     integration
         The run's settings.
     tell
@@ -203,38 +149,25 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
         raise RequestError(
             f"the run keeps {n_keep} sections of each cell, and a live start at most {MOST_KEPT}; give periods."
         )
-    only, early = np.array([0]), integration.stop_when_closed
-    window = window_of(integration.max_orbit_period)
-    last = flight.state[:, None][:, :0]
-    done, period, leg = 0, 0, window // 4 if early else 2
-    while done < n_transient and not period and flight.status[0] == Status.BOUNDED:
+    early, window = integration.stop_when_closed, window_of(integration.max_orbit_period)
+    done, leg, period = 0, window // 4 if early else 2, np.zeros(1, np.int16)
+    while done < n_transient and not period[0] and flight.flying[0]:
         n = min(leg - done % leg if early else leg, n_transient - done)
-        section, _ = flight.advance(only, n)
+        section = flight.advance(n).section
         done += n
-        last = np.concatenate([last, section], axis=1)[:, -window:]
         tell(section[0], done)
-        if early and done >= window and done % leg == 0 and flight.status[0] == Status.BOUNDED:
-            period = int(flight.closed(last, integration)[0])
+        if early and done >= window and done % leg == 0 and flight.flying[0]:
+            period = flight.closed(flight.section)
         leg = leg if early else min(2 * leg, 64)
-    kept, turns, left = last[:, :0], np.zeros((1, 0), np.int64), n_keep
+    kept, turns, left = flight.section[:, :0], np.zeros((1, 0), np.int64), n_keep
     while left:
         n = min(64, left) if kept.shape[1] else 1
-        section, more = flight.advance(only, n)
+        new = flight.advance(n)
         # turns count from the first section that is kept
-        turns = turns + more if kept.shape[1] else np.zeros_like(more)
-        kept, done, left = np.concatenate([kept, section], axis=1), done + n, left - n
-        tell(section[0], done)
-    if not period and flight.status[0] == Status.BOUNDED:
-        period = int(flight.closed(np.concatenate([last, kept], axis=1)[:, -window:], integration)[0])
-    return flight.block(only, kept, turns, np.array([period]))
-
-
-def taken(block: Block, rows: np.ndarray) -> Block:
-    """Select the cells at the indices `rows` of a block."""
-    rest = None if block.rest is None else block.rest[rows]
-    return Block(
-        slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows], block.turns[rows], rest
-    )
+        turns = turns + new.turns if kept.shape[1] else np.zeros_like(new.turns)
+        kept, done, left = np.concatenate([kept, new.section], axis=1), done + n, left - n
+        tell(new.section[0], done)
+    return flight.block(kept, turns, period if period[0] else flight.closed(flight.section))
 
 
 RUN_ON_LEGS = 32
@@ -245,13 +178,7 @@ RUN_ON_LEG = 64
 
 
 def run_on(
-    place: Place,
-    integration: Integration,
-    ends: Ends,
-    block: Block,
-    states: np.ndarray,
-    check: Check,
-    tell: Tell | None = None,
+    place: Place, integration: Integration, ends: Ends, states: np.ndarray, check: Check, tell: Tell | None = None
 ) -> np.ndarray:
     """Integrate undecided cells further until they reach a known orbit; return catalog numbers, -1 if they reach none.
 
@@ -263,45 +190,25 @@ def run_on(
         Where, and the run's settings.
     ends
         Catalog of the attractors at the parameter point.
-    block
-        The undecided cells.
     states
         Their last sections.
     check, tell
-        See `Flight` and `Tell`; sections of the first cell are told.
+        See `LiveFlight` and `Tell`; sections of the first cell are told.
     """
     settings = integration.model_copy(
         update={"rtol": EXTEND_RTOL, "atol": EXTEND_RTOL, "closure_tolerance": EXTEND_CLOSURE}
     )
-    flight = Flight(place, settings, states, check)
+    flight = LiveFlight(place, settings, states, check)
     numbers = np.full(len(states), -1, np.int64)
-    rows, last = np.arange(len(states)), block.section[:, :0]
-    window = window_of(settings.max_orbit_period)
     for leg in range(RUN_ON_LEGS):
-        section, _ = flight.advance(rows, RUN_ON_LEG)
-        last = np.concatenate([last, section], axis=1)[:, -window:]
-        if tell is not None and len(rows) and rows[0] == 0:
+        section = flight.advance(RUN_ON_LEG).section
+        if tell is not None and flight.rows[0] == 0:
             tell(section[0], (leg + 1) * RUN_ON_LEG)
-        numbers[rows] = _look(flight, rows, last, settings, ends, strictly=True)
-        going = (numbers[rows] < 0) & (flight.status[rows] == Status.BOUNDED)
-        rows, last = rows[going], last[going]
-        if not len(rows):
+        numbers[flight.rows] = flight.look(ends, strictly=True)
+        flight.keep((numbers[flight.rows] < 0) & flight.flying)
+        if not len(flight.rows):
             break
     return numbers
-
-
-def _look(
-    flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Ends, *, strictly: bool = False
-) -> np.ndarray:
-    """Return the catalog number of the orbit that each trajectory has reached; -1 if it is not decided yet."""
-    no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
-    period = np.zeros(len(rows), np.int16)
-    alive = flight.status[rows] == Status.BOUNDED
-    period[alive] = flight.closed(last[alive], integration)
-    block = flight.block(rows, last, no_turns, period)
-    if ends.model.autonomous:  # an equilibrium is told at the end alone
-        return ends.on_orbits(block)
-    return ends.conclude(block, final=False, strictly=strictly)
 
 
 def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.ndarray, check: Check) -> np.ndarray:
@@ -319,35 +226,21 @@ def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.
     starts
         Initial states, shape (n, n_states).
     check
-        See `Flight`.
+        See `LiveFlight`.
     """
-    flight = Flight(place, integration, starts, check)
+    flight = LiveFlight(place, integration, starts, check)
     numbers = np.full(len(starts), -1, np.int64)
-    rows, last = np.arange(len(starts)), np.zeros((len(starts), 0, starts.shape[1]))
-    window, done = window_of(integration.max_orbit_period), 0
-    n_transient = min(integration.n_transient, MOST_TRANSIENT)
-    while done < n_transient and len(rows):
+    done, n_transient = 0, min(integration.n_transient, MOST_TRANSIENT)
+    while done < n_transient and flight.flying.any():
         n = min(LEG, n_transient - done)
-        section, _ = flight.advance(rows, n)
-        last, done = np.concatenate([last, section], axis=1)[:, -window:], done + n
-        numbers[rows] = _look(flight, rows, last, integration, ends)
-        going = (numbers[rows] < 0) & (flight.status[rows] == Status.BOUNDED)
-        rows, last = rows[going], last[going]
-    kept = min(integration.n_keep, MOST_KEPT_OF_SLICE)
-    first, _ = flight.advance(rows, 1)
-    section, turns = flight.advance(rows, kept - 1)
-    section = np.concatenate([first, section], axis=1)
-    ring = np.concatenate([last, section], axis=1)[:, -window:]
-    blank = np.full((len(starts), kept, starts.shape[1]), np.nan)
-    all_turns = np.zeros((len(starts), turns.shape[1]), np.int64)
-    period = np.zeros(len(starts), np.int16)
-    blank[rows], all_turns[rows] = section, turns
-    alive = rows[flight.status[rows] == Status.BOUNDED]
-    if len(alive):
-        period[alive] = flight.closed(ring[flight.status[rows] == Status.BOUNDED], integration)
-    rest = np.flatnonzero(numbers < 0)
-    block = flight.block(rest, blank[rest], all_turns[rest], period[rest])
-    numbers[rest] = conclude(place, integration, ends, block, flight.state[rest], check)
+        flight.advance(n)
+        done += n
+        numbers[flight.rows] = flight.look(ends)
+        flight.keep(numbers[flight.rows] < 0)
+    first, rest = flight.advance(1), flight.advance(min(integration.n_keep, MOST_KEPT_OF_SLICE) - 1)
+    section = np.concatenate([first.section, rest.section], axis=1)
+    block = flight.block(section, rest.turns, flight.closed(flight.section))
+    numbers[flight.rows] = conclude(place, integration, ends, block, flight.state[flight.rows], check)
     return numbers
 
 
@@ -364,8 +257,8 @@ def conclude(
     numbers = ends.conclude(block, final=False)
     unsure = np.flatnonzero(ends.unsure(block, numbers))
     if len(unsure):
-        numbers[unsure] = run_on(place, integration, ends, taken(block, unsure), states[unsure], check, tell)
+        numbers[unsure] = run_on(place, integration, ends, states[unsure], check, tell)
     left = np.flatnonzero(numbers < 0)
     if len(left):
-        numbers[left] = ends.conclude(taken(block, left))
+        numbers[left] = ends.conclude(block.take(left))
     return numbers

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.explorer import RequestError
 from pipeline.explorer.live.catalog import Catalog
 from pipeline.explorer.live.jobs import Job
-from pipeline.explorer.live.messages import LEAST_RESOLUTION, RequestError, SliceRequest
+from pipeline.explorer.live.messages import LEAST_RESOLUTION, SliceRequest
 from pipeline.explorer.live.settling import Place, settle_cells
 
 if TYPE_CHECKING:

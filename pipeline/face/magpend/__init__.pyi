@@ -3,6 +3,7 @@
 from magpend._runs import Run as Run
 from magpend._runs import open_run as open_run
 from magpend._runs import run as run
+from magpend._runs import table as table
 from magpend_core.engine.system import System as System
 from magpend_core.lyapunov import LyapunovExponents as LyapunovExponents
 from magpend_core.lyapunov import lyapunov_exponents as lyapunov_exponents
@@ -33,7 +34,7 @@ from pipeline.analysis.chaos.dimensions import kaplan_yorke_dimension as kaplan_
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
 from pipeline.compute.simulate import simulate as simulate
-from pipeline.explorer.notebook.showing import explorer as explorer
+from pipeline.explorer.notebook import explorer as explorer
 from pipeline.plots import DataFigure as DataFigure
 from pipeline.plots import Frame as Frame
 from pipeline.plots import draw_figure as draw_figure
@@ -55,7 +56,7 @@ from pipeline.plots import plot_section as plot_section
 from pipeline.plots import plot_trajectory as plot_trajectory
 from pipeline.plots import save_data as save_data
 from pipeline.plots import save_figure as save_figure
-from pipeline.plots.films import save_animation as save_animation
+from pipeline.plots.animation import save_animation as save_animation
 from pipeline.rig.identify.identification import identify as identify
 from pipeline.rig.recordings import findings_of as findings_of
 from pipeline.rig.recordings import load_mapping as load_mapping
@@ -64,20 +65,20 @@ from pipeline.rig.recordings import smooth as smooth
 from pipeline.rig.recordings import window as window
 from pipeline.rig.recordings import write_recording as write_recording
 from pipeline.rig.recordings.figure import plot_recording as plot_recording
-from pipeline.runs.building import Spec as Spec
 from pipeline.runs.derive import derive as derive
 from pipeline.runs.derive import prune as prune
 from pipeline.runs.drawing import figure as figure
 from pipeline.runs.extend import extend as extend
 from pipeline.runs.filming import animation as animation
-from pipeline.runs.python import table as table
+from pipeline.runs.preview import preview as preview
 from pipeline.runs.status import state as state
 from pipeline.runs.verify import verify_run as verify_run
 from pipeline.runs.zoom import zoom as zoom
-from pipeline.specification.drive_files import load_drive as load_drive
-from pipeline.specification.inputs import load_model as load_model
-from pipeline.specification.inputs import model as model
+from pipeline.specification.models import load_model as load_model
+from pipeline.specification.models import model as model
 from pipeline.specification.problems import SpecError as SpecError
+from pipeline.specification.recorded_drive import load_drive as load_drive
+from pipeline.specification.spec import Spec as Spec
 
 __version__: str
 

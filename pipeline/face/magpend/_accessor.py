@@ -80,7 +80,7 @@ class DatasetAccessor:
         ValueError
             If the Dataset is not the result of an analysis with a table.
         """
-        from pipeline.runs.python import table
+        from magpend._runs import table
 
         return table(self._ds)
 

@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.products.product import Analysis, Figure, Options, bounds_of
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.specification.problems import SpecError, unknown_name
-from pipeline.store.run import Run as StoredRun
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -94,10 +94,10 @@ class AnalysisMethod(_Method[P]):
     """The method of a run for the analysis of its name. As an attribute of the class it also takes a directory."""
 
     @overload
-    def __get__(self, run: None, owner: type) -> AnalysisCall[Concatenate[str | Path | StoredRun, P]]: ...
+    def __get__(self, run: None, owner: type) -> AnalysisCall[Concatenate[str | Path | RunDirectory, P]]: ...
     @overload
-    def __get__(self, run: StoredRun, owner: type) -> AnalysisCall[P]: ...
-    def __get__(self, run: StoredRun | None, owner: type) -> Any:
+    def __get__(self, run: RunDirectory, owner: type) -> AnalysisCall[P]: ...
+    def __get__(self, run: RunDirectory | None, owner: type) -> Any:
         return _bound(analysis(self.name), run)
 
 
@@ -150,7 +150,7 @@ _INTO: Keywords = {
 def analysis(name: str) -> Callable[..., xr.Dataset]:
     """Return the function of an analysis, which takes a run or its directory, and keywords."""
 
-    def analyse(source: str | Path | StoredRun, options: dict[str, Any], **where: Any) -> xr.Dataset:
+    def analyse(source: str | Path | RunDirectory, options: dict[str, Any], **where: Any) -> xr.Dataset:
         from pipeline.runs.derive import derive
 
         return derive(source, name, options, **where)

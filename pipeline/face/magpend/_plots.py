@@ -8,7 +8,7 @@ from magpend._methods import AnyPanels, Bifurcation, OnePanel, SeveralPanels
 from pipeline.products import figures as options
 from pipeline.products.product import FigureOptions, StateOptions
 from pipeline.products.registry import FIGURES
-from pipeline.store.run import Run as StoredRun
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,7 +46,7 @@ class Plots:
     escapes = AnyPanels(options.EscapeFigureOptions)
     density = AnyPanels(options.DensityFigureOptions)
 
-    def __init__(self, source: StoredRun | xr.Dataset) -> None:
+    def __init__(self, source: RunDirectory | xr.Dataset) -> None:
         self._source = source
 
     def __repr__(self) -> str:

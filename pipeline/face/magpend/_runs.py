@@ -3,42 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from magpend._methods import AnalysisMethod
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.basins import BasinOptions
-from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions
+from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions, TongueOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
-from pipeline.products.product import Options
-from pipeline.products.registry import CELL_PRODUCTS, COMMANDS
+from pipeline.products.product import Options, function_of
+from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
-from pipeline.products.tongues import TongueOptions
-from pipeline.runs import python
 from pipeline.runs.arguments import names_arguments
+from pipeline.runs.derive import stale, stored_each
+from pipeline.runs.progress import bar_in_notebook
+from pipeline.runs.run import run as complete
+from pipeline.runs.stopping import InterruptedRunError, interrupt
 from pipeline.specification.problems import SpecError, unknown_name
-from pipeline.store.run import Run as StoredRun
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
     from magpend._plots import Plots
-    from pipeline.explorer.notebook.widget import Explorer
+    from pipeline.explorer.widget import Explorer
     from pipeline.runs.status import State
     from pipeline.store.checking import Verification
     from pipeline.store.files import Files
 
-P = ParamSpec("P")
 
-
-class Run(StoredRun):
+class Run(RunDirectory):
     """An opened run directory with its analyses as methods and its figures under `plot`.
 
     A run holds the commit records found when it was opened, so that all its results use the same cells. Open it
@@ -85,7 +85,7 @@ class Run(StoredRun):
     density = AnalysisMethod(DensityOptions)
 
     @classmethod
-    def open(cls, source: str | Path | Files | StoredRun) -> Self:
+    def open(cls, source: str | Path | Files | RunDirectory) -> Self:
         """Open a run directory with its present commit records; return an opened run unchanged.
 
         Raises
@@ -99,7 +99,7 @@ class Run(StoredRun):
         """
         if isinstance(source, cls):
             return source
-        run = StoredRun.open(source)
+        run = RunDirectory.open(source)
         return cls(run.info, run.spec, run.plan, run.commits)
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
@@ -112,9 +112,7 @@ class Run(StoredRun):
 
     def tree(self, chunks: Any = None, *, check: bool | None = None) -> xr.DataTree:
         """Open the cube and all kept results of analyses as one tree; see `magpend.open_run`."""
-        from magpend._trees import tree_of
-
-        return tree_of(self, chunks, check)
+        return _tree_of(self, chunks, check)
 
     @property
     def _next(self) -> tuple[str, ...]:
@@ -160,10 +158,10 @@ class Run(StoredRun):
         """
         if name not in COMMANDS:
             raise SpecError(unknown_name("analysis", name, COMMANDS))
-        return python.table(getattr(self, name)(**options))
+        return table(getattr(self, name)(**options))
 
     @names_arguments
-    def explore(self, *, curves: str | Path | StoredRun | None = None, height: int = 720) -> Explorer:
+    def explore(self, *, curves: str | Path | RunDirectory | None = None, height: int = 720) -> Explorer:
         """Show the run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
 
         Parameters
@@ -186,7 +184,7 @@ class Run(StoredRun):
         >>> widget = run.explore()                                           # doctest: +SKIP
         >>> widget.selected["state"]                                         # doctest: +SKIP
         """
-        from pipeline.explorer.notebook.showing import explorer
+        from pipeline.explorer.notebook import explorer
 
         return explorer(self, curves=curves, height=height)
 
@@ -302,7 +300,7 @@ class Run(StoredRun):
         nums: Mapping[str, int] | None = None,
         samples: int | None = None,
         echo: Callable[[str], None] | None = None,
-    ) -> dict[str, Any]:
+    ) -> Spec:
         """Return this run's specification with narrower ranges, for `magpend.run`.
 
         Parameters
@@ -322,8 +320,8 @@ class Run(StoredRun):
 
         Returns
         -------
-        dict
-            Tables of the specification, as `magpend.run` takes them.
+        Spec
+            The new specification.
 
         Raises
         ------
@@ -344,36 +342,77 @@ class Run(StoredRun):
         if echo is not None:
             for note in notes:
                 echo(note)
-        return spec.as_dict()
+        return spec
 
 
-def _opening(function: Callable[P, StoredRun]) -> Callable[P, Run]:
-    """Wrap a function so that the run that it returns has methods for analyses and figures."""
+@names_arguments
+def run(
+    spec: str | Path | Mapping[str, Any] | Spec,
+    out: str | Path | None = None,
+    *,
+    smoke: bool = False,
+    echo: Callable[[str], None] = print,
+    **options: Any,
+) -> Run:
+    """Compute the missing cells of a specification's run, and return the opened run.
 
-    @wraps(function)
-    def opening(*args: P.args, **kwargs: P.kwargs) -> Run:
-        return Run.open(function(*args, **kwargs))
+    Parameters
+    ----------
+    spec
+        A `Spec`, the path of a TOML file, the name of a shipped workflow, TOML text, or a table (a dict).
+    out
+        Run directory; by default ``runs/<name>``. For a text or a table the name is its model's with a
+        digest, so that the same specification continues its run.
+    smoke
+        Whether to apply the specification's ``[smoke]`` table.
+    echo
+        Function that prints a line. In a notebook a bar shows the progress instead of lines.
+    options
+        ``workers``, ``scheduler``, ``cluster`` and ``dashboard``, see `pipeline.runs.run.run`.
 
-    return opening
+    Returns
+    -------
+    Run
+        The run, for `attractors` and the other analyses, and for `figure`; ``run.cube()`` is the Dataset.
 
+    Raises
+    ------
+    SpecError
+        If the specification is wrong; before anything is computed, with all problems.
+    KeyboardInterrupt
+        After Ctrl-C, or an interrupt of the notebook's kernel. The finished cells stay, unfinished tasks write
+        nothing any more, and the same call goes on from there.
+    Exception
+        See `pipeline.runs.run.run`.
 
-run = names_arguments(_opening(python.run))
+    Examples
+    --------
+    >>> run("quickstart").cube().section.sel(frequency=2.2)  # doctest: +SKIP
+    """
+    parsed = Spec.read(spec, smoke=smoke)
+    out = parsed.directory if out is None else out
+    try:
+        with bar_in_notebook():
+            done = names_arguments(complete)(parsed, out, smoke=smoke, echo=echo, **options)
+    except InterruptedRunError:
+        raise interrupt(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
+    return Run.open(done)
 
 
 @overload
 def open_run(
-    path: str | Path | StoredRun, *, tree: Literal[False] = False, chunks: Any = None, check: bool | None = None
+    path: str | Path | RunDirectory, *, tree: Literal[False] = False, chunks: Any = None, check: bool | None = None
 ) -> xr.Dataset: ...
 
 
 @overload
 def open_run(
-    path: str | Path | StoredRun, *, tree: Literal[True], chunks: Any = None, check: bool | None = None
+    path: str | Path | RunDirectory, *, tree: Literal[True], chunks: Any = None, check: bool | None = None
 ) -> xr.DataTree: ...
 
 
 def open_run(
-    path: str | Path | StoredRun, *, tree: bool = False, chunks: Any = None, check: bool | None = None
+    path: str | Path | RunDirectory, *, tree: bool = False, chunks: Any = None, check: bool | None = None
 ) -> xr.Dataset | xr.DataTree:
     """Open the result cube of a run directory, alone or in a tree with the kept results of all analyses.
 
@@ -418,3 +457,53 @@ def open_run(
     """
     opened = Run.open(path)
     return opened.tree(chunks, check=check) if tree else opened.cube(chunks, check=check)
+
+
+def table(found: xr.Dataset) -> pd.DataFrame:
+    """Return the result of an analysis as a pandas table, as ``magpend analyse NAME --csv`` writes it.
+
+    Parameters
+    ----------
+    found
+        Result of `attractors`, `basins`, `branches`, ...
+
+    Returns
+    -------
+    DataFrame
+        For `attractors`, a row for each attractor at each parameter point. Numbers are in SI units,
+        unrounded.
+
+    Raises
+    ------
+    ValueError
+        If `found` is not the result of an analysis with a table.
+    """
+    import pandas as pd
+
+    name = str(found.attrs.get("derived_product", ""))
+    if name not in ANALYSES or not ANALYSES[name].table:
+        known = ", ".join(key for key, analysis in ANALYSES.items() if analysis.table)
+        raise ValueError(f"the Dataset is not the result of an analysis that has a table ({known}).")
+    return pd.DataFrame(function_of(ANALYSES[name].table)(found).rows)
+
+
+def _tree_of(run: Run, chunks: Any, check: bool | None) -> xr.DataTree:
+    """Return the cube and the kept results of a run as a tree."""
+    import xarray as xr
+
+    nodes = {"cube": run.cube(chunks, check=check)}
+    for name in COMMANDS:
+        for k, result in enumerate(stored_each(run, name, lazy=True)):
+            folder = str(result.encoding["source"]).rpartition("/")[2]
+            nodes[folder.removesuffix(".zarr") if k else name] = result if chunks is None else result.chunk(chunks)
+    computed = sum(run.plan.cells_in(i) for i in run.commits)
+    attrs = {
+        "title": run.info.title,
+        "source": str(nodes["cube"].attrs["source"]),
+        "digest": run.info.digest,
+        "cells": run.plan.n_cells,
+        "computed": computed,
+        "pending": run.plan.n_cells - computed,
+        "left_out": [name.rpartition("/")[2] for name in stale(run)],
+    }
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=attrs), **nodes}, name=run.name.rpartition("/")[2])

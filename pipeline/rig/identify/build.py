@@ -15,7 +15,6 @@ from magpend_core.sampling import Drive
 from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.measured_orbits import MeasuredTable, first_orbits
 from pipeline.rig.identify.problem import PHASE, ZERO, Free, Piece, Problem, steady_drive
-from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
 from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth, summary
 from pipeline.specification.problems import SpecError
@@ -34,26 +33,13 @@ LEAST_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class Built:
-    """Least-squares problem of an identification, and the held-out pieces of the recordings, on which the fit is only
-    tested.
-
-    Attributes
-    ----------
-    held_out : tuple of Piece
-        Pieces that are judged afterwards; only their starts are fitted.
-    tables : tuple of MeasuredTable
-        Measured orbits, with those that only judge the fit.
-    simulated : bool
-        Whether any of the recordings is simulated.
-    findings : tuple of tuple of str
-        Sentences about each recording's findings, without notes.
-    """
+    """Least-squares problem of an identification, and held-out pieces on which the fit is only tested."""
 
     problem: Problem
-    held_out: tuple[Piece, ...]
-    tables: tuple[MeasuredTable, ...] = ()
-    simulated: bool = False
-    findings: tuple[tuple[str, ...], ...] = ()
+    held_out: tuple[Piece, ...]  # pieces that are judged afterwards; only their starts are fitted
+    tables: tuple[MeasuredTable, ...] = ()  # measured orbits, with those that only judge the fit
+    simulated: bool = False  # whether any of the recordings is simulated
+    findings: tuple[tuple[str, ...], ...] = ()  # sentences about each recording's findings, without notes
 
 
 @dataclass(frozen=True)
@@ -67,13 +53,7 @@ class Stretch:
 
 
 def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
-    """Read all recordings that the specification of an identification names.
-
-    Raises
-    ------
-    SpecError
-        If one cannot be read; the message lists the problems of all.
-    """
+    """Read all recordings of a specification; raise `SpecError` with the problems of all."""
     found, problems = [], []
     for i, table in enumerate(spec.recordings):
         try:
@@ -87,14 +67,11 @@ def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
 
 
 def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Sequence[MeasuredTable] = ()) -> Built:
-    """Build the least-squares problem of a specification, its recordings and its measured orbits, and set the held-out
+    """Build the least-squares problem of a specification, its recordings and its measured orbits, and set held-out
     pieces apart.
 
-    Raises
-    ------
-    SpecError
-        With all problems at once, before anything is integrated: a missing channel or drive, pieces that are
-        too short, held-out pieces that do not exist, nothing left to fit.
+    Raise `SpecError` with all problems at once, before anything is integrated: a missing channel or drive, pieces that
+    are too short, held-out pieces that do not exist, nothing left to fit.
     """
     problems: list[str] = []
     channels = channels_of(spec.model, spec.fit.channels, recordings, problems) if recordings else ()
@@ -236,9 +213,7 @@ def _hold_out_problems(i: int, table: RecordingTable, own: Sequence[Piece]) -> l
 
 
 def free_of(spec: IdentificationSpec, channels: Sequence[str]) -> tuple[Free, ...]:
-    """Return the unknowns of the fit: parameters in the order of the specification, then zero offsets of sensors, then
-    phases of drives.
-    """
+    """Return the unknowns in the order of the specification: parameters, zero offsets of sensors, phases of drives."""
     found, n_recordings = [], len(spec.recordings)
     for u in spec.unknowns:
         p = spec.model.parameter(u.name)
@@ -290,25 +265,8 @@ def pieces_of(
 ) -> list[Piece]:
     """Cut a recording into the pieces that are fitted, each with samples, drive and a first guess of its initial state.
 
-    Parameters
-    ----------
-    model
-        Model that has the states.
-    channels
-        Channels that are compared.
-    both
-        The recording as measured, and smoothed. The smoothed one gives the first guess of a start.
-    table
-        The recording's table in the specification: length of pieces, kind of drive.
-    recording
-        Index of the recording.
-    decimate
-        Step between the samples that are used.
-
-    Raises
-    ------
-    SpecError
-        If pieces are too short or the drive does not cover them; the message names them.
+    `both` is the recording as measured, and smoothed for the guess. `decimate` is the step between the samples that are
+    used. Raise `SpecError` if pieces are too short or the drive does not cover them.
     """
     ds, smoothed = both
     drive = _drive_of(table, ds)
@@ -347,18 +305,7 @@ def pieces_of(
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
-    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s` seconds; return all
-    stretches.
-
-    Parameters
-    ----------
-    ds
-        The recording.
-    piece_s
-        Length [s]; by default pieces stay whole.
-    recording
-        Index of the recording.
-    """
+    """Cut each uninterrupted piece into equal stretches of about `piece_s` seconds; None keeps pieces whole."""
     found: list[Stretch] = []
     piece, time = ds["piece"].values, ds["time"].values
     for begin, end in _runs(piece):
@@ -377,9 +324,7 @@ def _runs(piece: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None) -> slice:
-    """Return a stretch's usable samples: from the first with values of all channels to the last at which the drive is
-    known.
-    """
+    """Return a stretch's samples from the first with values of all channels to the last with a known drive."""
     begin, end = stretch.samples.start, stretch.samples.stop
     time = ds["time"].values[begin:end]
     good = np.all([np.isfinite(ds[name].values[begin:end]) for name in channels], axis=0)
@@ -401,9 +346,7 @@ def _start(model: Model, own: xr.Dataset) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Driven:
-    """Drive of a recording, with the times that it covers [s]; or its frequency and its phase at time 0, if they are
-    known.
-    """
+    """Drive of a recording, with the times that it covers [s]; or its known frequency and phase at time 0."""
 
     drive: Drive | None
     begin_s: float
@@ -411,9 +354,7 @@ class _Driven:
     known: tuple[float, float] | None = None
 
     def window(self, begin: float, end: float) -> Drive:
-        """Return the drive between two times of the recording [s]. If no drive was recorded, return a drive of zero
-        torque.
-        """
+        """Return the drive between two times of the recording [s]; zero torque if none was recorded."""
         if self.known is not None:
             frequency, phase = self.known
             return steady_drive(frequency, phase + frequency * begin, end - begin)
@@ -472,8 +413,35 @@ def _steadied(edges: Edges) -> Edges:
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
-    """Update each piece's index of its preceding piece (`Piece.follows`) after pieces were removed. The index is -1 if
-    the preceding piece was removed.
-    """
+    """Update `Piece.follows` after pieces were removed; it is -1 where the preceding piece was removed."""
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
     return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]
+
+
+def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
+    """Attach parameter values that hold for a single recording, given by its index, to the drives of that recording's
+    pieces.
+
+    The drives of all pieces then have values of the same parameters; NaN leaves a parameter unchanged.
+    """
+    names: dict[str, None] = {}
+    for piece in pieces:
+        names |= dict.fromkeys(piece.drive.names if piece.drive is not None else ())
+        names |= dict.fromkeys(settings.get(piece.recording, {}))
+    if not names:
+        return list(pieces)
+    return [_with(piece, tuple(names), settings.get(piece.recording, {})) for piece in pieces]
+
+
+def _with(piece: Piece, names: tuple[str, ...], own: Mapping[str, float]) -> Piece:
+    drive = piece.drive
+    if drive is None:
+        time = piece.time
+        drive = Drive(np.array([2 * time[-1] - time[-2]]))
+    values = np.full((len(drive.durations_s), len(names)), np.nan)
+    for k, name in enumerate(names):
+        if name in own:
+            values[:, k] = own[name]
+        elif name in drive.names:
+            values[:, k] = drive.values[:, drive.names.index(name)]
+    return replace(piece, drive=replace(drive, names=names, values=values))

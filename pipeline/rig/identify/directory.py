@@ -21,20 +21,21 @@ from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
+import xarray as xr
 
+from magpend_core.models import load_model
 from magpend_core.models.imported import is_object_path
 from magpend_core.versions import ENGINE
-from pipeline.layout.first_versions import numbered
-from pipeline.layout.identity import canonical, differences, digest_of
+from pipeline.layout.identity import canonical, differences, digest_of, numbered
 from pipeline.layout.writing import sync_folder, write_atomically
-from pipeline.rig.identify.measured_orbits import MeasuredTable
+from pipeline.rig.identify.measured_orbits import MeasuredTable, stored_table
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
 from pipeline.specification.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import HOLDER, LOCK, RUN_FILE, entry_of, is_temporary, local_path, problems_of
 from pipeline.store.local import is_there, refuse_place, unreadable
-from pipeline.store.places import open_files
+from pipeline.store.objects import open_files
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")
@@ -58,15 +59,7 @@ FIT = 1
 
 @dataclass(frozen=True)
 class Source:
-    """Recording of an identification: its file name and sha256, with the text of its mapping file.
-
-    Attributes
-    ----------
-    file : str
-        Name of the file.
-    mapping : str
-        Text of the mapping file.
-    """
+    """Recording of an identification: its file name and sha256, with the text of its mapping file."""
 
     file: str
     sha256: str
@@ -75,45 +68,21 @@ class Source:
 
 @dataclass(frozen=True)
 class Info:
-    """Content of ``identification.json``.
-
-    Attributes
-    ----------
-    directory : Path
-        Directory of the identification.
-    digest : str
-        Digest of `identity`.
-    identity : dict
-        Everything that decides the numbers.
-    title, spec_text : str
-        Title and text of the specification.
-    files : list of str
-        Names of the recordings.
-    mappings : list of str
-        Texts of their mapping files.
-    versions, provenance : dict
-        Versions of packages; time and host.
-    """
+    """Content of ``identification.json``."""
 
     directory: Path
-    digest: str
-    identity: dict[str, Any]
+    digest: str  # digest of `identity`
+    identity: dict[str, Any]  # everything that decides the numbers
     title: str
     spec_text: str
-    files: list[str]
+    files: list[str]  # names of the recordings
     mappings: list[str]
     versions: dict[str, str]
     provenance: dict[str, str]
 
 
 def sources_of(spec: IdentificationSpec) -> list[Source]:
-    """Read the bytes of each recording and the text of its mapping; return file name, sha256 and mapping text.
-
-    Raises
-    ------
-    SpecError
-        If a file cannot be read.
-    """
+    """Read the bytes of each recording and the text of its mapping; raise `SpecError` if a file cannot be read."""
     from pipeline.specification.problems import SpecError
 
     found, problems = [], []
@@ -141,9 +110,7 @@ def _kept(path: Path) -> str:
 def identity_of(
     spec: IdentificationSpec, sources: Sequence[Source], orbits: Sequence[MeasuredTable] = ()
 ) -> dict[str, Any]:
-    """Return all inputs that decide the numerical results: specification, recordings, kernel version, model and code
-    digests.
-    """
+    """Return all inputs that decide the numbers: specification, recordings, model and versions."""
     tables = spec.as_dict()
     for table, source in zip(tables["recordings"], sources, strict=True):
         del table["file"], table["mapping"]
@@ -166,14 +133,10 @@ def is_identification(directory: str | Path) -> bool:
 
 
 def read_info(directory: str | Path) -> Info:
-    """Read ``identification.json``, and check its format and digest.
+    """Read ``identification.json``.
 
-    Raises
-    ------
-    RefusedError
-        If it does not exist, or has another format.
-    DamagedError
-        If its content has changed since it was written.
+    Raise `RefusedError` if it does not exist or has another format, and `DamagedError` if it has changed since it was
+    written.
     """
     directory = local_path(directory)
     path = directory / IDENTIFICATION
@@ -199,18 +162,9 @@ def read_info(directory: str | Path) -> Info:
 
 
 def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
-    """Return the identification in a directory if it has the given identity, or None if the directory is free. Raise
-    RefusedError if it holds anything else.
+    """Return the identification in a directory if it has the given identity, or None if the directory is free.
 
-    Returns
-    -------
-    Info or None
-        The identification that is there already; None if there is none.
-
-    Raises
-    ------
-    RefusedError
-        If the directory holds another identification (the message lists the differences) or other files.
+    Raise `RefusedError` if it holds other files or another identification; the message lists the differences.
     """
     if directory.exists() and not directory.is_dir():
         raise RefusedError(f"{directory}: is a file; give another --out.")
@@ -249,9 +203,7 @@ def establish(
     spec_text: str,
     orbits: Sequence[MeasuredTable] = (),
 ) -> Info:
-    """Create the directory of an identification with its ``identification.json``, unless they exist. Return the content
-    of this file.
-    """
+    """Create the directory with its ``identification.json``, unless they exist; return the content of this file."""
     identity = identity_of(spec, sources, orbits)
     if check(directory, identity) is None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -272,13 +224,7 @@ def establish(
 
 
 class Outcomes:
-    """Stored outcomes of local fits and profiles, one file per outcome. A continued identification reads them again.
-
-    Parameters
-    ----------
-    folder
-        Folder of the files.
-    """
+    """Stored outcomes of local fits and profiles, one file per outcome. A continued identification reads them again."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -305,23 +251,13 @@ class Outcomes:
 
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write ``result.json`` with the sha256 of the other result files; its existence marks the identification as
-    finished.
-    """
+    """Write ``result.json`` with the sha256 of the other files; it marks the identification as finished."""
     entries = {name: entry_of((directory / name).read_bytes()) for name in sorted(files)}
     write_atomically(directory / RESULT, canonical({**result, "files": entries}))
 
 
 def read_result(directory: str | Path) -> dict[str, Any]:
-    """Read ``result.json`` of a finished identification.
-
-    Raises
-    ------
-    RefusedError
-        If it is not finished.
-    DamagedError
-        If it is not JSON.
-    """
+    """Read ``result.json`` of a finished identification; raise `RefusedError` if it is not finished."""
     path = local_path(directory) / RESULT
     read_info(directory)
     if not is_there(path):
@@ -343,3 +279,16 @@ def is_complete(directory: Path) -> bool:
     except DamagedError:
         return False
     return not problems_of(open_files(directory), result.get("files", {}))
+
+
+def stored_tables(directory: str | Path) -> list[MeasuredTable]:
+    """Return the measured orbits of a finished identification, one `MeasuredTable` per table ``[[orbits]]``."""
+    info, result = read_info(directory), read_result(directory)
+    model = load_model(result["model"])
+    found = []
+    for i, table in enumerate(info.identity["spec"]["orbits"]):
+        with xr.open_dataset(Path(directory) / ORBITS.format(i), engine="scipy") as ds:
+            # a dim of length 0 is read as an unlimited one
+            measured = ds.load().drop_encoding()
+        found.append(stored_table(table["data"], model, measured if "orbit" in measured.sizes else None))
+    return found

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,116 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.plots.files import save_data, save_figure
-from pipeline.rig.identify.residuals import Series, per_piece, pieces_in, rate_of, residual_views
-from pipeline.rig.measured_branch.figure import plot_branch
+from pipeline.plots.figure import save_data, save_figure
+from pipeline.rig.identify.statistics import LEVEL, pooled_autocorrelation
+from pipeline.rig.measured.branch_figure import plot_branch
+
+# ---- data of the residuals -------------------------------------------------------------------------
+
+LONGEST_LAG = 1 / 3
+"""Longest lag of the autocorrelation, as a fraction of the shortest piece."""
+
+BINS = 30
+
+
+@dataclass(frozen=True)
+class Series:
+    """Piece in a dataset of residuals: its indices, its range of samples, and the size of its residuals."""
+
+    # index of the recording, and of the piece in it
+    recording: int
+    number: int
+    held_out: bool
+    samples: tuple[int, int]  # first sample, and one past the last
+    worst: float  # mean square of its residuals, each channel relative to its mean square over all pieces
+
+    def of(self, ds: xr.Dataset) -> xr.Dataset:
+        """Return the samples of this piece from the dataset of residuals."""
+        return ds.isel(sample=slice(*self.samples))
+
+
+def pieces_in(ds: xr.Dataset) -> list[Series]:
+    """Return the pieces of a dataset of residuals in their order, each with its range of samples."""
+    keys = np.stack([ds[name].values for name in ("held_out", "recording", "piece")])
+    cuts = np.flatnonzero((np.diff(keys, axis=1) != 0).any(axis=0)) + 1
+    bounds = [0, *cuts.tolist(), keys.shape[1]]
+    channels = str(ds.attrs["channels"]).split()
+    squares = np.stack([ds[f"{c}_residual"].values ** 2 for c in channels])
+    squares = squares / np.nanmean(squares, axis=1, keepdims=True)
+    return [
+        Series(int(keys[1, a]), int(keys[2, a]), bool(keys[0, a]), (a, b), float(np.nanmean(squares[:, a:b])))
+        for a, b in itertools.pairwise(bounds)
+    ]
+
+
+def per_piece(ds: xr.Dataset, channel: str) -> xr.Dataset:
+    """Return the rms of a channel's residuals by piece, in the order of recordings and pieces."""
+    pieces = sorted(pieces_in(ds), key=lambda s: (s.recording, s.number))
+    residual = ds[f"{channel}_residual"].values
+    rms = [float(np.sqrt(np.nanmean(residual[slice(*s.samples)] ** 2))) for s in pieces]
+    return xr.Dataset(
+        {"rms": ("number", np.array(rms))},
+        coords={
+            "piece": ("number", [s.number for s in pieces]),
+            "recording": ("number", [s.recording for s in pieces]),
+            "held_out": ("number", [int(s.held_out) for s in pieces]),
+        },
+    )
+
+
+def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a channel's computed rates of change and its residuals at the same times, over all fitted pieces.
+
+    Computed values have no noise, so the rates are differences of neighbours.
+    """
+    rates, left = [], []
+    for series in pieces_in(ds):
+        if series.held_out:
+            continue
+        own = series.of(ds)
+        residual = own[f"{channel}_residual"].values
+        computed = own[f"{channel}_measured"].values - residual
+        rates.append(np.gradient(computed, own["time"].values))
+        left.append(residual)
+    rate, residual = np.concatenate(rates), np.concatenate(left)
+    known = np.isfinite(rate) & np.isfinite(residual)
+    return rate[known], residual[known]
+
+
+def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
+    """Return what the residual plots show: autocorrelation, mean against the rate, density, rms by piece."""
+    fitted = [s.of(ds) for s in pieces_in(ds) if not s.held_out]
+    step = float(np.median(np.diff(fitted[0]["time"].values)))
+    most = max(2, int(LONGEST_LAG * min(p.sizes["sample"] for p in fitted)))
+    views = xr.Dataset(coords={"lag": ("lag", step * np.arange(most + 1), {"units": "s"})})
+    for channel in channels:
+        parts = [p[f"{channel}_residual"].values for p in fitted]
+        unit = str(ds[f"{channel}_residual"].attrs.get("units", ""))
+        n = sum(int(np.isfinite(r).sum()) for r in parts)
+        band = float(stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(n))
+        rho = pooled_autocorrelation(parts, most)
+        views[f"{channel}_autocorrelation"] = ("lag", rho, {"band": band, "units": "1"})
+        rate, residual = rate_of(ds, channel)
+        order = np.argsort(rate, kind="stable")
+        bins = np.array_split(order, min(BINS, max(1, len(order) // 5)))
+        dim = f"{channel}_bin"
+        views[f"{channel}_rate"] = (dim, np.array([rate[b].mean() for b in bins]), {"units": f"{unit}/s"})
+        views[f"{channel}_mean"] = (dim, np.array([residual[b].mean() for b in bins]), {"units": unit})
+        width = float(residual.std())
+        density, edges = np.histogram(residual, bins=61, range=(-4 * width, 4 * width), density=True)
+        views[f"{channel}_edges"] = (f"{channel}_edge", edges, {"units": unit})
+        views[f"{channel}_density"] = (f"{channel}_box", density, {"width": width})
+        rms = per_piece(ds, channel)["rms"].values
+        views[f"{channel}_rms"] = ("piece_number", rms, {"units": unit})
+    return views
+
+
+# ---- figures ---------------------------------------------------------------------------------------
 
 MOST_PIECES = 4
 """Most pieces that are drawn over the data."""
@@ -45,23 +150,11 @@ def draw_all(
     result: Mapping[str, Any],
     branches: Sequence[tuple[xr.Dataset, xr.Dataset, np.ndarray]] = (),
 ) -> list[str]:
-    """Draw all figures of an identification, and save each with the data that it shows.
+    """Draw all figures of an identification into a folder, each with the data that it shows; return the names of the
+    files.
 
-    Parameters
-    ----------
-    folder
-        Folder to write to.
-    residuals
-        See `pipeline.rig.identify.reports.residuals_of`.
-    result
-        Content of ``result.json``.
-    branches
-        For each table of measured orbits the judged orbits, the computed branches and the amplitudes of their orbits.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
+    `branches` has for each table of measured orbits the judged orbits, the computed branches and the amplitudes of
+    their orbits.
     """
     drawings: dict[str, Callable[[], style.DataFigure]] = {}
     if residuals.sizes["sample"]:
@@ -101,18 +194,7 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
 
 @style.drawn
 def plot_fit(ds: xr.Dataset) -> style.DataFigure:
-    """Draw measured and computed values of up to four pieces, with their residuals.
-
-    Parameters
-    ----------
-    ds
-        See `pipeline.rig.identify.reports.residuals_of`.
-
-    Returns
-    -------
-    DataFigure
-        It shows the first piece, the worst fit, a held-out piece, and the last. Its `data` are those pieces.
-    """
+    """Draw the first piece, the worst fit, a held-out piece and the last: measured, computed, and residuals."""
     chosen = _chosen(pieces_in(ds))
     channels = str(ds.attrs["channels"]).split()
     part = xr.concat([s.of(ds) for s in chosen], "sample", join="override", combine_attrs="override")
@@ -183,20 +265,10 @@ def _share_range(row: list[Axes]) -> None:
 
 @style.drawn
 def plot_residuals(ds: xr.Dataset) -> style.DataFigure:
-    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the channel's rate of
-    change, and histogram.
+    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the rate, and histogram.
 
-    Parameters
-    ----------
-    ds
-        See `pipeline.rig.identify.reports.residuals_of`.
-
-    Returns
-    -------
-    DataFigure
-        A column for each channel. Wrong friction shows in the third row: the mean residual then depends on
-        the rate. Its `data` are the curves and means drawn. Except in the second row, only fitted pieces
-        count.
+    Wrong friction shows in the third row: the mean residual then depends on the rate. Except in the second row, only
+    fitted pieces count.
     """
     channels = str(ds.attrs["channels"]).split()
     views = residual_views(ds, channels)
@@ -295,20 +367,7 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
 
 @style.drawn
 def plot_profiles(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
-    """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts.
-
-    Parameters
-    ----------
-    attrs
-        Of the residuals.
-    result
-        What ``result.json`` holds.
-
-    Returns
-    -------
-    DataFigure
-        Its `data` are ``NAME_values`` and ``NAME_growth``.
-    """
+    """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts."""
     names = [name for name in result["names"] if name in result["profiles"]]
     n_columns = min(4, len(names))
     n_rows = math.ceil(len(names) / n_columns)
@@ -365,9 +424,7 @@ def _draw_profile(ax: Axes, data: xr.Dataset, name: str, estimate: Mapping[str, 
 
 
 def _engineering(size: float) -> tuple[float, int]:
-    """Return the factor that scales a very small or very large number to 1 to 1000, and the exponent of ten that it
-    removes (a multiple of 3).
-    """
+    """Return the factor that scales a number to 1 to 1000, and the exponent that it removes (a multiple of 3)."""
     if not size > 0 or 1e-2 <= size < 1e4:
         return 1.0, 0
     exponent = 3 * math.floor(math.log10(size) / 3)
@@ -376,20 +433,7 @@ def _engineering(size: float) -> tuple[float, int]:
 
 @style.drawn
 def plot_correlations(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
-    """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty.
-
-    Parameters
-    ----------
-    attrs
-        Of the residuals.
-    result
-        What ``result.json`` holds.
-
-    Returns
-    -------
-    DataFigure
-        Its `data` are ``correlation`` over ``row`` and ``column``.
-    """
+    """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty."""
     names = list(result["names"])
     matrix = np.array([[_nan(result["correlations"][a][b]) for b in names] for a in names], np.float64)
     data = xr.Dataset(

@@ -12,26 +12,30 @@ from typing import Any
 import numpy as np
 
 from magpend_core.sampling import Drive
-from pipeline.analysis.branches.carrying import Solution
 from pipeline.layout.writing import write_netcdf
 from pipeline.products.reporting import report, track
 from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
 from pipeline.rig.identify.build import Built, build, read_all
 from pipeline.rig.identify.directory import Outcomes, Source
-from pipeline.rig.identify.drive_frequency import estimate_frequencies
-from pipeline.rig.identify.judging import judge, judge_fit
-from pipeline.rig.identify.linearise import linearise, loss_scale_of
+from pipeline.rig.identify.identifiability import Curvature, Profile, estimate_frequencies, following, profile
+from pipeline.rig.identify.judgement import judge, judge_fit
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.measured_orbits import judge_orbits, read_orbits
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import ZERO, Problem
-from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
-from pipeline.rig.identify.search import search
+from pipeline.rig.identify.search import Kept, search
 from pipeline.rig.identify.specification import IdentificationSpec, load_identification
-from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
+from pipeline.rig.identify.statistics import (
+    Covariance,
+    Linearised,
+    covariance_of,
+    linearise,
+    loss_scale_of,
+    n_effective,
+)
 from pipeline.runs.stopping import stoppable
-from pipeline.runs.workflows import default_directory, find_spec
+from pipeline.specification.files import default_directory, find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.files import FIGURES, local_path
 from pipeline.store.local import make_folder, refuse_links, writer_lock
@@ -140,13 +144,7 @@ def _write(
 
 
 def refuse_invisible(problem: Problem) -> None:
-    """Evaluate the residuals once, and raise `SpecError` if they do not depend on some of the unknowns.
-
-    Raises
-    ------
-    SpecError
-        If there are such unknowns (the message names all), or if trajectories diverge at the start.
-    """
+    """Evaluate once; raise `SpecError` if residuals do not depend on some unknowns, or trajectories diverge."""
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
         raise SpecError(
@@ -173,9 +171,7 @@ def refuse_invisible(problem: Problem) -> None:
 
 
 def _is_driven(problem: Problem) -> bool:
-    """Return whether the model's own drive acts on a piece without a recorded drive. The drive acts if the trajectory
-    changes with the drive period.
-    """
+    """Return whether the model's own drive acts on a piece without a recorded one, as its period then matters."""
     if not problem.pieces or problem.pieces[0].drive is not None:
         return False
     piece = problem.pieces[0]
@@ -191,13 +187,7 @@ def _is_driven(problem: Problem) -> bool:
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
-    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings.
-
-    Raises
-    ------
-    NotConvergedError
-        If no start converged.
-    """
+    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings."""
     problem, table = built.problem, spec.search
     keep = Kept(outcomes)
     fits = search(
@@ -318,84 +308,6 @@ def _unpack_profile(name: str, data: Mapping[str, np.ndarray]) -> Profile:
 
 
 def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
-    """Return the standard errors of the estimates under the assumption that the residuals are independent and have the
-    assumed noise.
-    """
+    """Return the standard errors of the estimates if residuals were independent and had the assumed noise."""
     inverse = np.linalg.pinv(linear.information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
     return np.asarray(np.sqrt(np.diag(inverse)) * scale)
-
-
-class Kept:
-    """Store of finished local fits for `pipeline.rig.identify.search.search`. The key of a fit is the number of its
-    first guess.
-
-    Parameters
-    ----------
-    outcomes
-        Files of the outcomes.
-    """
-
-    def __init__(self, outcomes: Outcomes) -> None:
-        self._outcomes = outcomes
-        self.fits: dict[int, Fit] = {}
-
-    def recall(self, number: int) -> Fit | None:
-        """Return the local fit that began at first guess `number`, or None if it is not stored."""
-        fit = self._outcomes.recall(_name(number), unpack_fit)
-        if fit is not None:
-            self.fits[number] = fit
-        return fit
-
-    def store(self, number: int, fit: Fit) -> None:
-        """Store the local fit that began at first guess `number`."""
-        self._outcomes.store(_name(number), pack_fit(fit))
-        self.fits[number] = fit
-
-
-def _name(number: int) -> str:
-    return f"start-{number:04d}"
-
-
-_KNOWN = ("packed", "unknowns", "tangents")
-"""Fields of a `Solution` that are stored."""
-
-
-def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
-    """Return all fields of a fit as named arrays, to be stored in a file."""
-    lengths = np.array([len(r) for r in fit.residuals], np.int64)
-    known = {f"orbits-{i}-{name}": getattr(own, name) for i, own in enumerate(fit.known) for name in _KNOWN}
-    return {
-        **known,
-        "theta": fit.theta,
-        "starts": fit.starts,
-        "rows": fit.rows,
-        "jacobian": fit.jacobian,
-        "residuals": np.concatenate(fit.residuals) if fit.residuals else np.zeros(0),
-        "lengths": lengths,
-        "cost": np.array(fit.cost),
-        "converged": np.array(fit.converged),
-        "message": np.array(fit.message),
-        "n_evaluations": np.array(fit.n_evaluations),
-    }
-
-
-def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
-    """Rebuild a fit from the arrays of `pack_fit`."""
-    residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1]) if len(data["lengths"]) else []
-    n_tables = sum(key.endswith(f"-{_KNOWN[0]}") for key in data)
-    known = []
-    for i in range(n_tables):
-        packed, unknowns, tangents = (data[f"orbits-{i}-{name}"] for name in _KNOWN)
-        known.append(Solution(packed, unknowns, tangents))
-    return Fit(
-        data["theta"],
-        data["starts"],
-        float(data["cost"]),
-        bool(data["converged"]),
-        str(data["message"]),
-        int(data["n_evaluations"]),
-        tuple(residuals),
-        data["rows"],
-        data["jacobian"],
-        tuple(known),
-    )

@@ -19,11 +19,10 @@ from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, KINDS,
 from pipeline.analysis.branches.carrying import ORBIT, PARAMETER, Along, Array, Datum, OrbitData, Solution, settled
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
-from pipeline.rig.identify.orbit_tables import OrbitsTable
-from pipeline.rig.identify.settings import setting_problems
-from pipeline.rig.measured_branch.comparison import amplitudes, compare, nearest_orbit
-from pipeline.rig.measured_branch.computing import branches_along
-from pipeline.rig.measured_branch.reading import STABILITIES, read_branch
+from pipeline.layout.writing import json_value
+from pipeline.rig.identify.specification import OrbitsTable, setting_problems
+from pipeline.rig.measured.branch import STABILITIES, branch_table, compare, nearest_orbit, read_branch
+from pipeline.rig.measured.branch_computed import amplitudes, branches_along
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, problems_of
 from pipeline.specification.section import SectionTable
@@ -45,26 +44,14 @@ _KINDS = {"fold": FOLD, "doubling": DOUBLING, "torus": TORUS, "hopf": HOPF}
 
 @dataclass(frozen=True)
 class MeasuredTable:
-    """Measured orbits and bifurcations of one table ``[[orbits]]``, read and checked.
+    """Measured orbits and bifurcations of one table ``[[orbits]]``, read and checked."""
 
-    Attributes
-    ----------
-    along : Along
-        Model, parameter and interval.
-    state : str
-        Measured state; empty if there are bifurcations alone.
-    measured : Dataset or None
-        Orbits as of `read_branch`; None if there are bifurcations alone.
-    settings : dict
-        Values of parameters in these measurements alone.
-    """
-
-    along: Along
-    state: str
+    along: Along  # model, parameter and interval
+    state: str  # measured state; empty if there are bifurcations alone
     fitted: tuple[Datum, ...]
     held_out: tuple[Datum, ...]
-    measured: xr.Dataset | None
-    settings: Mapping[str, float]
+    measured: xr.Dataset | None  # orbits as of `read_branch`; None if there are bifurcations alone
+    settings: Mapping[str, float]  # values of parameters in these measurements alone
 
     @property
     def data(self) -> tuple[Datum, ...]:
@@ -72,9 +59,7 @@ class MeasuredTable:
         return (*self.fitted, *self.held_out)
 
     def branches(self, values: Mapping[str, float]) -> tuple[xr.Dataset, Array]:
-        """Compute the model's branches along the measured parameter, and the amplitudes of their orbits, for values of
-        all parameters.
-        """
+        """Compute the model's branches along the measured parameter, and the amplitudes of their orbits."""
         parameters = _parameters(self.along.model, {**values, **self.settings})
         state = self.state or self.along.model.section_states[0]
         column = self.along.model.state_names.index(state)
@@ -107,13 +92,7 @@ def _plain(datum: Datum) -> dict[str, Any]:
 
 
 def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> MeasuredTable:
-    """Read and check one table ``[[orbits]]``: measured orbits and bifurcations.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
-    """
+    """Read and check one table ``[[orbits]]``; raise `SpecError` with all problems at once."""
     problems: list[str] = []
     measured = _read(spec, table, where)
     parameter = axis_name(table.parameter or ("" if measured is None else measured.attrs["parameter"]))
@@ -160,13 +139,7 @@ def _datum(data: Mapping[str, Any]) -> Datum:
 
 
 def read_orbits(spec: IdentificationSpec) -> list[MeasuredTable]:
-    """Read all tables ``[[orbits]]`` (measured orbits and bifurcations) of a specification.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
-    """
+    """Read all tables ``[[orbits]]`` of a specification; raise `SpecError` with all problems at once."""
     found, problems = [], []
     for i, table in enumerate(spec.orbits):
         try:
@@ -292,9 +265,7 @@ def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[t
 
 
 def _error(scatter: float, n_cycles: int) -> float:
-    """Return the standard error of a median over cycles, from the scatter of the cycles. For fewer than two cycles
-    return the scatter itself.
-    """
+    """Return the standard error of a median over cycles from their scatter; the scatter itself for one cycle."""
     if not math.isfinite(scatter):
         return 0.0
     return scatter * MEDIAN / math.sqrt(n_cycles) if n_cycles > 1 else scatter
@@ -334,10 +305,7 @@ def _parameters(model: Model, values: Mapping[str, float]) -> Parameters:
 def first_orbits(tables: Sequence[MeasuredTable], values: Mapping[str, float]) -> tuple[OrbitData, ...]:
     """Find the computed orbit or bifurcation for each fitted measurement, at the first guess of the parameters.
 
-    Raises
-    ------
-    SpecError
-        If an orbit or a bifurcation has none; the message names all of them.
+    Raise `SpecError` with the names of all that have none.
     """
     found, problems = [], []
     for i, table in enumerate(tables):
@@ -392,9 +360,7 @@ def _first_orbit(table: MeasuredTable, datum: Datum, branches: xr.Dataset, compu
 
 
 def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
-    """Return section point and parameter value of the computed bifurcation that is nearest to a measured one of the
-    same kind.
-    """
+    """Return section point and parameter of the computed bifurcation of a measured one's kind that is nearest."""
     words = words_of(branches["kind"]) if "kind" in branches else KINDS
     periods = branches["orbit_period"].values[branches["of_branch"].values]
     fits = [
@@ -415,11 +381,7 @@ def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
 def judge_orbits(table: MeasuredTable, values: Mapping[str, float]) -> xr.Dataset:
     """Compare the orbits and bifurcations of a measured table with newly computed branches.
 
-    Returns
-    -------
-    Dataset
-        As of `compare`, with ``held_out``, and over ``bifurcation`` the measured and computed values of
-        bifurcations.
+    Return a dataset as of `compare`, with ``held_out``, and over ``bifurcation`` the measured and computed values.
     """
     branches, computed = table.branches(values)
     found = xr.Dataset() if table.measured is None else compare(table.measured, branches, computed)
@@ -434,3 +396,80 @@ def judge_orbits(table: MeasuredTable, values: Mapping[str, float]) -> xr.Datase
     found["computed_value"] = ("bifurcation", [math.nan if r is None else float(r[-1]) for r in rows])
     found["bifurcation_held_out"] = ("bifurcation", np.array([d.name in held for d in points], np.int8))
     return found
+
+
+GROUPS = ("fitted", "held_out")
+
+
+def orbits_result(judged: Sequence[xr.Dataset]) -> list[dict[str, Any]]:
+    """Return the judged orbits and bifurcations of each table as plain data: ``parameter``, ``orbits``,
+    ``bifurcations``, ``rms``.
+
+    The last one is the root mean square of the relative errors of amplitude and frequency, for fitted and for held-out
+    orbits of each stability.
+    """
+    return [
+        {
+            "parameter": str(ds.attrs.get("parameter", "")),
+            "orbits": _orbit_rows(ds),
+            "bifurcations": _bifurcation_rows(ds),
+            "rms": _rms(ds),
+        }
+        for ds in judged
+    ]
+
+
+def _orbit_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
+    if "orbit" not in ds.sizes:
+        return []
+    rows = branch_table(ds).rows
+    held = ds["held_out"].values
+    return [json_value(row) | {"held_out": bool(h)} for row, h in zip(rows, held, strict=True)]
+
+
+def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": str(one["bifurcation"].item()),
+            "measured": float(one["measured_value"]),
+            "measured_sd": float(one["measured_value_sd"]),
+            "computed": json_value(float(one["computed_value"])),
+            "held_out": bool(one["bifurcation_held_out"]),
+        }
+        for one in (ds.isel(bifurcation=k) for k in range(ds.sizes["bifurcation"]))
+    ]
+
+
+def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the rms of the relative errors by group, stability and quantity; None if an orbit was not found."""
+    found: dict[str, dict[str, dict[str, Any]]] = {group: {} for group in GROUPS}
+    if "orbit" not in ds.sizes:
+        return found
+    words, held = words_of(ds["stability"]), ds["held_out"].values
+    for is_held, group in enumerate(GROUPS):
+        for code, word in enumerate(words):
+            chosen = (held == is_held) & (ds["stability"].values == code)
+            if not chosen.any():
+                continue
+            own = {"amplitude": ds["relative_error"].values[chosen], "frequency": ds["frequency_error"].values[chosen]}
+            found[group][word] = {name: json_value(float(np.sqrt(np.mean(e**2)))) for name, e in own.items()}
+    return found
+
+
+def orbit_lines(result: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the comparison of measured and computed orbits in ``result.json`` as printed lines."""
+    lines = []
+    for table in result:
+        for group in GROUPS:
+            for word, errors in table["rms"][group].items():
+                shown = ", ".join(
+                    f"{name} {'lost' if rms is None else format(100.0 * rms, '.2g') + ' %'}"
+                    for name, rms in errors.items()
+                )
+                stability = "" if word == "unknown" else f"{word} "
+                lines.append(f"{group.replace('_', ' ')} {stability}orbits: root mean square errors {shown}")
+        for one in table["bifurcations"]:
+            computed = "none" if one["computed"] is None else f"{one['computed']:.6g}"
+            held = ", held out" if one["held_out"] else ""
+            lines.append(f"{one['name']}{held}: measured {one['measured']:.6g} ± {one['measured_sd']:.2g}, {computed}")
+    return lines

@@ -13,7 +13,7 @@ from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.branches.carrying import OrbitData
-from pipeline.rig.identify.orbit_rows import OrbitRows, orbit_rows
+from pipeline.rig.identify.orbit_residuals import OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
@@ -33,28 +33,18 @@ LOST = 1e6
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residuals, and on request their derivatives, for one set of unknowns.
+    """Residuals, and on request their derivatives, for one set of unknowns."""
 
-    Attributes
-    ----------
-    residuals : tuple of ndarray, (n, n_channels)
-        Measured less computed, piece by piece [SI]; NaN where nothing was measured.
-    rows : ndarray, (m,)
-        Residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per
-        piece, which keeps the cost, ``rows @ rows / 2``.
-    jacobian : ndarray, (m, n_free + n_piece*n_states)
-        Slopes of `rows`: the unknowns first, then the starts, piece by piece; empty without slopes.
-    failed : int
-        Number of pieces whose trajectory did not reach its end, and of measured orbits that were not found.
-    orbits : tuple of OrbitData
-        Measured orbits, with the computed ones of these unknowns.
-    """
-
+    # (n, n_channels) measured less computed, piece by piece [SI]; NaN where nothing was measured
     residuals: tuple[Array, ...]
+    # (m,) residuals in units of the noise. With slopes they are compressed by an orthogonal transformation per piece,
+    # which keeps the cost, ``rows @ rows / 2``.
     rows: Array
+    # (m, n_free + n_piece*n_states) slopes of `rows`: the unknowns first, then the starts, piece by piece; empty
+    # without slopes
     jacobian: Array
-    failed: int
-    orbits: tuple[OrbitData, ...] = ()
+    failed: int  # number of pieces whose trajectory did not reach its end, and of measured orbits that were not found
+    orbits: tuple[OrbitData, ...] = ()  # measured orbits, with the computed ones of these unknowns
 
     @property
     def cost(self) -> float:
@@ -63,9 +53,7 @@ class Evaluation:
 
 
 class _Motions(NamedTuple):
-    """Computed trajectories of all pieces for many sets of unknowns, and their derivatives by the unknowns and initial
-    states.
-    """
+    """Computed trajectories of all pieces, and their derivatives by the unknowns and initial states."""
 
     states: Array  # (member, piece, time, column)
     slopes: Array  # (member, change, piece, time, column): by the moving unknowns, then by the own start
@@ -75,21 +63,8 @@ class _Motions(NamedTuple):
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
     """Compute the residuals of a fit, and on request their derivatives, for each row of a matrix of unknowns.
 
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    thetas
-        Unknowns, shape (n, n_free) [SI].
-    starts
-        Starts of the pieces, shape (n, n_piece, n_states) [SI].
-    slopes
-        Whether to compute slopes; `Problem.slopes` selects the method.
-
-    Returns
-    -------
-    list of Evaluation
-        One for each member.
+    `thetas` are unknowns, (n, n_free) [SI], and `starts` those of the pieces, (n, n_piece, n_states) [SI].
+    `Problem.slopes` selects the method of slopes.
     """
     of_orbits = orbit_rows(problem, thetas, slopes=slopes) if problem.orbits else [None] * len(thetas)
     if not problem.pieces:
@@ -127,9 +102,7 @@ def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _steps(problem: Problem, thetas: Array) -> Array:
-    """Return the finite-difference steps for each set of unknowns, for the unknowns on which the trajectories depend.
-    The steps stay within the bounds.
-    """
+    """Return finite-difference steps, within the bounds, for the unknowns on which trajectories depend."""
     found = np.zeros((len(thetas), len(problem.sloped)))
     for j, i in enumerate(problem.sloped):
         f, values = problem.free[i], thetas[:, i]
@@ -150,9 +123,7 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
 
 
 def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Compute trajectories and their derivatives by finite differences, with one unknown or one component of the
-    initial state changed at a time.
-    """
+    """Compute trajectories, and their derivatives with one unknown or component of the start changed at a time."""
     steps, n = _steps(problem, thetas), len(problem.model.states)
     moves = STEP * np.diag(problem.model.scales)
     packed = problem.pack(thetas)[:, None]
@@ -168,9 +139,7 @@ def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Compute trajectories, and their derivatives by variational equations, with one tangent vector per unknown and per
-    component of the initial state.
-    """
+    """Compute trajectories, and their derivatives by variational equations, one tangent vector for each."""
     system, steps = with_parameter_tangent(problem.system), _steps(problem, thetas)
     n, n_moving = len(problem.model.states), len(problem.sloped)
     same = np.repeat(problem.pack(thetas)[:, None], n_moving + n, axis=1)
@@ -191,9 +160,7 @@ def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 def _integrate(
     problem: Problem, parameters: Array, starts: Array, tolerance: float, system: System | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Integrate all pieces for each set of unknowns and each change of one unknown. Return the states, and a mask of
-    the integrations that failed.
-    """
+    """Integrate all pieces for each set of unknowns and each change; return the states, and which failed."""
     shape, n = starts.shape[:3], len(problem.model.states)
     n_pieces = shape[2]
     columns = list(problem.columns) if problem.continuity is None else list(range(n))
@@ -224,9 +191,7 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """Return a drive with three copies of its parameter values: plain, increased and decreased (for
-    `with_parameter_tangent`).
-    """
+    """Return a drive with its parameter values plain, increased and decreased, for `with_parameter_tangent`."""
     if drive is None or not drive.names:
         return drive
     names = tuple(f"{name}{end}" for end in ("", PLUS, MINUS) for name in drive.names)
@@ -234,9 +199,7 @@ def _thrice(drive: Drive | None) -> Drive | None:
 
 
 def _grid(problem: Problem, k: int) -> Array:
-    """Return the sample times of a piece, followed by the start time of the next piece if the fit penalises gaps
-    between the two.
-    """
+    """Return the sample times of a piece, then the start of the next piece if the fit penalises their gap."""
     time = problem.pieces[k].time
     if problem.continuity is None or not any(p.follows == k for p in problem.pieces):
         return time
@@ -251,9 +214,7 @@ def _read(problem: Problem, k: int, states: Array) -> Array:
 
 
 def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool) -> tuple[int, Array, Array]:
-    """Return the number of a piece, its compressed residuals, and their derivatives by the unknowns and its own initial
-    state.
-    """
+    """Return a piece's number, its compressed residuals, and their derivatives by the unknowns and its start."""
     piece, n_free = problem.pieces[k], len(problem.free)
     n_own = n_free + len(problem.model.states)
     given = np.isfinite(piece.measured)
@@ -277,9 +238,7 @@ def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: boo
 
 
 def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
-    """Transform the residuals so that half the sum of their squares is the robust loss; return them and the derivative
-    of each.
-    """
+    """Return residuals whose half sum of squares is the robust loss, and the derivative of each."""
     if problem.loss == "linear":
         return z, np.ones_like(z)
     scale = problem.loss_scale
@@ -298,9 +257,7 @@ def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
 
 
 def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> list[tuple[int, Array, Array]]:
-    """Return the gaps between the final state of a stretch and the initial state of the next as residuals, with their
-    derivatives.
-    """
+    """Return the gaps between a stretch's end and the next one's start as residuals, with derivatives."""
     if problem.continuity is None:
         return []
     n_free, n_states = len(problem.free), len(problem.model.states)
@@ -324,9 +281,7 @@ def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> li
 def _with_priors(
     problem: Problem, theta: Array, blocks: list[tuple[int, Array, Array]], orbits: OrbitRows | None, slopes: bool
 ) -> tuple[Array, Array]:
-    """Stack the residuals of all pieces, orbits and priors, and place their derivatives in the columns of the whole
-    Jacobian.
-    """
+    """Stack the residuals of pieces, orbits and priors, and place their derivatives in the whole Jacobian."""
     priors = [(i, f) for i, f in enumerate(problem.free) if f.has_prior]
     last = np.array([(f.prior_mean - theta[i]) / f.prior_sd for i, f in priors])
     measured = orbits.rows if orbits is not None else np.zeros(0)

@@ -1,8 +1,8 @@
-"""Draw parameter sets from the posterior of an identification: a Gaussian, or the chain of an ensemble of walkers."""
+"""Draw parameter sets from the posterior of an identification, and compute the 95 % bands of its branches from them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,21 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
-from pipeline.analysis.draws import LEVELS
+from pipeline.analysis.branches.bands import bifurcation_data, carried, orbit_data, place_variables, solvable
+from pipeline.analysis.branches.carrying import ORBIT, OrbitData, Solution, solve
+from pipeline.analysis.draws import LEVELS, interval_of, stretches
+from pipeline.layout.writing import write_netcdf
+from pipeline.plots.figure import save_data, save_figure
 from pipeline.products.product import Table
-from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result
+from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result, stored_tables
+from pipeline.rig.identify.measured_orbits import MeasuredTable
+from pipeline.rig.identify.orbit_residuals import quantities_of
 from pipeline.rig.identify.statistics import root_of
+from pipeline.rig.measured.branch_figure import Bands, plot_branch
+from pipeline.runs.stopping import stoppable
 from pipeline.specification.problems import SpecError
-from pipeline.store.files import local_path
+from pipeline.store.files import FIGURES, local_path
+from pipeline.store.local import make_folder, refuse_links, writer_lock
 
 Echo = Callable[[str], None]
 
@@ -33,27 +42,11 @@ LEAST_SHARE = 0.01
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
     """Draw parameter sets from the Gaussian that the estimates and their covariance define, truncated to the bounds.
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification.
-    n
-        Number of draws.
-    seed
-        Seed; the same one gives the same draws.
+    Return ``value`` over (draw, parameter): all parameters of the model, identified, tied and fixed [SI], with the
+    attributes ``identified`` (names), ``digest``, ``seed``, and ``outside``: the share of draws that the bounds
+    rejected. The same seed gives the same draws.
 
-    Returns
-    -------
-    Dataset
-        ``value`` over (draw, parameter): all parameters of the model, identified, tied and fixed [SI]. Attributes
-        ``identified`` (names), ``digest``, ``seed``, and ``outside``: the share of draws that the bounds rejected.
-
-    Raises
-    ------
-    SpecError
-        For parameters that are not determined, and if almost all draws lie outside the bounds.
-    RefusedError
-        If the identification is not finished.
+    Raise `SpecError` for parameters that are not determined, and if almost all draws lie outside the bounds.
     """
     result = read_result(directory)
     names = _identified(result)
@@ -67,21 +60,11 @@ def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Options of the sampling by an ensemble of walkers.
+    """Options of the sampling by an ensemble of walkers."""
 
-    Attributes
-    ----------
-    n_walkers : int
-        Number of walkers; 0 for the larger of 32 and four times the number of unknowns.
-    most_steps : int
-        Number of steps after which the chain ends, converged or not.
-    spec : str or Path, optional
-        Specification of the identification; needed if recordings were fitted.
-    """
-
-    n_walkers: int = 0
-    most_steps: int = 2000
-    spec: str | Path | None = None
+    n_walkers: int = 0  # number of walkers; 0 for the larger of 32 and four times the number of unknowns
+    most_steps: int = 2000  # number of steps after which the chain ends, converged or not
+    spec: str | Path | None = None  # specification of the identification; needed if recordings were fitted
 
 
 def sample_draws(
@@ -89,34 +72,13 @@ def sample_draws(
 ) -> xr.Dataset:
     """Draw parameter sets from the chain of an ensemble of walkers in the posterior density (affine-invariant MCMC).
 
-    Parameters
-    ----------
-    directory
-        Directory of a finished identification. It keeps the chain; a stopped sampling goes on to the same bytes.
-    n
-        Number of draws, taken at random from the chain.
-    seed
-        Seed of the chain.
-    sampling
-        Walkers and steps.
-    echo
-        Function that prints a line.
+    The directory keeps the chain; a stopped sampling goes on to the same bytes. The `n` draws are taken at random from
+    it. Return a dataset as of `draw_posterior`, with convergence figures of each unknown: ``autocorrelation_time``,
+    ``n_effective`` and ``split_rhat``; attributes ``converged``, ``not_converged_because``, ``accepted`` and others.
 
-    Returns
-    -------
-    Dataset
-        As of `draw_posterior`, with convergence figures of each unknown: ``autocorrelation_time``, ``n_effective`` and
-        ``split_rhat``; attributes ``converged``, ``not_converged_because``, ``accepted`` and others.
-
-    Raises
-    ------
-    SpecError
-        As `draw_posterior`, if emcee is missing, or if a specification is needed.
-    RefusedError
-        If the identification is not finished, or the specification is that of another one.
+    Raise `SpecError` as `draw_posterior`, if emcee is missing, or if a specification is needed.
     """
-    from pipeline.rig.identify.log_posterior import log_posterior
-    from pipeline.rig.identify.sampling import figures_of, require_emcee, sample_posterior
+    from pipeline.rig.identify.mcmc import figures_of, log_posterior, require_emcee, sample_posterior
 
     asked = sampling or Sampling()
     require_emcee()
@@ -149,10 +111,7 @@ def sample_draws(
 def kept_draws(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
     """Return draws of the chain that `sample_draws` has stored in the directory, or else draws of the Gaussian.
 
-    Raises
-    ------
-    SpecError
-        If there are fewer draws of the chain than asked for; see also `draw_posterior`.
+    Raise `SpecError` if there are fewer draws of the chain than asked for.
     """
     path = local_path(directory) / POSTERIOR
     if path.is_file():
@@ -162,10 +121,8 @@ def kept_draws(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
             there = kept.sizes["draw"]
             if n > there:
                 raise SpecError(
-                    [
-                        f"-n = {n}: {path} has {there} draws of the chain; make more: magpend identify posterior "
-                        f"{directory} --mcmc -n {n}."
-                    ]
+                    f"-n = {n}: {path} has {there} draws of the chain; make more: magpend identify posterior "
+                    f"{directory} --mcmc -n {n}."
                 )
             return kept.isel(draw=slice(n))
     return draw_posterior(directory, n, seed)
@@ -192,10 +149,8 @@ def _refuse_undetermined(names: list[str], matrix: np.ndarray) -> None:
     lost = [name for name, variance in zip(names, np.diag(matrix), strict=True) if not np.isfinite(variance)]
     if lost:
         raise SpecError(
-            [
-                f"{', '.join(lost)}: the data do not determine it, so it has no posterior; fix it under "
-                "[parameters], or give it a prior, and identify again."
-            ]
+            f"{', '.join(lost)}: the data do not determine it, so it has no posterior; fix it under "
+            "[parameters], or give it a prior, and identify again."
         )
 
 
@@ -212,10 +167,8 @@ def _within_bounds(
     while len(kept) < n:
         if tried and len(kept) < LEAST_SHARE * tried:
             raise SpecError(
-                [
-                    f"only {len(kept)} of {tried} draws lie within the bounds: the estimates' errors are larger than "
-                    "the bounds allow; widen the bounds, give priors, or identify fewer parameters."
-                ]
+                f"only {len(kept)} of {tried} draws lie within the bounds: the estimates' errors are larger than "
+                "the bounds allow; widen the bounds, give priors, or identify fewer parameters."
             )
         batch = mean + random.standard_normal((max(4 * n, 1000), len(names))) @ root
         tried += len(batch)
@@ -242,7 +195,7 @@ def posterior_table(drawn: xr.Dataset) -> Table:
     return Table(rows, lines)
 
 
-FIGURES = ("autocorrelation_time", "n_effective", "split_rhat")
+CONVERGENCE = ("autocorrelation_time", "n_effective", "split_rhat")
 """Convergence figures of each unknown."""
 
 
@@ -250,7 +203,7 @@ def _with_figures(rows: list[dict[str, Any]], drawn: xr.Dataset) -> list[dict[st
     return [
         {
             **row,
-            **{key: float(drawn[key].sel(unknown=row["name"])) for key in FIGURES},
+            **{key: float(drawn[key].sel(unknown=row["name"])) for key in CONVERGENCE},
             "converged": _has_converged(drawn),
         }
         for row in rows
@@ -278,3 +231,138 @@ def _chain_lines(drawn: xr.Dataset) -> list[str]:
     if not _has_converged(drawn):
         lines.append(f"NOT CONVERGED: {about['not_converged_because']}; give more --steps: the chain goes on")
     return lines
+
+
+# ---- bands -----------------------------------------------------------------------------------------
+
+
+def bands(table: MeasuredTable, best: dict[str, float], drawn: xr.Dataset) -> xr.Dataset:
+    """Compute amplitudes on the branches and values of the bifurcations for each draw of the posterior.
+
+    Each orbit and each bifurcation is carried from the best parameters to those of a draw by Newton's method, in steps
+    where this is necessary; no branch is computed again. Return ``bifurcation_value`` over (draw, bifurcation) with
+    ``kind`` and ``best_value``, and ``amplitude`` over (draw, orbit) with ``branch``, ``parameter_value``,
+    ``n_unstable`` and ``best_amplitude``; NaN where a draw has none.
+    """
+    branches, _ = table.branches(best)
+    points, states, _ = bifurcation_data(branches)
+    orbits, guesses, places = orbit_data(table.along, branches, ("amplitude",))
+    data = [*points, *orbits]
+    packed = table.along.model.load().replace(**_own(table, best)).pack()
+    guess = np.array([*states, *guesses]).reshape(len(data), -1)
+    known = Solution(packed, guess, np.zeros_like(guess))
+    start, solved = solvable(OrbitData(table.along, table.state, tuple(data), known, table.settings))
+    values = _carried(start, drawn)
+    n_points = sum(d.kind != ORBIT for d in start.data)
+    own = [k - len(points) for k in solved[n_points:]]
+    best_values = quantities_of(start, packed[None], solve(start, packed[None]))[0]
+    share = np.isfinite(values[:, n_points:]).mean(axis=0)
+    return xr.Dataset(
+        {
+            "bifurcation_value": (("draw", "bifurcation"), values[:, :n_points]),
+            "best_value": ("bifurcation", [v[0] for v in best_values[:n_points]]),
+            "kind": ("bifurcation", np.array([d.kind for d in start.data[:n_points]], object)),
+            "period": ("bifurcation", [d.period for d in start.data[:n_points]]),
+            "amplitude": (("draw", "orbit"), values[:, n_points:]),
+            "best_amplitude": ("orbit", [v[0] for v in best_values[n_points:]]),
+            **place_variables([orbits[k] for k in own], [places[k] for k in own], share),
+        },
+        attrs={"parameter": table.along.parameter, "state": table.state},
+    )
+
+
+def _own(table: MeasuredTable, values: dict[str, float]) -> dict[str, float]:
+    return {name: v for name, v in {**values, **table.settings}.items() if name in table.along.model.parameter_names}
+
+
+def _carried(table: OrbitData, drawn: xr.Dataset) -> np.ndarray:
+    """Return amplitude or bifurcation value by draw and measurement, (draw, datum); NaN where none is found."""
+    names = [str(name) for name in drawn["parameter"].values]
+    packed = np.array([table.packed(dict(zip(names, row, strict=True))) for row in drawn["value"].values])
+    found = [[v[0] for v in row] for own, points in carried(table, packed) for row in quantities_of(table, own, points)]
+    return np.array(found).reshape(len(packed), len(table.data))
+
+
+def bands_table(found: Sequence[xr.Dataset]) -> Table:
+    """Return a table of the bifurcations: best value, median and 95 % interval over the draws with this bifurcation."""
+    rows, lines = [], []
+    for ds in found:
+        for b in range(ds.sizes["bifurcation"]):
+            values = ds["bifurcation_value"].values[:, b]
+            low, middle, high, n = interval_of(values)
+            kind, best = str(ds["kind"].values[b]).replace("_", " "), float(ds["best_value"].values[b])
+            row = {"kind": kind, "period": int(ds["period"].values[b]), "best": best, "median": middle}
+            rows.append({**row, "low": low, "high": high, "n_draws": n})
+            lines.append(
+                f"{kind} at {ds.attrs['parameter']} = {best:.6g}   95 %: {low:.6g} to {high:.6g} "
+                f"({n} of {len(values)} draws have it)"
+            )
+    return Table(rows, lines)
+
+
+def tubes(found: xr.Dataset) -> list[dict[str, np.ndarray]]:
+    """Return the 95 % amplitude bands, one per branch and stability: parameter values with lower and upper amplitude.
+
+    A band is there where at least half of the draws have the orbit.
+    """
+    bands_of = []
+    for _, _, chosen in stretches(found):
+        low, _, high = np.nanquantile(found["amplitude"].values[:, chosen], LEVELS, axis=0)
+        bands_of.append({"x": found["parameter_value"].values[chosen], "low": low, "high": high})
+    return bands_of
+
+
+# ---- files -----------------------------------------------------------------------------------------
+
+SHORT = {"period_doubling": "doubling", "neimark_sacker": "torus", "hopf": "Hopf"}
+"""Names of bifurcations in figures."""
+
+
+def write_posterior(
+    directory: str | Path,
+    n: int,
+    seed: int = 1,
+    *,
+    sampling: Sampling | None = None,
+    figures: bool = True,
+    echo: Echo = print,
+) -> tuple[Table, Table, list[Path]]:
+    """Draw the posterior, compute the 95 % bands of branches and bifurcations, and write both to the directory.
+
+    A `sampling` of None gives draws of the Gaussian. Return tables of the parameters and of the bifurcations, and the
+    paths of the written files. After Ctrl-C or SIGTERM the chain stays.
+    """
+    folder = local_path(directory)
+    result, found, written = read_result(folder), [], [folder / POSTERIOR]
+    with writer_lock(folder), stoppable(folder):
+        if sampling is None:
+            drawn = draw_posterior(folder, n, seed)
+        else:
+            drawn = sample_draws(folder, n, seed, sampling, echo=echo)
+        write_netcdf(written[0], drawn)
+        for i, table in enumerate(stored_tables(folder)):
+            one = bands(table, result["values"], drawn)
+            found.append(one)
+            written.append(folder / f"bands-{i}.nc")
+            write_netcdf(written[-1], one.assign(kind=("bifurcation", one["kind"].values.astype(str))))
+            if figures and table.measured is not None:
+                written += _draw(folder, i, table, result["values"], one)
+    return posterior_table(drawn), bands_table(found), written
+
+
+def _draw(folder: Path, i: int, table: MeasuredTable, values: dict[str, float], found: xr.Dataset) -> list[Path]:
+    branches, computed = table.branches(values)
+    intervals = []
+    for b in range(found.sizes["bifurcation"]):
+        known = found["bifurcation_value"].values[:, b]
+        known = known[np.isfinite(known)]
+        if 2 * len(known) >= found.sizes["draw"]:
+            kind = str(found["kind"].values[b])
+            low, _, high = np.quantile(known, LEVELS)
+            intervals.append((SHORT.get(kind, kind), float(low), float(high)))
+    assert table.measured is not None
+    figure = plot_branch(table.measured, branches, computed, bands=Bands(tubes(found), intervals))
+    refuse_links(folder / FIGURES)
+    make_folder(folder / FIGURES)
+    path = folder / FIGURES / f"bands-{i}.png"
+    return [save_figure(figure, path), save_data(figure, path)]

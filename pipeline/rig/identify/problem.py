@@ -38,32 +38,21 @@ def steady_drive(
 
 @dataclass(frozen=True)
 class Free:
-    """Unknown of the fit: a parameter of the model, the zero offset of a sensor, or the phase of a known drive.
+    """Unknown of the fit: a parameter of the model, the zero offset of a sensor, or the phase of a known drive."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one;
-        ``phase.RECORDING``.
-    start, lower, upper : float
-        First guess and bounds [SI].
-    unit, meaning : str
-        Unit, and description in words.
-    prior_mean, prior_sd : float
-        Mean and standard deviation of an independent measurement; NaN for none.
-    typical : float
-        Typical size, for an unknown whose start and bounds do not tell it; NaN: they do.
-    """
-
+    # name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one;
+    # ``phase.RECORDING``
     name: str
+    # first guess and bounds [SI]
     start: float
     lower: float = -math.inf
     upper: float = math.inf
     unit: str = ""
     meaning: str = ""
+    # mean and standard deviation of an independent measurement; NaN for none
     prior_mean: float = math.nan
     prior_sd: float = math.nan
-    typical: float = math.nan
+    typical: float = math.nan  # typical size, for an unknown whose start and bounds do not tell it; NaN: they do
 
     @property
     def size(self) -> float:
@@ -82,42 +71,21 @@ class Free:
 
 @dataclass(frozen=True)
 class Piece:
-    """Stretch of a recording that is fitted as one trajectory with its own unknown initial state.
+    """Stretch of a recording that is fitted as one trajectory with its own unknown initial state."""
 
-    Attributes
-    ----------
-    recording, number : int
-        Index of the recording, and of the piece in it.
-    time : ndarray, (n,)
-        Time since the stretch's start, rising from 0 [s].
-    measured : ndarray, (n, n_channels)
-        Measured values [SI]; NaN where nothing was measured.
-    start : ndarray, (n_states,)
-        First guess of the state at time 0 [SI].
-    drive : Drive, optional
-        Drive of the piece; None for none.
-    follows : int
-        Index in the problem of the stretch that this one continues; -1 for none.
-    begin_s : float
-        Time of the stretch's start by the recording's clock [s].
-    known_hz : float
-        Frequency of a drive that was not measured; 0 for any other [Hz].
-    """
-
+    # index of the recording, and of the piece in it
     recording: int
     number: int
-    time: np.ndarray
-    measured: np.ndarray
-    start: np.ndarray
+    time: np.ndarray  # (n,) time since the stretch's start, rising from 0 [s]
+    measured: np.ndarray  # (n, n_channels) measured values [SI]; NaN where nothing was measured
+    start: np.ndarray  # (n_states,) first guess of the state at time 0 [SI]
     drive: Drive | None = None
-    follows: int = -1
-    begin_s: float = 0.0
-    known_hz: float = 0.0
+    follows: int = -1  # index in the problem of the stretch that this one continues; -1 for none
+    begin_s: float = 0.0  # time of the stretch's start by the recording's clock [s]
+    known_hz: float = 0.0  # frequency of a drive that was not measured; 0 for any other [Hz]
 
     def turned(self, phase: float, detuning_hz: float) -> Piece:
-        """Return the piece with its known drive moved forward by a phase [drive periods] at the recording's time 0, and
-        with another frequency.
-        """
+        """Return the piece with its known drive moved by a phase at the recording's time 0, and detuned."""
         if self.drive is None or not self.known_hz or (phase == 0.0 and detuning_hz == 0.0):
             return self
         begun = self.drive.start_s * self.known_hz + phase + detuning_hz * self.begin_s
@@ -128,64 +96,29 @@ class Piece:
 
 @dataclass(frozen=True)
 class Problem:
-    """Least-squares problem of an identification: the unknowns are parameters, sensor offsets and the pieces' initial
-    states.
-
-    Attributes
-    ----------
-    model : Model
-        Model that is fitted.
-    fixed : Parameters
-        Values of the parameters that are not identified.
-    free : tuple of Free
-        Unknowns.
-    tied : dict
-        By parameter, the factor and the name of the parameter that it follows.
-    channels : tuple of str
-        States that are compared.
-    pieces : tuple of Piece
-        Pieces that are fitted.
-    noise : ndarray, (n_channels,)
-        Standard deviations that residuals are divided by [SI].
-    loss : str
-        ``linear``, ``soft_l1``, ``huber`` or ``cauchy``, as in `scipy.optimize.least_squares`.
-    loss_scale : float
-        Residual, in units of the noise, above which a robust loss grows slower than the square.
-    continuity : float, optional
-        Weight of the gap between a stretch's end and the next one's start; None leaves the starts free.
-    rtol : float
-        Tolerance of the integration, relative and absolute.
-    slopes : str
-        Method for slopes: ``differences`` between lanes or ``variational`` equations.
-    recorded : bool
-        Whether the pieces' drives are measured torques instead of the model's own drive.
-    orbits : tuple of OrbitData
-        Measured orbits and bifurcations that are fitted.
-    held : bool
-        Whether slopes are computed by the starts alone, as the unknowns are held.
-    """
+    """Least-squares problem: the unknowns are parameters, sensor offsets and the pieces' initial states."""
 
     model: Model
-    fixed: Parameters
+    fixed: Parameters  # values of the parameters that are not identified
     free: tuple[Free, ...]
     channels: tuple[str, ...]
     pieces: tuple[Piece, ...]
-    noise: np.ndarray
+    noise: np.ndarray  # (n_channels,) standard deviations that residuals are divided by [SI]
+    # by parameter, the factor and the name of the parameter that it follows
     tied: Mapping[str, tuple[float, str]] = field(default_factory=dict)
-    loss: str = "linear"
-    loss_scale: float = 1.0
+    loss: str = "linear"  # ``linear``, ``soft_l1``, ``huber`` or ``cauchy``, as in `scipy.optimize.least_squares`
+    loss_scale: float = 1.0  # residual, in units of the noise, above which a robust loss grows slower than the square
+    # weight of the gap between a stretch's end and the next one's start; None leaves the starts free
     continuity: float | None = None
-    rtol: float = RTOL
-    slopes: str = "differences"
-    recorded: bool = False
-    orbits: tuple[OrbitData, ...] = ()
-    held: bool = False
+    rtol: float = RTOL  # tolerance of the integration, relative and absolute
+    slopes: str = "differences"  # method for slopes: ``differences`` between lanes or ``variational`` equations
+    recorded: bool = False  # whether the pieces' drives are measured torques instead of the model's own drive
+    orbits: tuple[OrbitData, ...] = ()  # measured orbits and bifurcations that are fitted
+    held: bool = False  # whether slopes are computed by the starts alone, as the unknowns are held
 
     @cached_property
     def system(self) -> System:
-        """System of equations that is integrated. If the recordings contain a measured torque, this torque is its
-        drive.
-        """
+        """System that is integrated; a torque that the recordings contain is its drive."""
         return with_recorded_drive(self.model.system) if self.recorded else self.model.system
 
     @property
@@ -298,9 +231,7 @@ class Problem:
         return np.hstack([packed, np.zeros((len(thetas), more)), thetas @ turns.T])
 
     def with_orbits(self, known: Sequence[Solution]) -> Problem:
-        """Return a copy of the least-squares problem with new computed orbits to start Newton's method, one `Solution`
-        per table.
-        """
+        """Return the problem with new computed orbits to start Newton's method, one `Solution` per table."""
         orbits = tuple(replace(table, known=own) for table, own in zip(self.orbits, known, strict=True))
         return replace(self, orbits=orbits)
 

@@ -14,13 +14,11 @@ from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import json_value
 from pipeline.rig.identify.directory import Source
-from pipeline.rig.identify.drive_frequency import DriveFrequency
-from pipeline.rig.identify.identifiability import Direction
-from pipeline.rig.identify.judging import Judgement
+from pipeline.rig.identify.identifiability import Direction, DriveFrequency, Profile
+from pipeline.rig.identify.judgement import Judgement
 from pipeline.rig.identify.local import Fit
-from pipeline.rig.identify.orbit_reports import orbit_lines, orbits_result
+from pipeline.rig.identify.measured_orbits import orbit_lines, orbits_result
 from pipeline.rig.identify.problem import PHASE, ZERO, Problem
-from pipeline.rig.identify.profiles import Profile
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.identify.statistics import Covariance
 from pipeline.store.provenance import versions
@@ -31,37 +29,23 @@ SAME = 1e-3
 
 @dataclass(frozen=True)
 class Finding:
-    """Results of an identification before they are written to files.
-
-    Attributes
-    ----------
-    starts : dict of Fit
-        Outcome of each start by its number.
-    fitted, held_out : Judgement
-        Judgements of the fitted pieces, and of the held-out ones if there are any.
-    n_effective : dict
-        Number of independent residuals by channel.
-    at_bound : list of str
-        For each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text.
-    orbits : list of Dataset
-        Judged orbits and bifurcations, one dataset per table.
-    frequencies : list of DriveFrequency
-        Estimates of the stated frequencies of known drives.
-    """
+    """Results of an identification before they are written to files."""
 
     problem: Problem
-    starts: Mapping[int, Fit]
+    starts: Mapping[int, Fit]  # outcome of each start by its number
     best: Fit
     covariance: Covariance
     directions: Sequence[Direction]
+    # judgements of the fitted pieces, and of the held-out ones if there are any
     fitted: Judgement
     held_out: Judgement | None
-    n_effective: Mapping[str, float]
+    n_effective: Mapping[str, float]  # number of independent residuals by channel
+    # for each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text
     at_bound: Sequence[str]
-    orbits: Sequence[xr.Dataset] = ()
+    orbits: Sequence[xr.Dataset] = ()  # judged orbits and bifurcations, one dataset per table
     profiles: Mapping[str, Profile] = field(default_factory=dict)
     warnings: Sequence[str] = ()
-    frequencies: Sequence[DriveFrequency] = ()
+    frequencies: Sequence[DriveFrequency] = ()  # estimates of the stated frequencies of known drives
 
     @property
     def values(self) -> dict[str, float]:
@@ -84,9 +68,7 @@ class Finding:
 
 
 def beside_of(problem: Problem, fit: Fit, *words: str) -> dict[str, float]:
-    """Return the fitted unknowns that are no parameters of the model, by name: zero offsets of the sensors and phases
-    of known drives, or those whose names begin with one of the given words.
-    """
+    """Return the fitted unknowns beside the model's parameters: zeros and phases, or those of the given words."""
     prefixes = tuple(f"{word}." for word in words or (ZERO, PHASE))
     named = zip(problem.names, fit.theta, strict=True)
     return {name: float(value) for name, value in named if name.startswith(prefixes)}
@@ -282,9 +264,7 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
-    """Return one printed line for each channel: rms of its residuals, and correlation of its measured and computed
-    values.
-    """
+    """Return a printed line for each channel: rms of its residuals, and correlation with computed values."""
     lines = []
     for name, rms in judged["rms"].items():
         shown = "-" if rms is None else f"{rms:.4g} {units[name]}"

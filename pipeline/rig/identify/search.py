@@ -8,20 +8,20 @@ whole pieces with free starts at last (multiple shooting: Bezruchko et al., Chao
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.analysis.branches.carrying import Solution
 from pipeline.products.reporting import report
-from pipeline.rig.identify.first_guesses import choose_phases, fit_starts
-from pipeline.rig.identify.local import Echo, Fit, fit_local
+from pipeline.rig.identify.directory import Outcomes
+from pipeline.rig.identify.local import Echo, Fit, choose_phases, fit_local, fit_starts
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.specification.extras import import_extra
+from pipeline.specification.problems import import_extra
 
 Array = NDArray[np.float64]
 
@@ -36,14 +36,73 @@ POPULATION = 32
 """Members that are integrated at the same time."""
 
 
-class Keep(Protocol):
-    """Protocol of a store for finished fits. The key of a fit is the number of its first guess."""
+class Kept:
+    """Store of finished local fits; the key of a fit is the number of its first guess."""
+
+    def __init__(self, outcomes: Outcomes) -> None:
+        self._outcomes = outcomes
+        self.fits: dict[int, Fit] = {}
 
     def recall(self, number: int) -> Fit | None:
-        """Return the fit from first guess `number`, or None if it is not stored."""
+        """Return the local fit that began at first guess `number`, or None if it is not stored."""
+        fit = self._outcomes.recall(_name(number), unpack_fit)
+        if fit is not None:
+            self.fits[number] = fit
+        return fit
 
     def store(self, number: int, fit: Fit) -> None:
-        """Store the fit from first guess `number`."""
+        """Store the local fit that began at first guess `number`."""
+        self._outcomes.store(_name(number), pack_fit(fit))
+        self.fits[number] = fit
+
+
+def _name(number: int) -> str:
+    return f"start-{number:04d}"
+
+
+_KNOWN = ("packed", "unknowns", "tangents")
+"""Fields of a `Solution` that are stored."""
+
+
+def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
+    """Return all fields of a fit as named arrays, to be stored in a file."""
+    lengths = np.array([len(r) for r in fit.residuals], np.int64)
+    known = {f"orbits-{i}-{name}": getattr(own, name) for i, own in enumerate(fit.known) for name in _KNOWN}
+    return {
+        **known,
+        "theta": fit.theta,
+        "starts": fit.starts,
+        "rows": fit.rows,
+        "jacobian": fit.jacobian,
+        "residuals": np.concatenate(fit.residuals) if fit.residuals else np.zeros(0),
+        "lengths": lengths,
+        "cost": np.array(fit.cost),
+        "converged": np.array(fit.converged),
+        "message": np.array(fit.message),
+        "n_evaluations": np.array(fit.n_evaluations),
+    }
+
+
+def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
+    """Rebuild a fit from the arrays of `pack_fit`."""
+    residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1]) if len(data["lengths"]) else []
+    n_tables = sum(key.endswith(f"-{_KNOWN[0]}") for key in data)
+    known = []
+    for i in range(n_tables):
+        packed, unknowns, tangents = (data[f"orbits-{i}-{name}"] for name in _KNOWN)
+        known.append(Solution(packed, unknowns, tangents))
+    return Fit(
+        data["theta"],
+        data["starts"],
+        float(data["cost"]),
+        bool(data["converged"]),
+        str(data["message"]),
+        int(data["n_evaluations"]),
+        tuple(residuals),
+        data["rows"],
+        data["jacobian"],
+        tuple(known),
+    )
 
 
 def search(
@@ -54,41 +113,16 @@ def search(
     spread: float,
     method: str = "sobol",
     n_samples: int = 256,
-    keep: Keep | None = None,
+    keep: Kept | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> list[Fit]:
     """Fit from many first guesses. Return the fits sorted by cost, converged ones first.
 
-    Parameters
-    ----------
-    problem
-        Least-squares problem of the identification.
-    n_starts
-        Number of first guesses that are followed to an optimum; the first is the problem's own.
-    seed
-        Seed of the guesses.
-    spread
-        Largest distance of a guess from the problem's own, relative to the unknowns' sizes. All guesses lie
-        within the bounds.
-    method
-        ``sobol``: the best of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if
-        none of them converges; ``cma``: CMA-ES over the shortest stretches finds the guesses.
-    n_samples
-        Number of points that are evaluated; at least `n_starts`.
-    keep
-        Store of outcomes, so that a killed search can continue.
-    tell
-        Function that prints a line about each outcome.
-
-    Returns
-    -------
-    list of Fit
-        Best first; those that converged before those that did not.
-
-    Raises
-    ------
-    SpecError
-        If the package cma is not installed.
+    The first of the `n_starts` guesses that are followed to an optimum is the problem's own; the others are at most
+    `spread` away from it, relative to the unknowns' sizes, and within the bounds. With the method ``sobol``, the best
+    of `n_samples` points of a Sobol sequence are followed, and CMA-ES is tried if none of them converges; with ``cma``,
+    CMA-ES over the shortest stretches finds the guesses. `keep` stores outcomes, so that a killed search can continue;
+    `tell` prints a line about each.
     """
     import_extra("cma", "rig", "identify")  # now, and not when the first starts have failed
     stages = _stages(problem)
@@ -109,7 +143,7 @@ def _kept(
     k: int,
     theta: Array,
     total: int,
-    keep: Keep | None,
+    keep: Kept | None,
     tell: Callable[[str], None],
 ) -> Fit:
     fit = keep.recall(k) if keep is not None else None
@@ -127,9 +161,7 @@ def _kept(
 def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
-    """Return first guesses of the unknowns: that of the specification, then the best Sobol points or
-    results of CMA-ES.
-    """
+    """Return first guesses: that of the specification, then the best Sobol points or results of CMA-ES."""
     if n_starts == 1:
         return [problem.start]
     if method == "cma":
@@ -154,9 +186,7 @@ def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
 
 
 def costs(problem: Problem, thetas: Array) -> Array:
-    """Return the cost of each row of unknowns, at the first guesses of the initial states. The cost is infinite if a
-    trajectory diverges.
-    """
+    """Return the cost of each row of unknowns at the guessed initial states; infinite for diverging ones."""
     found = []
     for at in range(0, len(thetas), POPULATION):
         members = thetas[at : at + POPULATION]
@@ -218,9 +248,7 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
 
 
 def _stages(problem: Problem) -> list[Problem]:
-    """Return versions of the least-squares problem with short, longer and still longer stretches of the recordings.
-    Their initial states are estimated from the recordings.
-    """
+    """Return the problem with short, longer and still longer stretches, whose starts the recordings give."""
     if not problem.pieces:
         return [problem]
     longest = max(p.time[-1] for p in problem.pieces)

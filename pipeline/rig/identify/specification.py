@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,16 +15,257 @@ from pydantic import Field
 from magpend_core.defaults import RTOL
 from magpend_core.models import model_names
 from magpend_core.models.model import Model, Parameters
-from magpend_core.models.parameters import near_names
+from magpend_core.models.parameters import (
+    FRACTION,
+    NON_NEGATIVE,
+    POSITIVE,
+    ParameterError,
+    near_names,
+    unknown_name_problem,
+)
 from magpend_core.models.presets import is_file
-from pipeline.rig.identify.orbit_tables import OrbitsTable
-from pipeline.rig.identify.settings import setting_problems
-from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown
-from pipeline.specification.files import read_toml
+from pipeline.specification.files import IDENTIFICATION, read_toml
 from pipeline.specification.models import add_model
-from pipeline.specification.parsing import IDENTIFICATION
 from pipeline.specification.problems import SpecError, checked, table_at, unknown_choice, unknown_key
+from pipeline.specification.section import SectionTable
 from pipeline.specification.tables import Table
+
+# ---- measured orbits -------------------------------------------------------------------------------
+
+Quantity = Literal["amplitude", "frequency", "mean", "harmonics"]
+
+Pair = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class BifurcationTable(Table):
+    """Table ``[[orbits.bifurcations]]``: bifurcation that was measured, with its 95 % interval."""
+
+    kind: Literal["fold", "doubling", "torus", "hopf"] = Field(description="Kind of the bifurcation.")
+    interval: Pair = Field(description="95 % interval of the parameter, [low, high].")
+    period: int = Field(1, ge=1, description="Period of its orbit [drive periods or returns]; no matter for hopf.")
+    name: str = Field("", description="Name; by default kind and place in the list.")
+
+
+class OrbitsTable(Table):
+    """Table ``[[orbits]]``: measured orbits along a parameter, and measured bifurcations."""
+
+    file: str = Field(
+        "", description="Table of orbits (CSV) or specification with [measured.branch], relative to this file."
+    )
+    parameter: str = Field("", description="Parameter of the bifurcations; by default that of the file.")
+    state: str = Field("", description="State of a CSV file's amplitudes; by default the model's first.")
+    section: SectionTable | None = Field(
+        None, description="Poincare section of a model without a drive; by default that of the file."
+    )
+    period: int = Field(1, ge=1, description="Period of the orbits [drive periods or returns].")
+    frequency_hz: float | None = Field(None, gt=0, description="Drive frequency [Hz], unless it is the parameter.")
+    range: Pair | None = Field(
+        None, description="Interval of the parameter in which branches are computed; by default half as wide again."
+    )
+    parameters: dict[str, float] = Field(
+        default_factory=dict, description="Values of parameters in these measurements alone."
+    )
+    quantities: Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1)] = Field(
+        ("amplitude", "frequency"), description="Quantities that are fitted; a drive determines the frequency."
+    )
+    model_error: dict[Quantity, Annotated[float, Field(ge=0)]] = Field(
+        default_factory=dict,
+        description="Standard deviation that the model is allowed, relative to the measured value; it is added to "
+        "that of the measurement.",
+    )
+    parameter_sd: float = Field(
+        0.0,
+        ge=0,
+        description="Standard deviation of the parameter's measured values. Above 0 the nearest orbit of the branch is "
+        "compared, which is also there beside a fold.",
+    )
+    hold_out: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="Names of orbits and bifurcations that are judged but not fitted."
+    )
+    bifurcations: Annotated[tuple[BifurcationTable, ...], Field(strict=False)] = Field(
+        (), description="Measured bifurcations."
+    )
+
+
+# ---- parameters ------------------------------------------------------------------------------------
+
+_LEAST = 1e-9
+"""Smallest value of a positive parameter, relative to its start."""
+
+_FRACTION_MARGIN = 1e-6
+"""Distance that a fraction keeps from 0 and 1."""
+
+
+class Prior(Table):
+    """Prior of a parameter from an independent measurement: mean and standard deviation."""
+
+    mean: float
+    sd: Annotated[float, Field(gt=0)]
+
+
+class Identified(Table):
+    """Table ``[identify.NAME]``: first guess, bounds and prior of a parameter to be identified."""
+
+    start: float | None = Field(None, description="First guess; by default the preset's value")
+    bounds: Pair | None = Field(None, description="[low, high]; by default those of the model")
+    prior: Prior | None = Field(
+        None, description="An independent measurement, { mean = ..., sd = ... }: a weight, a length"
+    )
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Parameter to be identified, with first guess, bounds and prior filled in."""
+
+    name: str
+    # in the parameter's unit
+    start: float
+    lower: float
+    upper: float
+    prior: Prior | None
+
+
+_TIE = re.compile(r"\s*(?:([+-]?\s*[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*|(-)\s*)?([A-Za-z_]\w*)\s*")
+
+
+class ParameterTables:
+    """Fixed values, unknowns and ties (parameters proportional to others) of a specification, checked together."""
+
+    def __init__(self, data: Mapping[str, Any], model: Model, preset: str | Path | None, problems: list[str]) -> None:
+        self._model, self._problems = model, problems
+        identified = table_at(data, "identify", problems)
+        tied = table_at(data, "tied", problems)
+        self.fixed = dict(table_at(data, "parameters", problems))
+        self.values = self._values(preset)
+        if not identified:
+            problems.append("identify: missing; add a table [identify.NAME] for each parameter to identify.")
+        self.unknowns = tuple(
+            one for name, table in identified.items() if (one := self._unknown(name, table)) is not None
+        )
+        self.tied = self._ties(tied, identified)
+        for name in self.fixed:
+            if name in identified or name in tied:
+                where = "identify" if name in identified else "tied"
+                problems.append(f"parameters.{name}: is also in {where}; keep one of the two.")
+        if self.values is not None and not problems:
+            self._check_together()
+
+    def _values(self, preset: str | Path | None) -> Parameters | None:
+        try:
+            self._model.load(preset)
+        except ParameterError as error:
+            self._problems += [f"preset: {p}" for p in error.problems]
+            return None
+        try:
+            return self._model.load(preset, **self.fixed)
+        except ParameterError as error:
+            self._problems += [f"parameters: {p}" for p in error.problems]
+            return None
+
+    def _unknown(self, name: str, table: Any) -> Unknown | None:
+        if name not in self._model.parameter_names:
+            self._problems.append(f"identify.{name}: {unknown_name_problem(name, self._model.parameter_names)}")
+            return None
+        one = checked(Identified, table, f"identify.{name}", self._problems)
+        if one is None or (self.values is None and one.start is None):
+            return None
+        start = one.start if one.start is not None else self.values[name]  # type: ignore[index]
+        wrong = self._model.parameter(name).problem(start)
+        if wrong is not None:
+            self._problems.append(f"identify.{name}.start: {wrong}")
+            return None
+        low, high = one.bounds or self._bounds(name, start)
+        for bound in one.bounds or ():
+            wrong = self._model.parameter(name).problem(bound)
+            # an open bound of the model may be named as the end of a range
+            if wrong is not None and bound not in (0.0, 1.0):
+                self._problems.append(f"identify.{name}.bounds: {wrong}")
+        if not low < high:
+            self._problems.append(f"identify.{name}.bounds = [{low:g}, {high:g}]: must rise.")
+        elif not low <= start <= high:
+            self._problems.append(
+                f"identify.{name}.bounds = [{low:g}, {high:g}]: exclude the start {start:g}; widen them, or "
+                f"give another start."
+            )
+        least, most = self._bounds(name, start)
+        return Unknown(name, start, max(low, least), min(high, most), one.prior)
+
+    def _bounds(self, name: str, start: float) -> tuple[float, float]:
+        """Return the model's bounds on a parameter, just inside where the bound is not an allowed value."""
+        return {
+            POSITIVE: (_LEAST * start, math.inf),
+            NON_NEGATIVE: (0.0, math.inf),
+            FRACTION: (_FRACTION_MARGIN, 1.0 - _FRACTION_MARGIN),
+        }.get(self._model.parameter(name).bound, (-math.inf, math.inf))
+
+    def _ties(self, table: Mapping[str, Any], identified: Mapping[str, Any]) -> dict[str, tuple[float, str]]:
+        found = {}
+        for name, text in table.items():
+            one = self._tie(name, text, table, identified)
+            if one is not None:
+                found[name] = one
+        return found
+
+    def _tie(
+        self, name: str, text: Any, table: Mapping[str, Any], identified: Mapping[str, Any]
+    ) -> tuple[float, str] | None:
+        known, path = self._model.parameter_names, f"tied.{name}"
+        match = _TIE.fullmatch(text) if isinstance(text, str) else None
+        factor, other = math.nan, ""
+        if match is not None:
+            number, minus, other = match.groups()
+            factor = -1.0 if minus else _number(number)
+        if name not in known:
+            problem = unknown_name_problem(name, known)
+        elif not math.isfinite(factor):
+            problem = 'must be a name, or a number times one, such as "NAME" or "-1.0*NAME".'
+        elif name in identified:
+            problem = "is also in identify; keep one of the two."
+        elif other == name:
+            problem = "is tied to itself; name the identified parameter that it follows."
+        elif other not in known:
+            problem = unknown_name_problem(other, known)
+        elif other in table:
+            problem = f"follows {other}, which is tied itself; tie both to one identified parameter."
+        elif other not in identified:
+            problem = f"follows {other}, which is not identified; give its value under [parameters]."
+        else:
+            return factor, other
+        self._problems.append(f"{path} = {text!r}: {problem}")
+        return None
+
+    def _check_together(self) -> None:
+        assert self.values is not None
+        starts = {u.name: u.start for u in self.unknowns}
+        tied = {name: factor * starts[other] for name, (factor, other) in self.tied.items()}
+        try:
+            Parameters(self._model, {**self.values.as_dict(), **starts, **tied})
+        except ParameterError as error:
+            self._problems += [f"identify: at the start, {p}" for p in error.problems]
+
+
+def _number(text: str | None) -> float:
+    try:
+        return 1.0 if text is None else float(text.replace(" ", ""))
+    except ValueError:
+        return math.nan
+
+
+# ---- the whole specification -----------------------------------------------------------------------
+
+
+def setting_problems(model: Model, values: Mapping[str, float], where: str) -> list[str]:
+    """Return problems with values set for one recording: unknown parameters, values out of bounds."""
+    found = []
+    for name, value in values.items():
+        if name not in model.parameter_names:
+            hint = near_names(name, model.parameter_names, "parameters")
+            found.append(f"{where}.{name}: is not a parameter of {model.name}; {hint}")
+            continue
+        problem = model.parameter(name).problem(value)
+        if problem:
+            found.append(f"{where}.{problem}")
+    return found
 
 
 class SensorsTable(Table):
@@ -35,9 +277,7 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """Table ``[[recordings]]``: file of a recording, mapping file of its channels, kind of its drive, time window and
-    held-out pieces.
-    """
+    """Table ``[[recordings]]``: file, mapping, kind of the drive, time window and held-out pieces."""
 
     file: str = Field(description="Recording, relative to the specification")
     mapping: str = Field(description="Mapping file of the recording, relative to the specification")
@@ -116,43 +356,22 @@ class SearchTable(Table):
 
 @dataclass(frozen=True)
 class IdentificationSpec:
-    """Validated specification of an identification.
-
-    Attributes
-    ----------
-    title : str
-        Title of the identification.
-    model : Model
-        Model that is fitted.
-    preset : str, optional
-        Preset as given; by default the model's first.
-    parameters : dict
-        Fixed values by name, which replace the preset's.
-    values : Parameters
-        Values of the preset with `parameters` applied.
-    unknowns : tuple of Unknown
-        Identified parameters.
-    tied : dict
-        By parameter, the factor and the name of the identified parameter that it follows.
-    sensors, recordings, orbits, fit, search
-        Tables of the specification.
-    folder : Path
-        Folder that paths of files are relative to.
-    """
+    """Validated specification of an identification."""
 
     title: str
     model: Model
-    preset: str | None
-    parameters: dict[str, float]
-    values: Parameters
+    preset: str | None  # preset as given; by default the model's first
+    parameters: dict[str, float]  # fixed values by name, which replace the preset's
+    values: Parameters  # values of the preset with `parameters` applied
     unknowns: tuple[Unknown, ...]
+    # by parameter, the factor and the name of the identified parameter that it follows
     tied: dict[str, tuple[float, str]]
     sensors: SensorsTable
     recordings: tuple[RecordingTable, ...]
     orbits: tuple[OrbitsTable, ...]
     fit: FitTable
     search: SearchTable
-    folder: Path
+    folder: Path  # folder that paths of files are relative to
 
     @property
     def preset_found(self) -> str | Path | None:
@@ -204,25 +423,13 @@ _KEYS = (
 
 
 def load_identification(path: str | Path) -> IdentificationSpec:
-    """Read and validate the TOML file that specifies an identification.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once; also if the file cannot be read or is not TOML.
-    """
+    """Read and validate the TOML file of an identification; raise `SpecError` with all problems at once."""
     path = Path(path)
     return parse_identification(read_toml(path), path.parent)
 
 
 def parse_identification(data: Mapping[str, Any], folder: Path) -> IdentificationSpec:
-    """Validate the TOML tables of an identification; file paths in them are relative to `folder`.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
-    """
+    """Validate an identification's tables, with paths relative to `folder`; raise `SpecError` with all problems."""
     kind = data.get("kind")
     if kind in ("sweep", "continuation"):
         raise SpecError(f'kind = "{kind}": is a run, not an identification; use magpend run.')

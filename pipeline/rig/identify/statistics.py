@@ -22,11 +22,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy import signal, stats
+
+from pipeline.rig.identify.local import Fit
+from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.orbit_residuals import OrbitRows, orbit_rows
+from pipeline.rig.identify.problem import Problem
 
 FEWEST_PIECES = 8
 """Fewest pieces whose scatter gives a variance."""
@@ -46,51 +51,26 @@ Estimator = Literal["white", "pieces", "newey-west", "orbits"]
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and their derivatives at a fit's optimum, with the initial states eliminated, in units of the noise.
+    """Residuals and their derivatives at a fit's optimum, with the initial states eliminated, in units of the noise."""
 
-    Attributes
-    ----------
-    information : ndarray (n_free, n_free)
-        Information from data, priors and continuity.
-    prior : ndarray (n_free,)
-        Information of the priors, 1/sd^2; 0 where there is none.
-    residuals : tuple of ndarray (n, n_channels)
-        Residuals by piece; NaN where nothing was measured.
-    slopes : tuple of ndarray (n, n_channels, n_free)
-        Slopes of the residuals by the parameters, by piece, with the starts eliminated.
-    groups : tuple of int
-        The independent stretch that each piece belongs to.
-    n_starts : int
-        Number of fitted components of starts.
-    loss : str
-        Name of the loss in `scipy.optimize.least_squares`.
-    loss_scale : float
-        Residual above which a robust loss grows slower than the square.
-    following : ndarray (n_piece, n_states, n_free), optional
-        Derivative of the optimum of the starts by the parameters.
-    orbits : ndarray (n_orbit_residuals, n_free), optional
-        Slopes of the residuals of measured orbits, in standard deviations.
-    orbit_residuals : ndarray (n_orbit_residuals,), optional
-        Their residuals.
-    """
-
-    information: np.ndarray
-    prior: np.ndarray
-    residuals: tuple[np.ndarray, ...]
+    information: np.ndarray  # (n_free, n_free) information from data, priors and continuity
+    prior: np.ndarray  # (n_free,) information of the priors, 1/sd^2; 0 where there is none
+    residuals: tuple[np.ndarray, ...]  # (n, n_channels) residuals by piece; NaN where nothing was measured
+    # (n, n_channels, n_free) slopes of the residuals by the parameters, by piece, with the starts eliminated
     slopes: tuple[np.ndarray, ...]
-    groups: tuple[int, ...]
-    n_starts: int
-    loss: str = "linear"
-    loss_scale: float = 1.0
+    groups: tuple[int, ...]  # the independent stretch that each piece belongs to
+    n_starts: int  # number of fitted components of starts
+    loss: str = "linear"  # name of the loss in `scipy.optimize.least_squares`
+    loss_scale: float = 1.0  # residual above which a robust loss grows slower than the square
+    # (n_piece, n_states, n_free) derivative of the optimum of the starts by the parameters
     following: np.ndarray | None = None
+    # (n_orbit_residuals, n_free) slopes of the residuals of measured orbits, in standard deviations
     orbits: np.ndarray | None = None
-    orbit_residuals: np.ndarray | None = None
+    orbit_residuals: np.ndarray | None = None  # (n_orbit_residuals,) their residuals
 
     @property
     def stated(self) -> np.ndarray:
-        """Information matrix of priors and measured orbits, whose errors are stated rather than estimated, (n_free,
-        n_free).
-        """
+        """Information matrix, (n_free, n_free), of priors and measured orbits, whose errors are stated."""
         own = np.diag(self.prior).astype(float)
         return own if self.orbits is None else own + self.orbits.T @ self.orbits
 
@@ -107,30 +87,14 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance of the estimates, with the method that gave it and the half width of 95 % intervals.
+    """Covariance of the estimates, with the method that gave it and the half width of 95 % intervals."""
 
-    Attributes
-    ----------
-    matrix : ndarray (n_free, n_free)
-        NaN in rows and columns of parameters that are not determined.
-    estimator : str
-        Name of the method.
-    why : str
-        A sentence that gives the reason for the method.
-    critical : float
-        Half width of a 95 % interval in standard errors.
-    degrees : float
-        Degrees of freedom of Student's t.
-    inflation : float
-        Ratio of the standard errors to those of independent residuals as large as the noise.
-    """
-
-    matrix: np.ndarray
+    matrix: np.ndarray  # (n_free, n_free) NaN in rows and columns of parameters that are not determined
     estimator: Estimator
-    why: str
-    critical: float
-    degrees: float
-    inflation: float
+    why: str  # a sentence that gives the reason for the method
+    critical: float  # half width of a 95 % interval in standard errors
+    degrees: float  # degrees of freedom of Student's t
+    inflation: float  # ratio of the standard errors to those of independent residuals as large as the noise
 
     @property
     def errors(self) -> np.ndarray:
@@ -147,21 +111,11 @@ class Covariance:
 
 
 def eliminate_starts(jacobian: np.ndarray, n_free: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the initial states from a least-squares problem; return the information matrix of the parameters.
+    """Eliminate the initial states from a least-squares problem whose Jacobian has the parameters' columns first.
 
-    Parameters
-    ----------
-    jacobian
-        (m, n_free + n_starts), the parameters' columns first.
-    n_free
-        Number of parameters.
-
-    Returns
-    -------
-    information : ndarray (n_free, n_free)
-        Schur complement of the starts' block of ``jacobian.T @ jacobian``.
-    following : ndarray (n_starts, n_free)
-        The matrix X of the module: minus the derivative of the starts' optimum by the parameters.
+    Return the information matrix of the parameters, the Schur complement of the starts' block of ``jacobian.T @
+    jacobian``, and the matrix X of the module, (n_starts, n_free): minus the derivative of the starts' optimum by the
+    parameters.
     """
     own, starts = jacobian[:, :n_free], jacobian[:, n_free:]
     # lstsq does not square the condition number, and gives 0 for undetermined starts
@@ -176,22 +130,10 @@ def pooled_autocorrelation(residuals: Sequence[np.ndarray], most: int) -> np.nda
 
 
 def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the autocorrelation (mean not subtracted) of one channel's residuals, and the number of pairs of
-    residuals, at each lag.
+    """Return the autocorrelation (mean not subtracted) of one channel's residuals by piece, and the number of pairs, at
+    each lag.
 
-    Parameters
-    ----------
-    residuals
-        Residuals of each piece, (n,); NaN where nothing was measured.
-    most
-        Largest lag.
-
-    Returns
-    -------
-    autocorrelation : ndarray (most + 1,)
-        At lags 0, 1, ...; NaN where no piece is long enough.
-    pairs : ndarray (most + 1,)
-        Number of pairs of residuals at each lag.
+    The lags are 0 to `most`; the autocorrelation is NaN where no piece is long enough.
     """
     products, pairs = np.zeros(most + 1), np.zeros(most + 1)
     for r in residuals:
@@ -207,13 +149,7 @@ def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray
 
 
 def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
-    """Return whether any channel's residuals are autocorrelated, by a Ljung-Box test over all pieces.
-
-    Parameters
-    ----------
-    residuals
-        Residuals of each piece, (n, n_channels).
-    """
+    """Return whether residuals, (n, n_channels) by piece, are autocorrelated: a Ljung-Box test over all pieces."""
     n_channels = residuals[0].shape[1]
     shortest = min(len(r) for r in residuals)
     lags = max(1, min(LAGS, shortest // 5))
@@ -227,22 +163,11 @@ def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
 
 
 def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
-    """Return the lag at which the residuals have lost their correlation, and the number of residuals that count as one
-    independent residual.
+    """Return the lag at which `n` residuals have lost their correlation, and the number of residuals per independent
+    one.
 
-    Parameters
-    ----------
-    rho
-        Autocorrelation at lags 0, 1, ...
-    n
-        Number of residuals.
-
-    Returns
-    -------
-    lag : int
-        First lag from which on the autocorrelation stays within the band of white noise for a while.
-    factor : float
-        ``1 + 2 sum rho`` up to that lag, at least 1: number of residuals per independent one.
+    From the lag on, the autocorrelation stays within the band of white noise for a while; the number is ``1 + 2 sum
+    rho`` up to it, at least 1.
     """
     band = stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(max(n, 1))
     outside = np.abs(np.nan_to_num(rho)) > 2.0 * band
@@ -267,14 +192,8 @@ def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
 
 
 def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return weight and curvature of each residual for a robust loss of `scipy.optimize.least_squares`.
-
-    Returns
-    -------
-    weight : ndarray
-        Derivative of half the loss, divided by the residual.
-    slope : ndarray
-        Second derivative of half the loss, at least 0.
+    """Return, for a robust loss of `scipy.optimize.least_squares`, the derivative of half the loss divided by the
+    residual, and the second derivative of half the loss, at least 0.
     """
     z = residuals**2
     if loss == "linear":
@@ -289,9 +208,7 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores (gradients of the cost by the parameters) at each sample time, and information matrices, for
-    each piece.
-    """
+    """Gradients of the cost by the parameters at each sample time, and information matrices, by piece."""
 
     scores: list[np.ndarray]
     information: list[np.ndarray]
@@ -315,19 +232,8 @@ def _scores(fit: Linearised) -> _Scores:
 def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | None = None) -> Covariance:
     """Estimate the covariance of the fitted parameters, with allowance for autocorrelated residuals.
 
-    Parameters
-    ----------
-    fit
-        The fit near its optimum.
-    scale
-        (n_free,) size of each parameter, to detect singular directions.
-    estimator
-        Method; by default chosen by the residuals, see the module.
-
-    Returns
-    -------
-    Covariance
-        Covariance with its method and critical value.
+    `scale` is the size of each parameter, (n_free,), to detect singular directions. By default the residuals choose the
+    estimator, see the module.
     """
     if not fit.residuals:
         return _of_orbits(fit, scale)
@@ -461,9 +367,7 @@ def _newey_west(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.
 
 
 def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
-    """Return the Newey-West sum of the scores' autocovariances over time, with Bartlett weights up to lag
-    `bandwidth`.
-    """
+    """Return the Newey-West sum of the scores' autocovariances, with Bartlett weights up to lag `bandwidth`."""
     n, p = scores.shape
     window = 1.0 - np.abs(np.arange(-bandwidth, bandwidth + 1)) / (bandwidth + 1)
     smoothed = np.stack(
@@ -471,3 +375,135 @@ def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
     )
     meat = scores.T @ smoothed
     return np.asarray((meat + meat.T) / 2)
+
+
+# ---- linearisation of a fit ------------------------------------------------------------------------
+
+STEP = 1e-4
+"""Step of the central differences in units of the sizes; their error is about its square."""
+
+RTOL = 1e-10
+"""Tolerance of the integration under the differences; a slope's noise is this over `STEP`."""
+
+MAD = 1.4826
+"""Ratio of the standard deviation of Gaussian noise to its median absolute value."""
+
+
+def linearise(problem: Problem, fit: Fit) -> Linearised:
+    """Return the residuals at a fit's optimum and their derivatives by the parameters, with the initial states
+    eliminated.
+
+    The fit's own slopes are compressed piece by piece. Statistics of autocorrelated residuals need them along
+    time.
+    """
+    n_free, n_states = len(problem.free), len(problem.model.states)
+    scale = loss_scale_of(problem, fit)
+    full = sample_slopes(problem, fit) if problem.pieces else []
+    joined = problem.continuity is not None
+    follow = eliminate_starts(fit.jacobian, n_free)[1] if joined else None
+    slopes, following = [], []
+    for k, own in enumerate(full):
+        flat = own.reshape(-1, own.shape[-1])
+        # free starts are eliminated piece by piece here: the fit's one-sided differences are less exact
+        moves = eliminate_starts(flat, n_free)[1] if follow is None else follow[k * n_states : (k + 1) * n_states]
+        slopes.append(own[..., :n_free] - own[..., n_free:] @ moves)
+        following.append(-moves)
+    prior = np.array([f.prior_sd**-2 if f.has_prior else 0.0 for f in problem.free])
+    residuals = tuple(r / problem.noise for r in fit.residuals)
+    of_orbits = _at_orbits(problem, fit)
+    information = _information(problem, fit, slopes, residuals, prior, scale)
+    if of_orbits is not None and not joined:
+        information = information + of_orbits.jacobian.T @ of_orbits.jacobian
+    return Linearised(
+        information,
+        prior,
+        residuals,
+        tuple(slopes),
+        groups_of(problem),
+        fit.starts.size,
+        problem.loss,
+        scale,
+        np.array(following),
+        None if of_orbits is None else of_orbits.jacobian,
+        None if of_orbits is None else of_orbits.rows,
+    )
+
+
+def _at_orbits(problem: Problem, fit: Fit) -> OrbitRows | None:
+    if not problem.orbits:
+        return None
+    return orbit_rows(problem.with_orbits(fit.known), fit.theta[None], slopes=True)[0]
+
+
+def _information(
+    problem: Problem,
+    fit: Fit,
+    slopes: list[np.ndarray],
+    residuals: tuple[np.ndarray, ...],
+    prior: np.ndarray,
+    scale: float,
+) -> np.ndarray:
+    """Return the unknowns' information matrix: a sum over samples, or of the Jacobian for coupled pieces."""
+    if problem.continuity is not None:
+        return eliminate_starts(fit.jacobian, len(problem.free))[0]
+    total = np.diag(prior)
+    for r, own in zip(residuals, slopes, strict=True):
+        there = np.isfinite(r)
+        bend = np.where(there, robust_weights(np.where(there, r, 0.0) / scale, problem.loss)[1], 0.0)
+        known = np.where(there[..., None], own, 0.0)
+        total = total + np.einsum("tcp,tc,tcq->pq", known, bend, known)
+    return total
+
+
+def loss_scale_of(problem: Problem, fit: Fit) -> float:
+    """Return the residual, in units of the noise, above which a robust loss grows slower than the square."""
+    if problem.loss == "linear":
+        return 1.0
+    z = np.concatenate(fit.residuals) / problem.noise
+    return max(MAD * float(np.nanmedian(np.abs(z))), 1.0)
+
+
+def groups_of(problem: Problem) -> tuple[int, ...]:
+    """Return the group of each piece: consecutive pieces tied by a continuity weight form one."""
+    found: list[int] = []
+    for k, piece in enumerate(problem.pieces):
+        joined = problem.continuity is not None and 0 <= piece.follows < k
+        found.append(found[piece.follows] if joined else k)
+    return tuple(found)
+
+
+def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
+    """Return, for each piece, the derivatives of the residuals at each sample by the unknowns and by the piece's
+    initial state, in units of the noise.
+
+    They are central differences from one call of the engine. The starts of all pieces are changed at once,
+    since no piece depends on another's start. At a bound the differences are one-sided.
+    """
+    n_free, scales = len(problem.free), problem.model.scales
+    thetas, starts, widths = [], [], []
+    for i, free in enumerate(problem.free):
+        h = STEP * max(abs(float(fit.theta[i])), free.size)
+        ends = np.clip(fit.theta[i] + h * np.array([1.0, -1.0]), free.lower, free.upper)
+        for end in ends:
+            theta = fit.theta.copy()
+            theta[i] = end
+            thetas.append(theta)
+            starts.append(fit.starts)
+        widths.append(float(ends[0] - ends[1]))
+    for s, scale in enumerate(scales):
+        for sign in (1.0, -1.0):
+            moved = fit.starts.copy()
+            moved[:, s] += sign * STEP * scale
+            thetas.append(fit.theta)
+            starts.append(moved)
+        widths.append(2 * STEP * scale)
+    exact = replace(problem, rtol=min(problem.rtol, RTOL), continuity=None, orbits=())
+    found = evaluate(exact, np.array(thetas), np.array(starts), slopes=False)
+    slopes = []
+    for k in range(len(problem.pieces)):
+        own = [
+            (found[2 * j].residuals[k] - found[2 * j + 1].residuals[k]) / (widths[j] * problem.noise)
+            for j in range(n_free + len(scales))
+        ]
+        slopes.append(np.nan_to_num(np.stack(own, axis=-1)))
+    return slopes

@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.plots import style
-from pipeline.plots.files import save_data, save_figure, with_provenance
+from pipeline.plots.figure import save_data, save_figure, with_provenance
 from pipeline.rig.magnet.fitting import Outcome
 from pipeline.rig.magnet.measurement import SAME_ANGLE
 from pipeline.store.provenance import provenance, versions
@@ -128,9 +128,7 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
 
 @style.drawn
 def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the fitted torque in the plane of both angles, with the line of zero torque and the readings (as Fig. 8 of
-    Wojna et al. 2018).
-    """
+    """Draw the fitted torque over both angles, with its zeros and the readings (as Fig. 8 of Wojna et al. 2018)."""
     m, values = outcome.measured, outcome.joint.values
     angle, locked = (np.linspace(a.min() - _EDGE, a.max() + _EDGE, FINE) for a in (m.angle, m.locked))
     torque = laws.magnet_moment(angle, locked[:, None], values)
@@ -158,9 +156,7 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
 
 @style.drawn
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the torques of the joint fit and of point dipoles together with the readings, and the residuals of both (as
-    Fig. 9 of Wojna et al. 2018).
-    """
+    """Draw the joint fit and point dipoles against the readings (as Fig. 9 of Wojna et al. 2018)."""
     shown = _spread(outcome, COMPARED)
     figure = style.new_figure(4.4, _comparison(outcome, shown), frame)
     grid = figure.subplots(2, len(shown), sharex="col", sharey="row", height_ratios=[1.5, 1.0], squeeze=False)
@@ -261,9 +257,7 @@ def _readings(outcome: Outcome, rows: np.ndarray) -> xr.Dataset:
 
 
 def _numbers(outcome: Outcome, fine: np.ndarray) -> xr.Dataset:
-    """Return height, position and width of each torque curve's bump. Add the laws for them over the locked angle,
-    fitted separately and jointly.
-    """
+    """Return height, position and width of the bumps, and their laws over the locked angle."""
     curves = outcome.curves
     variables: dict[str, Any] = {
         "curve_locked": ("curve", [np.degrees(f.curve.locked) for f in curves], {"units": "deg"}),
@@ -290,9 +284,7 @@ def _laws_at(locked: np.ndarray, values: dict[str, float], i: int) -> dict[str, 
 
 
 def _comparison(outcome: Outcome, shown: Sequence[float]) -> xr.Dataset:
-    """Return the readings at some locked angles, with the torques of the joint fit and of the point dipoles on a fine
-    grid of angles.
-    """
+    """Return readings at some locked angles, with the torques of the fit and of dipoles on a fine grid."""
     m = outcome.measured
     own = [np.flatnonzero(np.abs(m.locked - locked) < SAME_ANGLE) for locked in shown]
     fine = np.array([_fine(m.angle[rows]) for rows in own])

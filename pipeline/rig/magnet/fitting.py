@@ -10,16 +10,120 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import least_squares, minimize_scalar
 
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.rig.magnet.measurement import Curve, Measurement
-from pipeline.rig.magnet.solving import Quality, Solution, errors_by_cluster, solve
+
+# ---- least squares ---------------------------------------------------------------------------------
+
+_EPS = np.finfo(np.float64).eps
+MAX_EVALUATIONS = 4000
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of a converged least-squares fit: estimates, standard errors, Jacobian and residuals."""
+
+    x: np.ndarray  # estimates, (n_free,)
+    errors: np.ndarray  # standard errors, (n_free,)
+    jacobian: np.ndarray  # derivatives of the residuals, (n, n_free)
+    residuals: np.ndarray  # measured minus computed (n,)
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Correlation matrix of the estimates, for readings with equal noise."""
+        normal = _inverse(self.jacobian)
+        size = np.sqrt(np.diag(normal))
+        return np.asarray(normal / size[:, None] / size)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Quality of a fit: R squared, and root mean square of the residuals."""
+
+    r2: float  # 1 - residual over total sum of squares about the mean
+    rms: float  # root mean square of the residuals [N m]
+
+    @classmethod
+    def of(cls, measured: np.ndarray, residuals: np.ndarray) -> Quality:
+        """Compute the quality of a fit from the readings and their residuals."""
+        total = float(((measured - measured.mean()) ** 2).sum())
+        left = float(residuals @ residuals)
+        return cls(1.0 - left / total if total > 0.0 else math.nan, math.sqrt(left / len(residuals)))
+
+
+def solve(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    slopes: Callable[[np.ndarray], np.ndarray],
+    start: Sequence[float],
+    what: str,
+) -> Solution:
+    """Solve a nonlinear least-squares problem by the Levenberg-Marquardt method, with tolerances at the level of
+    rounding errors.
+
+    `slopes` are the derivatives of the residuals, (n, n_free); `what` names the fit in messages. Raise
+    `ArithmeticError` if it does not converge, or the readings do not determine all free parameters.
+    """
+    with np.errstate(all="ignore"):
+        found = least_squares(
+            residuals,
+            start,
+            slopes,
+            method="lm",
+            x_scale="jac",
+            ftol=4 * _EPS,
+            xtol=4 * _EPS,
+            gtol=4 * _EPS,
+            max_nfev=MAX_EVALUATIONS,
+        )
+        finite = bool(np.isfinite(found.x).all() and np.isfinite(found.fun).all())
+        if found.status < 1 or not finite:
+            raise ArithmeticError(f"{what}: the fit did not converge ({found.message}), so there is no result.")
+        jacobian = slopes(found.x)
+        variance = found.fun @ found.fun / max(len(found.fun) - len(found.x), 1)
+        try:
+            errors = np.sqrt(np.diag(_inverse(jacobian)) * variance)
+        except np.linalg.LinAlgError:
+            errors = np.full(len(found.x), np.nan)
+    if not np.isfinite(errors).all():
+        raise ArithmeticError(f"{what}: the readings do not determine all fitted parameters, so there is no result.")
+    return Solution(found.x, errors, jacobian, found.fun)
+
+
+def _inverse(jacobian: np.ndarray) -> np.ndarray:
+    """Return the inverse of ``J.T @ J``; the columns of ``J`` are scaled to equal size for accuracy."""
+    size = np.linalg.norm(jacobian, axis=0)
+    _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
+    if not s[-1] > len(jacobian) * _EPS * s[0]:
+        raise np.linalg.LinAlgError
+    half = right.T / s / size[:, None]
+    return np.asarray(half @ half.T)
+
+
+def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the standard errors of fitted parameters by a jackknife over clusters of rows, within which residuals may
+    correlate.
+
+    This is the jackknife over clusters about the fit to all readings (CR3): each cluster is left out in turn, to first
+    order. Unlike the plain sandwich, its errors are not too small with few clusters: MacKinnon, Nielsen & Webb, J.
+    Econometrics 232 (2023) 272-299. All are NaN if one cluster alone determines some parameter.
+    """
+    normal = _inverse(found.jacobian)
+    squares = np.zeros(len(found.x))
+    for rows in clusters:
+        own = found.jacobian[rows]
+        rest = np.eye(len(rows)) - own @ normal @ own.T
+        if np.linalg.cond(rest) > 1.0 / (len(found.jacobian) * _EPS):
+            return np.full(len(found.x), np.nan)
+        squares += (normal @ own.T @ np.linalg.solve(rest, found.residuals[rows])) ** 2
+    return np.asarray(np.sqrt(squares * (len(clusters) - 1) / len(clusters)))
+
 
 STEEPNESS = (30.0, 10.0, 100.0, 300.0)
 """First guesses of the steepness of the change between the bumps, for the joint fit [1/rad]."""
@@ -33,15 +137,10 @@ FARTHEST_DIPOLES = 3.0
 
 @dataclass(frozen=True)
 class CurveFit:
-    """Fit of one Gaussian bump to one torque curve (Wojna et al. 2018, Eq. 17), with standard errors and quality.
-
-    Attributes
-    ----------
-    values, errors : dict
-        By ``A`` [N m], ``b``, ``c`` [rad].
-    """
+    """Fit of one Gaussian bump to one torque curve (Wojna et al. 2018, Eq. 17), with standard errors and quality."""
 
     curve: Curve
+    # by ``A`` [N m], ``b``, ``c`` [rad]
     values: dict[str, float]
     errors: dict[str, float]
     quality: Quality
@@ -49,90 +148,49 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class Laws:
-    """Fitted height, position and width of the bumps as functions of the locked angle (Wojna et al. 2018, Eq. 18).
+    """Fitted height, position and width of the bumps as functions of the locked angle (Wojna et al. 2018, Eq. 18)."""
 
-    Attributes
-    ----------
-    values, errors : dict
-        By the names of `laws.FITTED`, without the steepness.
-    r2 : dict
-        R squared of height and position by side, ``A1`` ... ``b2``. The width is constant.
-    """
-
+    # by the names of `laws.FITTED`, without the steepness
     values: dict[str, float]
     errors: dict[str, float]
-    r2: dict[str, float]
+    r2: dict[str, float]  # R squared of height and position by side, ``A1`` ... ``b2``. The width is constant.
 
 
 @dataclass(frozen=True)
 class JointFit:
-    """Joint fit to all readings (Wojna et al. 2018, Eq. 18-19), with standard errors and correlations of its
-    parameters.
-
-    Attributes
-    ----------
-    free : tuple of str
-        Parameters that were fitted.
-    values : dict
-        All of `laws.FITTED`.
-    errors, errors_by_curve : dict
-        Standard errors of `free`: from the residuals' variance, and from a jackknife over whole curves. The
-        latter are NaN if one curve alone determines a parameter.
-    correlation : ndarray
-        Correlation matrix of `free`.
-    residuals : ndarray
-        Measured minus computed [N m].
-    neighbours : float
-        Correlation of the residuals of neighbouring readings of a curve; 0 for white noise.
-    undetermined : dict
-        For each parameter that the readings hardly determine, the one with which it correlates most.
-    """
+    """Joint fit to all readings (Wojna et al. 2018, Eq. 18-19), with standard errors and correlations."""
 
     free: tuple[str, ...]
-    values: dict[str, float]
+    values: dict[str, float]  # all of `laws.FITTED`
+    # standard errors of `free`: from the residuals' variance, and from a jackknife over whole curves. The latter are
+    # NaN if one curve alone determines a parameter.
     errors: dict[str, float]
     errors_by_curve: dict[str, float]
     correlation: np.ndarray
     quality: Quality
-    residuals: np.ndarray
-    neighbours: float
+    residuals: np.ndarray  # measured minus computed [N m]
+    neighbours: float  # correlation of the residuals of neighbouring readings of a curve; 0 for white noise
+    # for each parameter that the readings hardly determine, the one with which it correlates most
     undetermined: dict[str, str]
 
 
 @dataclass(frozen=True)
 class DipoleFit:
-    """Fit of two point dipoles to the readings (Wojna et al. 2018, Eq. 16).
+    """Fit of two point dipoles to the readings (Wojna et al. 2018, Eq. 16)."""
 
-    Attributes
-    ----------
-    values : dict
-        ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m].
-    residuals : ndarray
-        Measured minus computed [N m].
-    """
-
+    # ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m]
     values: dict[str, float]
     quality: Quality
-    residuals: np.ndarray
+    residuals: np.ndarray  # measured minus computed [N m]
 
 
 # ---- one curve -----------------------------------------------------------------------------------
 
 
 def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
-    """Fit a Gaussian bump (Wojna et al. 2018, Eq. 17) to one torque curve.
+    """Fit a Gaussian bump (Wojna et al. 2018, Eq. 17) to the readings [rad], [N m] of one torque curve.
 
-    Parameters
-    ----------
-    angle, torque
-        Readings of the curve [rad], [N m].
-    curve
-        Side and locked angle of the curve.
-
-    Raises
-    ------
-    ArithmeticError
-        If the fit does not converge, or finds no peak among the readings.
+    Raise `ArithmeticError` if the fit does not converge, or finds no peak among the readings.
     """
     what = f"curve {curve}"
     peak = int(np.argmax(torque if curve.side == 0 else -torque))
@@ -155,13 +213,7 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
 
 
 def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
-    """Fit a bump to each torque curve separately.
-
-    Raises
-    ------
-    ArithmeticError
-        If a fit fails; the message names all such curves.
-    """
+    """Fit a bump to each torque curve separately; raise `ArithmeticError` with all curves whose fits fail."""
     found, problems = [], []
     for curve in measured.curves:
         try:
@@ -177,15 +229,10 @@ def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
 
 
 def fit_laws(curves: Sequence[CurveFit]) -> Laws:
-    """Fit the bumps' height by a Gaussian, their position by a line and their width by a constant, as functions of the
-    locked angle (Wojna et al. 2018, Eq. 18).
+    """Fit the bumps' height by a Gaussian, their position by a line and their width by a constant, over the locked
+    angle (Wojna et al. 2018, Eq. 18).
 
     Each value is weighted by its standard error. The laws' own errors come from the scatter about them.
-
-    Raises
-    ------
-    ArithmeticError
-        If the Gaussian does not converge.
     """
     values: dict[str, float] = {}
     errors: dict[str, float] = {}
@@ -246,21 +293,10 @@ def _constant(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
 
 
 def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping[str, float] | None = None) -> JointFit:
-    """Fit the law of the torque (Wojna et al. 2018, Eq. 18-19) to all readings at once.
+    """Fit the law of the torque (Wojna et al. 2018, Eq. 18-19) to all readings at once, with the parameters of `hold`
+    kept.
 
-    Parameters
-    ----------
-    measured
-        The readings.
-    start
-        First guess by name; several first guesses of the steepness are tried.
-    hold
-        Values of parameters that are not fitted, by name.
-
-    Raises
-    ------
-    ArithmeticError
-        If no first guess leads to a result.
+    Several first guesses of the steepness are tried besides `start`. Raise `ArithmeticError` if none leads to a result.
     """
     held = dict(hold or {})
     free = tuple(name for name in laws.FITTED if name not in held)
@@ -346,15 +382,11 @@ def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
 
 
 def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
-    """Fit the strength of two point dipoles (Wojna et al. 2018, Eq. 16). With `place`, fit the position of the fixed
+    """Fit the strength of two point dipoles (Wojna et al. 2018, Eq. 16), and with `place` the position of the fixed
     dipole as well.
 
-    The torque is linear in the strength. The place is sought below the end of the stretched pendulum.
-
-    Raises
-    ------
-    ArithmeticError
-        If no strength of repelling dipoles fits the readings.
+    The torque is linear in the strength. The place is sought below the end of the stretched pendulum. Raise
+    `ArithmeticError` if no strength of repelling dipoles fits.
     """
     p: dict[str, Any] = {**measured.parameters, "pole1": 1.0, "pole2": 1.0}
 
@@ -387,23 +419,14 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All fits to a measurement of the magnets' torque.
-
-    Attributes
-    ----------
-    joint : JointFit
-        Joint fit with the parameters held that the header names.
-    unheld : JointFit or None
-        Joint fit with nothing held; None if the header holds nothing, or if this fit fails.
-    dipoles, placed_dipoles : DipoleFit
-        Fits with the fixed dipole at the fixed magnet, and at its best place.
-    """
+    """All fits to a measurement of the magnets' torque."""
 
     measured: Measurement
     curves: tuple[CurveFit, ...]
     laws: Laws
-    joint: JointFit
-    unheld: JointFit | None
+    joint: JointFit  # joint fit with the parameters held that the header names
+    unheld: JointFit | None  # joint fit with nothing held; None if the header holds nothing, or if this fit fails
+    # fits with the fixed dipole at the fixed magnet, and at its best place
     dipoles: DipoleFit
     placed_dipoles: DipoleFit
 

@@ -87,18 +87,14 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """Tie that holds the pendulum's upper link during the measurement. The weight of the tie adds a torque to the
-    readings.
-    """
+    """Tie that holds the pendulum's upper link; its weight adds a torque to the readings."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
     lever_m: float = Field(ge=0, description="Distance from the upper joint along the link to the mass [m].")
 
 
 class Correction(Table):
-    """Header table ``[correction]``: torques in the readings that do not come from the magnets and must be
-    subtracted.
-    """
+    """Header table ``[correction]``: torques in the readings that the magnets do not cause, to be subtracted."""
 
     weights: bool = Field(description="Whether the readings include the torque of the links' weights.")
     tie: Tie | None = Field(None, description="Weight of the tie, if the readings include it.")
@@ -150,21 +146,11 @@ class Header(Table):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Torque curve: the readings at one locked angle, on one side of the fixed magnet.
+    """Torque curve: the readings at one locked angle, on one side of the fixed magnet."""
 
-    Attributes
-    ----------
-    side : int
-        Index in `laws.SIDES`.
-    locked : float
-        Locked angle [rad].
-    rows : ndarray
-        Indices of its readings in the measurement.
-    """
-
-    side: int
+    side: int  # index in `laws.SIDES`
     locked: float
-    rows: np.ndarray
+    rows: np.ndarray  # indices of its readings in the measurement
 
     def __str__(self) -> str:
         return f"{laws.LOCKED} = {math.degrees(self.locked):.4g} deg, {laws.SIDES[self.side]}"
@@ -172,38 +158,19 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques.
-
-    Attributes
-    ----------
-    path : Path
-        Path of the header.
-    digest : str
-        sha256 of the table.
-    parameters : Parameters
-        Parameters of the model that are known before the fit.
-    angle, locked : ndarray
-        Angles [rad], one per reading.
-    side : ndarray of int
-        Indices in `laws.SIDES`.
-    reading : ndarray
-        Uncorrected torque [N m].
-    torque : ndarray
-        Of the magnets alone [N m].
-    warnings : tuple of str
-        Names of columns that were taken though they are not the header's.
-    """
+    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques."""
 
     header: Header
     path: Path
-    digest: str
-    parameters: Parameters
+    digest: str  # sha256 of the table
+    parameters: Parameters  # parameters of the model that are known before the fit
+    # angles [rad], one per reading
     angle: np.ndarray
     locked: np.ndarray
-    side: np.ndarray
-    reading: np.ndarray
-    torque: np.ndarray
-    warnings: tuple[str, ...] = ()
+    side: np.ndarray  # indices in `laws.SIDES`
+    reading: np.ndarray  # uncorrected torque [N m]
+    torque: np.ndarray  # of the magnets alone [N m]
+    warnings: tuple[str, ...] = ()  # names of columns that were taken though they are not the header's
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
@@ -212,9 +179,7 @@ class Measurement:
 
     @property
     def label(self) -> str:
-        """Title of the measurement for figures and presets, beginning with "SYNTHETIC" if the readings were
-        computed.
-        """
+        """Title of the measurement, beginning with "SYNTHETIC" if the readings were computed."""
         return ("SYNTHETIC: " if self.header.synthetic else "") + self.header.title
 
 
@@ -230,29 +195,15 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
 
 
 def find_measurement(name: str | Path) -> Path:
-    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package.
-
-    Raises
-    ------
-    SpecError
-        If there is neither.
-    """
+    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package."""
     return find_file("measurement", name, {path.stem: path for path in shipped_files("magnet/*.toml")})
 
 
 def read_measurement(path: str | Path) -> Measurement:
     """Read a measurement: its TOML header and its table of readings, corrected and in SI units.
 
-    Parameters
-    ----------
-    path
-        Path of the header; see `find_measurement`.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once: unknown or missing keys and columns, fields that are not numbers, angles
-        out of range, curves with too few readings, sides with too few curves.
+    Raise `SpecError` with all problems at once: unknown or missing keys and columns, fields that are not numbers,
+    angles out of range, curves with too few readings, sides with too few curves.
     """
     path = Path(path)
     header = validated(Header, read_toml(path))
@@ -276,9 +227,7 @@ def read_measurement(path: str | Path) -> Measurement:
 def _besides(
     correction: Correction, p: Parameters, angle: np.ndarray, locked: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the part of the measured torque that does not come from the magnets but, for example, from the links'
-    weights [N m].
-    """
+    """Return the part of the torque that the magnets do not cause, such as that of the links' weights [N m]."""
     if correction.without is not None:
         return columns["without"]
     found = laws.weight_torque(angle, locked, p) if correction.weights else np.zeros_like(angle)
@@ -351,9 +300,7 @@ def _wanted(header: Header) -> dict[str, str]:
 
 
 def _but_for_units(wanted: dict[str, str], names: list[str], header: Header) -> tuple[dict[str, str], list[str]]:
-    """Accept columns whose names differ from those in the header only by a unit in brackets. Return the names found,
-    and warnings.
-    """
+    """Accept columns that differ from the header's by a unit in brackets; return their names, and warnings."""
     found, warnings = dict(wanted), []
     for key, name in wanted.items():
         near = units.names_with_unit(name, names)
@@ -407,9 +354,7 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _places(rows: Any) -> str:
-    """Format row numbers of the table for a message: at most three numbers, then the count of further rows. The first
-    reading is row 1.
-    """
+    """Name rows of the table, from 1, in a message: at most three, then the number of further ones."""
     named = ", ".join(str(i) for i in rows[:MAX_NAMED])
     more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
     return f"row{'s' if len(rows) > 1 else ''} {named}{more}"

@@ -16,9 +16,8 @@ from magpend_core.models.preset_writing import write_preset
 from magpend_core.models.presets import Preset, find_preset
 from pipeline.layout.writing import json_value, write_atomically
 from pipeline.products.product import padded
-from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome
+from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome, Quality
 from pipeline.rig.magnet.measurement import Measurement
-from pipeline.rig.magnet.solving import Quality
 from pipeline.store.provenance import provenance, versions
 
 REPORT, PRESET, DIPOLE_PRESET = "fit.json", "preset.toml", "preset-dipoles.toml"
@@ -122,9 +121,7 @@ def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _base(measured: Measurement, model: str) -> str | Preset:
-    """Return the preset for the parameters that are not fitted. From a preset file, keep only the model's
-    parameters.
-    """
+    """Return the preset of the parameters that are not fitted; of a file, only the model's parameters."""
     name = measured.header.preset
     if name is None:
         return load_model(model).presets[0].name
@@ -136,9 +133,7 @@ def _base(measured: Measurement, model: str) -> str | Preset:
 
 
 def _error(fit: JointFit, name: str, measured: Measurement) -> str:
-    """Format the standard error of a parameter: the larger of two estimates, from the residuals and from a jackknife
-    over curves.
-    """
+    """Format a parameter's standard error, the larger of that by residuals and that by a jackknife over curves."""
     error, unit = np.fmax(fit.errors[name], fit.errors_by_curve[name]), _unit(name, measured)
     return f"standard error {error:.2g} {unit}".rstrip()
 
@@ -186,9 +181,7 @@ def _table(joint: JointFit, m: Measurement) -> list[str]:
 
 
 def warnings_of(outcome: Outcome) -> list[str]:
-    """Return warnings for users of the fit: columns accepted by similar names, undetermined parameters, correlated
-    residuals.
-    """
+    """Return warnings: columns accepted by similar names, undetermined parameters, correlated residuals."""
     joint, found = outcome.joint, list(outcome.measured.warnings)
     for name, partner in joint.undetermined.items():
         found.append(

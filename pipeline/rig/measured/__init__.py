@@ -1,1 +1,1 @@
-"""Measure bifurcation diagrams on a rig from recorded sweeps, and compare them with computed ones."""
+"""Measure bifurcation diagrams and branches of orbits on a rig, and compare them with computed ones."""

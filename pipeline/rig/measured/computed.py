@@ -17,7 +17,6 @@ from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims
-from pipeline.rig.measured.distances import Candidate
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.specification.problems import SpecError
 
@@ -27,13 +26,9 @@ Floats = npt.NDArray[np.float64]
 def cube_and_parameters(
     run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
-    """Return a run's result cube over the drive frequency, with one value chosen on every other axis, and the model's
-    parameters at the chosen values.
+    """Return a run's cube over the drive frequency, at one value of every other axis, and the parameters there.
 
-    Raises
-    ------
-    SpecError
-        If the run is of another model, sweeps no frequency, or has another axis with several values.
+    Raise `SpecError` if the run is of another model, sweeps no frequency, or has another axis with several values.
     """
     where = run.name
     model = load_model(model)
@@ -62,36 +57,29 @@ def cube_and_parameters(
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """Attractor of the model at one frequency, with its section points."""
+
+    attractor: int
+    orbit_period: int  # period of the orbit; 0 for a set that does not close
+    side: int  # code of the model's classifier
+    points: Floats  # (n, state): all points of a closed orbit, or a sample of a set that does not close
+
+
+@dataclass(frozen=True)
 class Computed:
-    """Attractors of a run over the drive frequency, at one value of every other swept parameter.
+    """Attractors of a run over the drive frequency, at one value of every other swept parameter."""
 
-    Attributes
-    ----------
-    attractors : Dataset
-        Result of the analysis ``attractors``: dims frequency, cells, attractor, in rising frequency.
-    cube : Dataset
-        Cells of the run, for the points of sets that do not close and the diagram.
-    parameters : Parameters
-        Parameters at the chosen values of the other axes.
-    title, digest : str
-        Title and digest of the run.
-    """
-
+    # result of the analysis ``attractors``: dims frequency, cells, attractor, in rising frequency
     attractors: xr.Dataset
-    cube: xr.Dataset
-    parameters: Parameters
+    cube: xr.Dataset  # cells of the run, for the points of sets that do not close and the diagram
+    parameters: Parameters  # parameters at the chosen values of the other axes
     title: str
     digest: str
 
     @classmethod
     def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
-        """Read a run and its attractors. Compute the attractors if no stored result exists.
-
-        Raises
-        ------
-        SpecError
-            If the run is of another model, sweeps no frequency, or has another axis with several values.
-        """
+        """Read a run and its attractors, or compute these; see `cube_and_parameters` for errors."""
         cube, parameters = cube_and_parameters(run, model, at)
         with refused(run.name):
             found = run.derive("attractors")
@@ -113,9 +101,7 @@ class Computed:
         return np.asarray(self.attractors[FREQUENCY_DIM].values, np.float64)
 
     def place(self, frequency_hz: float) -> int:
-        """Return the index of the computed frequency nearest to `frequency_hz`, or -1 if `frequency_hz` lies more than
-        about half a step outside the computed range.
-        """
+        """Return the index of the nearest computed frequency; -1 if it lies over half a step outside of their range."""
         f = self.frequencies
         i = int(np.abs(f - frequency_hz).argmin())
         near = np.abs(np.delete(f, i) - f[i])

@@ -1,10 +1,12 @@
-"""Draw measured bifurcation diagrams beside or over computed ones, and the distances between them."""
+"""Draw measured bifurcation diagrams beside or over computed ones, and recorded time series over computed ones."""
 
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,18 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import FREQUENCY_DIM
+from magpend_core.models.model import Model
+from pipeline.layout.vocabulary import FREQUENCY_DIM, letter, model_of
+from pipeline.layout.writing import write_atomically
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.motions import Motions, motions_of
+from pipeline.plots.figure import save_data, save_figure
+from pipeline.plots.palette import Motions, motions_of
+from pipeline.plots.style import WIDE, Frame
+from pipeline.rig.measured.comparison import edges_table
 from pipeline.rig.measured.computed import Computed
+from pipeline.rig.measured.diagram import steps_table
+from pipeline.store.local import make_folder
 
 LAYOUTS = ("side", "over")
 _MARKERS = {"up": "^", "down": "v", "none": "o"}
@@ -39,32 +47,10 @@ def plot_measured(
 ) -> style.DataFigure:
     """Draw measured section points over the drive frequency: alone, or beside or over a computed diagram.
 
-    Parameters
-    ----------
-    measured
-        Result of `pipeline.rig.measured.measuring.measure`.
-    cube
-        Cube of a run of the same model, with one value on every axis but the frequency.
-    state
-        Name of the state; by default the first that is measured.
-    degrees
-        Whether to use degrees instead of radians.
-    layout
-        ``side``: measured left, computed right. ``over``: measured points as open triangles over the computed
-        points; the triangles show the direction of the sweep.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Both diagrams share their axes. Its `data` hold the measured points (dims ``step``, ``period_index``)
-        and, under names that end in ``_diagram``, the computed ones.
-
-    Raises
-    ------
-    ValueError
-        For an unknown layout, or a state that was not measured.
+    `cube` has one value on every axis but the frequency. With the layout ``side``, measured points are left and
+    computed ones right, on the same axes; with ``over``, measured points are open triangles, which show the direction
+    of the sweep. The data hold the measured points (dims ``step``, ``period_index``) and, under names that end in
+    ``_diagram``, the computed ones. Raise `ValueError` for an unknown layout, or a state that was not measured.
     """
     style.check_choice("layout", layout, LAYOUTS)
     names = [str(n) for n in measured["state"].values]
@@ -113,9 +99,7 @@ def _rig(measured: xr.Dataset) -> str:
 def _ranges(
     measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return the ranges of the frequency axis and the state axis. The range of the state axis is None if a computed
-    diagram sets it.
-    """
+    """Return the ranges of the frequency axis and the state axis, which is None if a computed diagram sets it."""
     own = measured["frequency"].values
     f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
     margin = 0.02 * float(np.ptp(f)) or 0.02 * float(f[0])
@@ -142,9 +126,7 @@ def _dress(ax: Axes, measured: xr.Dataset, measure: labels.Measure, ranges: Any)
 
 
 def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) -> None:
-    """Draw the measured section points separately for each sweep direction and class of motion. Upward sweeps are drawn
-    on top.
-    """
+    """Draw measured section points by sweep direction and class of motion, upward sweeps on top."""
     motions = motions_of(measured)
     codes = measured["side"].values if "side" in measured else np.zeros(measured.sizes["step"], int)
     f, ways = measured["frequency"].values, measured["direction"].values.astype(str)
@@ -194,35 +176,13 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
 def plot_comparison(
     compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw three panels: measured points over the computed attractors, distances in units of the noise floor, and
-    periods and classes of motion of rig and model.
+    """Draw measured points over the computed attractors, distances in noise floors, and periods and classes of rig and
+    model.
 
-    Parameters
-    ----------
-    compared
-        Result of `pipeline.rig.measured.compare.compare`.
-    computed
-        Attractors that it was compared with.
-    state
-        Name of the state; by default the first that is measured.
-    degrees
-        Whether to use degrees instead of radians.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        Three panels over one frequency axis. Top: the attractors, coloured if they are nearest at some step,
-        with the measured sections as open triangles. Middle: the distance from the nearest attractor in units
-        of the noise floor, in its colour; triangles show the direction of the sweep. Bottom: strips of the
-        regimes of rig and model, coloured by side, with their periods (a cross: unclosed). Its `data` are
-        `compared`.
-
-    Raises
-    ------
-    ValueError
-        For a state that was not measured.
+    Top: the attractors, coloured if they are nearest at some step, with the measured sections as open triangles.
+    Middle: the distance from the nearest attractor in units of the noise floor, in its colour; triangles show the
+    direction of the sweep. Bottom: strips of the regimes of rig and model, coloured by side, with their periods (a
+    cross: unclosed). Raise `ValueError` for a state that was not measured.
     """
     names = [str(n) for n in compared["state"].values]
     state = state or names[0]
@@ -263,9 +223,7 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    """Return the attractors that are nearest to the measurement at some step. The most frequent attractor of each class
-    of motion gets the colour of the class.
-    """
+    """Return the attractors that are nearest at some step; the most frequent of each class has its colour."""
     cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
     winners, sides = compared["winner"].values, compared["computed_side"].values
     ids = [int(i) for i in np.unique(winners) if i >= 0]
@@ -329,9 +287,7 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
 
 
 def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequence[str]) -> None:
-    """Draw period and class of motion over the frequency as coloured strips. Each sweep direction has one strip for the
-    rig and one for the model.
-    """
+    """Draw period and class of motion as coloured strips, for each sweep direction one for rig and model each."""
     rows: list[str] = []
     for way in ways:
         chosen = np.flatnonzero(compared["direction"].values == way)
@@ -390,3 +346,123 @@ def _comparison_handles(compared: xr.Dataset, met: _Met, motions: Motions, ways:
         if c in codes and c
     ]
     return handles
+
+
+# ---- time series -----------------------------------------------------------------------------------
+
+RIG, MODEL = "0.15", style.VERMILLION
+SUFFIX = "_computed"
+
+
+@style.drawn
+def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
+    """Draw measured and computed time series from `pipeline.rig.measured.series.series_of`, and their phase portraits.
+
+    Each state has a panel with the root mean square of the difference. Raise `ValueError` if degrees are asked for
+    without an angle.
+    """
+    model = model_of(ds)
+    labels.some_angle(model, degrees, "series")
+    n, m = len(model.states), len(model.portraits)
+    fig = style.new_figure(max(1.25 * n, 2.4 * m) + 0.7, ds, frame)
+    outer = fig.add_gridspec(1, 2, width_ratios=[1.55, 1.0])
+    left, right = outer[0].subgridspec(n, 1), outer[1].subgridspec(m, 1)
+    measures = {s.name: labels.state_measure(ds, s.name, degrees and s.unit.startswith("rad")) for s in model.states}
+    axes = [fig.add_subplot(left[i]) for i in range(n)]
+    _draw_series(axes, ds, model, measures)
+    for k, pair in enumerate(model.portraits):
+        ax = fig.add_subplot(right[k])
+        style.style_axes(ax)
+        _draw_portrait(ax, ds, [measures[name] for name in pair])
+    if frame.xlim:
+        axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
+    fig.align_ylabels(axes)
+    who = "simulated rig" if int(ds.attrs.get("simulated", 0)) else "measured"
+    handles = [
+        Line2D([], [], color=RIG, linewidth=1.2, label=who),
+        Line2D([], [], color=MODEL, linewidth=1.2, label="computed from the same state"),
+    ]
+    f, begin = float(ds.attrs["frequency_hz"]), float(ds.attrs["start_s"])
+    text = f"$f$ = {f:.6g}\u00a0Hz, start at {begin:.3f}\u00a0s"
+    style.complete(fig, axes[0], text, handles)
+    return fig
+
+
+def _draw_series(axes: list[Axes], ds: xr.Dataset, model: Model, measures: dict[str, labels.Measure]) -> None:
+    time, rms = ds["time"].values, json.loads(str(ds.attrs["rms"]))
+    for ax, s in zip(axes, model.states, strict=True):
+        if ax is not axes[-1]:
+            ax.sharex(axes[-1])
+            ax.tick_params(labelbottom=False)
+        style.style_axes(ax)
+        m = measures[s.name]
+        for name, look in _looks(s.name):
+            ax.plot(time, m.shown(ds[name].values), gid=f"series:{name}", **look)
+        ax.set_xlim(float(time[0]), float(time[-1]))
+        low, high = ax.get_ylim()
+        ax.set_ylim(low, high + 0.25 * (high - low))  # room for the words
+        ax.text(
+            0.99,
+            0.93,
+            f"rms {rms[s.name] * m.factor:.3g} {m.unit}",
+            transform=ax.transAxes,
+            ha="right",
+            va="top",
+            fontsize=style.look_of(ax).tick - 1.0,
+        )
+        style.label_axes(ax, y=m.label)
+        labels.angle_ticks(ax, m, most=5.0)
+    style.label_axes(axes[-1], x="time [s]")
+
+
+def _draw_portrait(ax: Axes, ds: xr.Dataset, pair: list[labels.Measure]) -> None:
+    x, y = pair
+    for (name, look), (other, _) in zip(_looks(x.name), _looks(y.name), strict=True):
+        first, second = x.shown(ds[name].values), y.shown(ds[other].values)
+        if x.on_circle and np.ptp(ds[name].values) > 2 * np.pi:
+            first, second = labels.on_circle(ds[name].values, second)
+            first = first * x.factor
+        ax.plot(first, second, gid=f"portrait:{name}", **look)
+    labels.angle_ticks(ax, x, "x")
+    style.label_axes(ax, x.label, y.label)
+
+
+def _looks(name: str) -> tuple[tuple[str, dict[str, Any]], ...]:
+    """Return variable name and line style of a state, measured, then computed: thinner and on top."""
+    return (
+        (name, {"color": RIG, "linewidth": 1.3, "zorder": 2.0}),
+        (name + SUFFIX, {"color": MODEL, "linewidth": 0.8, "zorder": 3.0}),
+    )
+
+
+# ---- files -----------------------------------------------------------------------------------------
+
+
+def write_comparison(
+    compared: xr.Dataset,
+    computed: Computed,
+    folder: Path,
+    *,
+    state: str = "",
+    degrees: bool = False,
+    frame: Frame = WIDE,
+) -> list[Path]:
+    """Write the figures and tables of a comparison into a folder, which is made if necessary; return their paths.
+
+    They are ``comparison``, ``beside`` and ``over`` as ``.png`` with their data as ``.nc``, ``steps.csv`` and
+    ``edges.csv``.
+    """
+    figures = {
+        "comparison": plot_comparison(compared, computed, state=state, degrees=degrees, frame=frame),
+        "beside": plot_measured(compared, computed.cube, state=state, degrees=degrees, frame=frame),
+        "over": plot_measured(compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame),
+    }
+    make_folder(folder)
+    written = []
+    for name, figure in figures.items():
+        figure.data = figure.data.assign_attrs(run=computed.title, cube_digest=computed.digest)
+        written += [save_figure(figure, folder / f"{name}.png"), save_data(figure, folder / f"{name}.nc")]
+    for name, table in (("steps", steps_table(compared)), ("edges", edges_table(compared))):
+        written.append(folder / f"{name}.csv")
+        write_atomically(written[-1], table.csv())
+    return written

@@ -12,8 +12,7 @@ from magpend_core.models.model import Parameters
 from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of
-from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import find_sections, name_of
+from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 
@@ -32,40 +31,16 @@ def series_of(
     window_s: float = WINDOW_S,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
-    """Return part of a recording that begins at a rising edge of the drive, with the model's trajectory from the same
-    initial state.
+    """Return part of a recording from a rising edge of the drive on, with the model's trajectory from the same state.
 
-    Local polynomials give the model's initial state at the edge. The drive frequency is that of a line
-    through the edges of the stretch of constant frequency.
+    The first rising edge from `start_s` on is taken; the part ends before `n_periods` if the drive frequency changes.
+    Local polynomials give the model's initial state at the edge. The drive frequency is that of a line through the
+    edges of the stretch of constant frequency. Over ``time`` [s since the edge] there are the measured states, smoothed
+    rates if rates are not measured, and the computed states with the suffix ``_computed``. Attributes:
+    ``frequency_hz``, ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; angles on their circle).
 
-    Parameters
-    ----------
-    recording
-        Recording from `pipeline.rig.recordings.read_recording`, with every state or the angle whose rate it
-        is.
-    parameters
-        Parameters of the recording's model.
-    start_s
-        Time from which on the first rising edge is taken [s]; by default the recording's begin.
-    n_periods
-        Drive periods of the part; it ends earlier if the drive frequency changes.
-    window_s, hysteresis
-        See `pipeline.rig.measured.recorded_sections.find_sections` and `pipeline.rig.edges.find_edges`.
-
-    Returns
-    -------
-    Dataset
-        Over ``time`` [s since the edge]: the measured states under their names, smoothed rates if rates are
-        not measured, and the computed states with the suffix ``_computed``. Attributes: ``frequency_hz``,
-        ``start_s`` of the edge, ``start`` and ``rms`` (JSON by state; angles on their circle).
-
-    Raises
-    ------
-    SpecError
-        If the parameters are of another model, a state is unknown, or no edge after `start_s` has samples
-        around it and periods of one frequency after it.
-    ArithmeticError
-        If the model diverges.
+    Raise `SpecError` if the parameters are of another model, a state is unknown, or no edge after `start_s` has samples
+    around it and periods of one frequency after it, and `ArithmeticError` if the model diverges.
     """
     model = parameters.model
     if model_of(recording) is not model:
@@ -99,9 +74,7 @@ def series_of(
 def _part(
     recording: xr.Dataset, edges: Edges, sections: xr.Dataset, start_s: float | None, n_periods: int
 ) -> tuple[int, int]:
-    """Return the first and the last rising edge of the part of a recording to compare. The drive frequency is constant
-    between them.
-    """
+    """Return the first and last rising edge of the compared part, in which the drive frequency is constant."""
     begin = -math.inf if start_s is None else start_s
     known = [int(n) for n in sections["number"].values if edges.rising[int(n)] >= begin]
     for first in known:
@@ -123,9 +96,7 @@ def _first_timing(edges: Edges) -> float:
 
 
 def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
-    """Return the times of edges `first` to `last` on a line fitted to all edges of their stretch of constant
-    frequency.
-    """
+    """Return the times of edges `first` to `last` on a line through all edges of their constant stretch."""
     a, b = next((a, b) for a, b in constant_spans(edges) if a <= first < b)
     rising = edges.rising[a : b + 1]
     n = np.arange(rising.size, dtype=np.float64)

@@ -31,31 +31,20 @@ _AROUND = 16
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive drive periods with the same frequency: the edges at which section points are taken, and their timing.
+    """Consecutive drive periods of one frequency: the edges at which section points are taken, and their timing."""
 
-    Attributes
-    ----------
-    edges : Edges
-        Edges at which sections are taken, without the transient. If they scatter only by the error of
-        measuring, rising edges are placed on the line through all edges of the stretch, which is more exact.
-    timing : Timing
-        Timing of all edges of the stretch.
-    start_s, end_s : float
-        First and last edge [s], with the transient.
-    instant_scatter_s, instant_error_s : float
-        Standard errors of a rising edge [s]: the part that differs from edge to edge, and the part that all
-        edges share. The latter is up to half a sample if edges fall on the same place between two samples.
-    direction : int
-        1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other.
-    """
-
+    # edges at which sections are taken, without the transient. If they scatter only by the error of measuring, rising
+    # edges are placed on the line through all edges of the stretch, which is more exact.
     edges: Edges
-    timing: Timing
+    timing: Timing  # timing of all edges of the stretch
+    # first and last edge [s], with the transient
     start_s: float
     end_s: float
+    # standard errors of a rising edge [s]: the part that differs from edge to edge, and the part that all edges share.
+    # The latter is up to half a sample if edges fall on the same place between two samples.
     instant_scatter_s: float
     instant_error_s: float
-    direction: int
+    direction: int  # 1 if the frequency rose to this stretch, -1 if it fell, 0 if there is no other
 
     @property
     def shake_s(self) -> float:
@@ -65,28 +54,13 @@ class Stretch:
 
 
 def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) -> list[Stretch]:
-    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows.
+    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows, in the order
+    of time.
 
-    Parameters
-    ----------
-    edges
-        Edges of a recording.
-    transient
-        Periods that are dropped at the beginning of each constant stretch.
-    window
-        Periods of a window of a slow sweep; none are dropped. 0 never cuts into windows. By default windows
-        of 40 periods are used if stretches have only a few periods, or if most of them are curved the same
-        way.
-
-    Returns
-    -------
-    list of Stretch
-        Stretches in the order of time, each with at least 8 periods without the transient.
-
-    Raises
-    ------
-    SpecError
-        If a number is out of bounds, or nothing long enough is left.
+    The `transient` is dropped at the beginning of each constant stretch; a stretch keeps at least 8 periods. A `window`
+    of 0 never cuts into windows. By default windows of 40 periods are used if stretches have only a few periods, or if
+    most of them are curved the same way. Raise `SpecError` if a number is out of bounds, or nothing long enough is
+    left.
     """
     problems = []
     if transient < 0:
@@ -117,9 +91,7 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
 
 
 def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
-    """Return whether the frequency changes continuously. It does if most stretches of constant frequency are short, or
-    if most are curved in the same direction.
-    """
+    """Return whether the frequency changes continuously: most stretches are short, or bend in one direction."""
     if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
         return True
     bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST])
@@ -128,18 +100,14 @@ def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
 
 
 def _bend(rising: Floats, noise: float) -> float:
-    """Return the curvature of the drive's edge times as a function of the edge number, in units of its standard
-    error.
-    """
+    """Return the curvature of edge times over their number, in units of its standard error."""
     n = np.arange(rising.size) - 0.5 * (rising.size - 1)
     square = n**2 - (n**2).mean()
     return float(square @ rising / (noise * math.sqrt(square @ square)))
 
 
 def constant_spans(edges: Edges) -> list[tuple[int, int]]:
-    """Return the first and last rising edge of each stretch of constant frequency; successive stretches
-    share an edge.
-    """
+    """Return first and last rising edge of each stretch of constant frequency; neighbours share an edge."""
     t = edges.rising
     noise = _noise(edges)
     spans, first = [], 0
@@ -154,9 +122,7 @@ def constant_spans(edges: Edges) -> list[tuple[int, int]]:
 
 
 def _noise(edges: Edges) -> float:
-    """Estimate the standard deviation of an edge time [s] from second differences, which frequency steps hardly
-    affect.
-    """
+    """Estimate the standard deviation of an edge time [s] from second differences, which steps hardly affect."""
     second = np.diff(edges.rising, 2)
     own = 1.4826 * float(np.median(np.abs(second))) / math.sqrt(6) if second.size else 0.0
     period = float(np.median(np.diff(edges.rising)))
@@ -231,9 +197,7 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
 
 
 def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
-    """Return a stretch of a sweep with its timing. The known bend `curve` [s] is subtracted from the edge times before
-    a line is fitted to them.
-    """
+    """Return a stretch with its timing; the known bend `curve` [s] is subtracted before a line is fitted."""
     rising = own.rising
     # a falling edge is shifted by interpolation between its rising ones
     falling = own.falling - np.interp(own.falling, rising, curve)
@@ -249,9 +213,7 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
 
 
 def _line(rising: Floats) -> Floats:
-    """Fit a line to edge times as a function of the edge number, and return the times on the line. A missing edge does
-    not shift the numbers of later edges.
-    """
+    """Return edge times on a line fitted over the edge number, in which missing edges count."""
     gaps = np.diff(rising)
     n = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(gaps / np.median(gaps)), 1.0))])
     centred = n - n.mean()
@@ -260,9 +222,7 @@ def _line(rising: Floats) -> Floats:
 
 
 def _directed(stretches: list[Stretch]) -> list[Stretch]:
-    """Set the sweep direction of each stretch from the frequency change against the stretch before. The first stretch
-    takes the direction of the next.
-    """
+    """Set the sweep direction of each stretch from the stretch before; the first takes that of the next."""
     f = np.array([s.timing.frequency_hz for s in stretches])
     error = np.array([s.timing.frequency_error_hz for s in stretches])
     signs = [0] * len(stretches)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding, runs
+from pipeline.rig.recordings.channels import Finding, runs
 from pipeline.rig.recordings.mapping import ChannelMap
 
 CLIPPED_SAMPLES = 5
@@ -25,23 +26,14 @@ LEAP_AROUND = 9
 """Number of steps whose median is the usual step."""
 
 
+@dataclass(frozen=True, eq=False)
 class Signal:
-    """Readings of one channel, with the time of each sample and the number of its piece (part without a gap).
+    """Readings of one channel, with the time of each sample and the number of its piece (part without a gap)."""
 
-    Parameters
-    ----------
-    name
-        Name in the dataset.
-    raw
-        Readings, (n,) [the file's unit].
-    time
-        Times, (n,) [s].
-    piece
-        Index of the piece, (n,).
-    """
-
-    def __init__(self, name: str, raw: np.ndarray, time: np.ndarray, piece: np.ndarray) -> None:
-        self.name, self.raw, self.time, self.piece = name, raw, time, piece
+    name: str  # name in the dataset
+    raw: np.ndarray  # readings, (n,) [the file's unit]
+    time: np.ndarray  # times, (n,) [s]
+    piece: np.ndarray  # index of the piece, (n,)
 
     def found(self, kind: str, start: int, end: int, severity: str, text: str) -> Finding:
         """Return a finding (fault report) about the samples from index `start` up to, not including, `end`."""
@@ -156,22 +148,9 @@ def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Fi
 
 
 def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
-    """Unwrap an angle within each piece if the recording's mapping file says that it wraps; otherwise report jumps by a
-    full turn.
+    """Unwrap an angle [rad] within each piece if the mapping says that it wraps; otherwise report jumps by a full turn.
 
-    Parameters
-    ----------
-    signal
-        The channel.
-    angle
-        Angle, (n,) [rad], NaN where it is not measured.
-    wraps
-        Whether the reading wraps, according to the mapping.
-
-    Returns
-    -------
-    ndarray, list of Finding
-        The angle, with `wraps` continuous from one measured sample of a piece to the next; the findings.
+    The unwrapped angle is continuous from one measured sample of a piece to the next; NaN is not measured.
     """
     result = angle.copy()
     findings = []
@@ -198,16 +177,10 @@ def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarra
 
 
 def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
-    """Find steps of an angle between samples that are too large for a motion and too small for a wrap by a full turn.
+    """Find steps of an angle [rad] between samples that are too large for a motion and too small for a wrap by a full
+    turn.
 
     An example is a wrap whose flank was sampled: it looks like a motion, and a turn is lost.
-
-    Parameters
-    ----------
-    signal
-        The channel.
-    angle
-        Angle, (n,) [rad], unwrapped if the mapping asks for it; NaN where it is not measured.
     """
     from scipy.ndimage import median_filter
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding, runs
-from pipeline.rig.recordings.raw import Channel
+from pipeline.rig.recordings.channels import Channel, Finding, runs
 from pipeline.specification.problems import SpecError
 
 MIXED = 1e-3
@@ -39,27 +38,13 @@ UNEVEN = 0.5
 
 @dataclass(eq=False)
 class Clock:
-    """Uniform sample times of a recording, and the range of samples used from each channel.
+    """Uniform sample times of a recording, and the range of samples used from each channel."""
 
-    Attributes
-    ----------
-    time : ndarray
-        Times, (n,) [s since the first sample], even within a piece.
-    piece : ndarray
-        Index of the piece, (n,): 0, 1, ...
-    step_s : float
-        Sampling interval [s].
-    taken : list of mappings
-        For each stretch, by channel, the first sample and the one after the last.
-    findings : list of Finding
-        Findings about times.
-    """
-
-    time: np.ndarray
-    piece: np.ndarray
-    step_s: float
-    taken: list[dict[str, tuple[int, int]]]
-    findings: list[Finding] = field(default_factory=list)
+    time: np.ndarray  # times, (n,) [s since the first sample], even within a piece
+    piece: np.ndarray  # index of the piece, (n,): 0, 1, ...
+    step_s: float  # sampling interval [s]
+    taken: list[dict[str, tuple[int, int]]]  # for each stretch, by channel, the first sample and the one after the last
+    findings: list[Finding] = field(default_factory=list)  # findings about times
 
 
 def clock_of(
@@ -72,30 +57,12 @@ def clock_of(
 ) -> Clock:
     """Give the channels of all stretches of a file the same uniform sample times.
 
-    Parameters
-    ----------
-    stretches
-        Channels that are used, by name, with time stamps or sampling intervals.
-    sampling_rate_hz
-        Rate from the mapping, which takes precedence over the file's.
-    source
-        Name of the file, for messages.
-    numbers
-        Piece numbers of the first channel's samples, (n,), one stretch after the other. A new piece begins
-        where the number changes.
-    apart
-        Whether each stretch is a piece, even if it continues the stretch before.
+    All channels begin at the latest start and end at the earliest end; samples left out are findings. A
+    `sampling_rate_hz` from the mapping takes precedence over the file's. A new piece begins where the piece number of
+    the first channel's samples, `numbers`, changes, and with `apart` at each stretch.
 
-    Returns
-    -------
-    Clock
-        All channels begin at the latest start and end at the earliest end; samples left out are findings.
-
-    Raises
-    ------
-    SpecError
-        If no sampling interval is known, channels have different ones, time stamps go backwards, or there
-        are no samples.
+    Raise `SpecError` if no sampling interval is known, channels have different ones, time stamps go backwards, or there
+    are no samples.
     """
     stated = None if sampling_rate_hz is None else 1.0 / sampling_rate_hz
     step = _common_step(stretches, stated, source)
@@ -123,11 +90,6 @@ def resampled(channel: Channel, rate_hz: float) -> Channel:
 
     A gap is a step of more than `GAP_STEPS` times the longest of 99 % of the steps, and more than that many steps of
     the new rate.
-
-    Raises
-    ------
-    SpecError
-        If the time stamps do not increase.
     """
     time = channel.time
     if time is None or len(time) < 2 or not (np.diff(time) > 0.0).all():
@@ -235,9 +197,7 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
 def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
-    """Return the sample range of each channel in which all channels of a stretch have data, and findings about samples
-    left out.
-    """
+    """Return the sample range in which all channels of a stretch have data, and findings on samples left out."""
     starts = {n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()}
     known = [s for s in starts.values() if math.isfinite(s)]
     first = max(known, default=0.0)
@@ -315,9 +275,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
 def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None, source: str
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
-    """Divide the samples into pieces at gaps and where `forced` is true, and make the sample times even within each
-    piece.
-    """
+    """Divide samples into pieces at gaps and where `forced` is true, with even times within each piece."""
     is_gap = _missing(time, step) > 0
     if stated is None:
         _refuse_irregular(time, is_gap, step, source)
@@ -390,9 +348,7 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 
 
 def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
-    """Shift those stretches of a file whose time restarts, so that they follow the previous stretch. Return the time
-    stamps, and whether any stretch was shifted.
-    """
+    """Lay stretches whose time restarts after the one before; return the time stamps, and whether any was."""
     placed = [stamps[0]]
     moved = 0
     for s in stamps[1:]:
@@ -415,9 +371,7 @@ def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Fin
 def _even(
     time: np.ndarray, piece: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Fit lines of equal slope to the time stamps, one line per piece. Return the times on the lines, the slope and the
-    residuals.
-    """
+    """Fit lines of equal slope to the time stamps by piece; return times on them, slope and residuals."""
     count = np.bincount(piece)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     index = np.arange(len(time)) - first[piece]
@@ -437,9 +391,7 @@ def _even(
 
 
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
-    """Report time stamps that deviate from even steps. The report is a warning if they deviate by half a step
-    or more.
-    """
+    """Report time stamps that deviate from even steps, as a warning from half a step on."""
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []

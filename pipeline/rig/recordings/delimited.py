@@ -2,18 +2,131 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
 from pipeline.rig.recordings.mapping import CsvMap
-from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.rig.recordings.text import instants, number, read_text, split, table, unique, without_end
 from pipeline.specification.problems import SpecError
+
+# ---- numbers in texts ------------------------------------------------------------------------------
+
+_INSTANT = re.compile(
+    r"(?:(?P<date>\d{4}-\d\d-\d\d)[T ])?(?P<time>\d\d:\d\d:\d\d(?:\.\d{1,9})?)(?P<zone>Z|[+-]\d\d:?\d\d)?"
+)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file, decoded as UTF-8 or else as cp1252, which LabVIEW on Windows writes."""
+    data = path.read_bytes()
+    if b"\x00" in data[:4096]:
+        raise SpecError(f"{path}: is not a text; state its format in the mapping if the suffix misleads.")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")
+
+
+def number(field: str, decimal: str) -> float | None:
+    """Return the number in a text field. Return NaN for an empty field and None for any other text."""
+    text = field.strip().strip('"').strip()
+    if not text:
+        return float("nan")
+    if decimal == ",":
+        if "." in text:
+            return None
+        text = text.replace(",", ".")
+    if "_" in text:  # only Python takes it for a number
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def split(line: str, delimiter: str) -> list[str]:
+    """Split a line into its fields; a blank as delimiter also matches several blanks."""
+    if delimiter == " ":
+        return line.split()
+    if '"' in line:
+        import csv
+
+        return next(csv.reader([line], delimiter=delimiter))
+    return line.split(delimiter)
+
+
+def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal: str) -> np.ndarray:
+    """Convert the columns of text lines with the given indices to numbers, (n_lines, n_columns).
+
+    Fields that are empty, missing or not numbers become NaN.
+    """
+    if not lines or not columns:
+        return np.empty((len(lines), len(columns)))
+    text = "\n".join(lines)
+    if decimal == ",":
+        text = text.replace(",", ".")
+    try:
+        found = np.loadtxt(
+            io.StringIO(text),
+            delimiter=None if delimiter == " " else delimiter,
+            usecols=columns,
+            ndmin=2,
+            comments=None,
+            quotechar='"',
+        )
+        if found.shape == (len(lines), len(columns)):
+            return found
+    except (ValueError, IndexError):
+        pass  # empty or short rows: slower, field by field
+    rows = np.full((len(lines), len(columns)), np.nan)
+    for i, line in enumerate(lines):
+        parts = split(line, delimiter)
+        for k, j in enumerate(columns):
+            value = number(parts[j], decimal) if j < len(parts) else None
+            rows[i, k] = np.nan if value is None else value
+    return rows
+
+
+def instants(fields: Sequence[str]) -> np.ndarray | None:
+    """Convert dates or times of day to seconds since the first; return None if a field is anything else.
+
+    Their order is that of ISO 8601, with a blank or a T between date and time, and a point or a comma before the
+    fraction of a second.
+    """
+    found = [_INSTANT.fullmatch(f.strip().strip('"').replace("/", "-").replace(",", ".")) for f in fields]
+    known = [m for m in found if m is not None]
+    if len(known) < len(found) or not known or len({m["zone"] for m in known}) > 1:
+        return None
+    try:
+        stamps = np.array([f"{m['date'] or '1970-01-01'}T{m['time']}" for m in known], dtype="datetime64[ns]")
+    except ValueError:  # no such date, as the 31st of February
+        return None
+    return np.asarray((stamps - stamps[0]).astype(np.float64) * 1e-9)
+
+
+def unique(names: Sequence[str]) -> list[str]:
+    """Make names unique: the second ``a`` becomes ``a (2)``."""
+    seen: dict[str, int] = {}
+    result = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        result.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return result
+
+
+def without_end(values: np.ndarray) -> np.ndarray:
+    """Drop the values of a column after its last finite number."""
+    known = np.flatnonzero(np.isfinite(values))
+    return values[: known[-1] + 1] if known.size else values[:0]
+
+
+# ---- CSV files -------------------------------------------------------------------------------------
 
 SIMULATED = "# simulated"
 """First line of a file with simulated readings."""
@@ -37,24 +150,13 @@ class _Form:
 
 
 def read_csv(path: Path, stated: CsvMap) -> Raw:
-    """Read all columns of a CSV file.
+    """Read all columns of a CSV file; `stated` has properties that need not be detected.
 
-    Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels'
-    names. A second row of names gives their units, as do brackets after a name: ``angle [V]``. Without names
-    the columns are ``1``, ``2``, ... Empty fields and texts are NaN, and are dropped after the last number of
-    a column. Dates and times of day become seconds since the first. Other texts are left out.
-
-    Parameters
-    ----------
-    path
-        The file.
-    stated
-        Properties of the file that need not be detected.
-
-    Raises
-    ------
-    SpecError
-        If the file is not a table of numbers, or can be read in two ways.
+    Lines that begin with ``#`` are comments. The first row with names, if there is one, gives the channels' names. A
+    second row of names gives their units, as do brackets after a name: ``angle [V]``. Without names the columns are
+    ``1``, ``2``, ... Empty fields and texts are NaN, and are dropped after the last number of a column. Dates and times
+    of day become seconds since the first. Other texts are left out. Raise `SpecError` if the file is not a table of
+    numbers, or can be read in two ways.
     """
     lines = read_text(path).splitlines()
     is_simulated = bool(lines) and lines[0].startswith(SIMULATED)
@@ -78,9 +180,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
 
 
 def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
-    """Return the numeric columns, and the columns of dates or times of day, which are converted to seconds since the
-    first row.
-    """
+    """Return the numeric columns, and those of dates or times of day as seconds since the first row."""
     numbers = [j for j in range(form.n_columns) if j not in form.texts]
     values = table(body, numbers, form.delimiter, form.decimal)
     found = {j: values[:, k] for k, j in enumerate(numbers)}
@@ -123,9 +223,7 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
 
 
 def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
-    """Try to read the rows with one delimiter and decimal sign. Return the form of the text, or None if the rows do not
-    fit.
-    """
+    """Return the form of rows read with one delimiter and decimal sign, or None if they do not fit."""
     sample = rows[:LOOKED_AT]
     parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
     late = parsed[len(parsed) // 2 :]

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.rig.recordings.findings import findings_of
+from pipeline.rig.recordings.channels import findings_of
 from pipeline.rig.recordings.mapping import DRIVE
 
 MOST_DOTS = 6000
@@ -113,9 +113,7 @@ def _draw(ax: Axes, ds: xr.Dataset, name: str, span: tuple[float, float], colour
 
 
 def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and values of the minimum and maximum of each block of samples, in the order of time. The values are
-    NaN if the block has no finite sample.
-    """
+    """Return minimum and maximum of each block of samples, in the order of time; NaN without finite samples."""
     n = len(time) // (MOST_DOTS // 2) + 1
     whole = len(time) // n * n
     blocks = values[:whole].reshape(-1, n)

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding
-from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.rig.recordings.text import number, read_text, split, table, unique, without_end
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
+from pipeline.rig.recordings.delimited import number, read_text, split, table, unique, without_end
 from pipeline.specification.problems import SpecError
 
 MAGIC = "LabVIEW Measurement"
@@ -47,13 +46,9 @@ class _Segment:
 def read_lvm(path: Path) -> Raw:
     """Read all channels of all segments of an LVM file.
 
-    Segments with successive times are one recording. The times come from their headers (``Date``, ``Time``,
-    ``X0``, ``Delta_X``) and the X columns. Comments are left out.
-
-    Raises
-    ------
-    SpecError
-        If it is not an LVM file; the message names the line where reading ended.
+    Segments with successive times are one recording. The times come from their headers (``Date``, ``Time``, ``X0``,
+    ``Delta_X``) and the X columns. Comments are left out. If it is not an LVM file, `SpecError` names the line where
+    reading ended.
     """
     lines = read_text(path).splitlines()
     if not lines or not lines[0].strip().startswith(MAGIC):
@@ -123,9 +118,7 @@ def _skip(lines: list[str], i: int) -> int:
 
 
 def _columns(segment: _Segment) -> dict[int, int | None]:
-    """Map the index of each channel column to the index of its abscissa (X) column, or to None if it has no such
-    column.
-    """
+    """Map the index of each channel column to that of its abscissa (X) column, or to None."""
     last_x: int | None = None
     found: dict[int, int | None] = {}
     for j, name in enumerate(segment.names):

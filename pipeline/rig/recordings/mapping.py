@@ -12,11 +12,10 @@ from pydantic import BaseModel, Field, model_validator
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from pipeline.rig.recordings import units
-from pipeline.specification.files import read_toml
-from pipeline.specification.models import KEPT, add_model, kept_reference, model_toml
+from pipeline.specification.files import model_toml, read_toml, toml_key, toml_value
+from pipeline.specification.models import KEPT, add_model, kept_reference
 from pipeline.specification.problems import SpecError, checked, unknown_key
 from pipeline.specification.tables import Table
-from pipeline.specification.toml import toml_key, toml_value
 
 DRIVE = "drive"
 """Name of the drive in a recording's dataset."""
@@ -80,9 +79,7 @@ class PieceMap(Table):
 
 
 class CsvMap(Table):
-    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, for files in which they should not be detected
-    automatically.
-    """
+    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, if they should not be detected."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
         default=None, description="Separator of fields."
@@ -174,21 +171,10 @@ def load_mapping(path: str | Path) -> Mapping:
 
 
 def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT) -> Mapping:
-    """Validate a recording's mapping, given as tables or as the text of a TOML file.
+    """Validate a recording's mapping, given as tables or as the text of a TOML file; `source` names it in messages.
 
-    Parameters
-    ----------
-    data
-        Tables, or their text.
-    source
-        Name of the data in messages.
-    folder
-        Folder that a model's file is relative to; None for kept data: no file is read, nothing is imported.
-
-    Raises
-    ------
-    SpecError
-        With all problems at once.
+    A model's file is relative to `folder`; None is for kept data: no file is read, nothing is imported. Raise
+    `SpecError` with all problems at once.
     """
     tables = tomllib.loads(data) if isinstance(data, str) else dict(data)
     problems: list[str] = []
@@ -217,9 +203,7 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: st
 
 
 def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
-    """Validate the keys of a mapping file other than model, channels and drive, one by one so that all problems are
-    reported.
-    """
+    """Validate the keys other than model, channels and drive one by one, so that all problems are reported."""
     found = {}
     for key, value in rest.items():
         if key not in Mapping.model_fields:

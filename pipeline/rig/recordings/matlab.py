@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.rig.recordings.raw import Channel, Raw, digest
+from pipeline.rig.recordings.channels import Channel, Raw, digest
 from pipeline.specification.problems import SpecError
 
 STEP = "dt"
@@ -21,16 +21,12 @@ _PRIVATE = "__"
 def read_matlab(path: Path) -> Raw:
     """Read all real arrays of a MATLAB file as channels.
 
-    A variable of one row or column is the channel ``NAME``. The rows of others are ``NAME[0]``, ``NAME[1]``,
-    ...; samples lie along the longer side. Fields of a structure are ``STRUCTURE.FIELD``. The elements of
-    cells and of structure arrays are stretches: the first elements of all variables form one stretch, the
-    second elements the next. A variable that is not a cell belongs to all stretches. A scalar ``dt`` is the
-    sampling interval [s].
+    A variable of one row or column is the channel ``NAME``. The rows of others are ``NAME[0]``, ``NAME[1]``, ...;
+    samples lie along the longer side. Fields of a structure are ``STRUCTURE.FIELD``. The elements of cells and of
+    structure arrays are stretches: the first elements of all variables form one stretch, the second elements the next.
+    A variable that is not a cell belongs to all stretches. A scalar ``dt`` is the sampling interval [s].
 
-    Raises
-    ------
-    SpecError
-        If it is not a MATLAB file, has version 7.3, or its cells differ in number.
+    Raise `SpecError` if it is not a MATLAB file, has version 7.3, or its cells differ in number.
     """
     from scipy.io import loadmat
 
@@ -59,9 +55,7 @@ def _refuse_hdf5(path: Path) -> None:
 
 
 def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
-    """Add the numeric arrays of a MATLAB variable to `leaves` under its name; each field of a structure has its own
-    entry.
-    """
+    """Add the numeric arrays of a MATLAB variable to `leaves` by name; fields have entries of their own."""
     if not isinstance(value, np.ndarray):
         return
     if value.dtype.names:

@@ -12,20 +12,13 @@ import xarray as xr
 from pipeline.analysis.tabular import aligned, number
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
+from pipeline.rig.recordings.channels import Raw, findings_of, summary
 from pipeline.rig.recordings.clock import step_of
-from pipeline.rig.recordings.findings import findings_of, summary
 from pipeline.rig.recordings.mapping import DRIVE
-from pipeline.rig.recordings.raw import Raw
 
 
 def describe_file(raw: Raw) -> Table:
-    """Return a table with one row for each channel of a file, before any mapping to quantities.
-
-    Parameters
-    ----------
-    raw
-        Channels of the file.
-    """
+    """Return a table with one row for each channel of a file, before any mapping to quantities."""
     rows = [_channel_row(raw, name) for name in raw.names]
     head = f"{raw.path.name}: {raw.format}, {len(raw.names)} channels"
     if len(raw.stretches) > 1:
@@ -68,18 +61,7 @@ def _channel_row(raw: Raw, name: str) -> dict[str, Any]:
 
 
 def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
-    """Return two tables of a recording: one row per measured quantity, and one row per finding (fault or correction).
-
-    Parameters
-    ----------
-    ds
-        Recording from `read_recording`. The noise in the first table is from `smooth`.
-
-    Returns
-    -------
-    Table, Table
-        Quantities, and findings. Each finding has its own row; printed lines group them by kind and channel.
-    """
+    """Return tables of a recording: a row per measured quantity, with its noise, and a row per finding."""
     from pipeline.rig.recordings.smoothing import smooth
 
     smoothed = smooth(ds)

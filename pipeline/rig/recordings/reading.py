@@ -13,12 +13,13 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.rig.recordings import checks, formats, units
+from pipeline.rig.recordings import checks, units
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, findings_of, to_json
 from pipeline.rig.recordings.clock import Clock, clock_of, resampled
-from pipeline.rig.recordings.findings import Finding, findings_of, to_json
 from pipeline.rig.recordings.mapping import (
     DRIVE,
     ChannelMap,
+    CsvMap,
     DriveMap,
     Mapping,
     PieceMap,
@@ -26,8 +27,62 @@ from pipeline.rig.recordings.mapping import (
     TimeMap,
     load_mapping,
 )
-from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.specification.problems import SpecError, unknown_name
+
+# ---- formats ---------------------------------------------------------------------------------------
+
+SUFFIXES = {
+    ".tdms": "tdms",
+    ".lvm": "lvm",
+    ".csv": "csv",
+    ".txt": "csv",
+    ".tsv": "csv",
+    ".dat": "csv",
+    ".mat": "matlab",
+}
+"""Format by suffix."""
+
+
+def format_of(path: Path, stated: str | None = None) -> str:
+    """Return the stated format of a file, otherwise that of its suffix."""
+    if stated is not None:
+        return stated
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise SpecError(
+            f"{path}: the suffix {path.suffix!r} is none of {', '.join(SUFFIXES)}; "
+            'add format = "tdms", "lvm", "csv" or "matlab" to the mapping.'
+        )
+    return SUFFIXES[suffix]
+
+
+def read_raw(path: Path, stated: str | None = None, csv: CsvMap | None = None) -> Raw:
+    """Read all channels of a recording's file with the reader for its format, which by default the suffix gives."""
+    name = format_of(path, stated)
+    if not path.is_file():
+        raise SpecError(f"{path}: there is no such file.")
+    if name == "matlab":
+        from pipeline.rig.recordings.matlab import read_matlab
+
+        raw = read_matlab(path)
+    elif name == "tdms":
+        from pipeline.rig.recordings.tdms import read_tdms
+
+        raw = read_tdms(path)
+    elif name == "lvm":
+        from pipeline.rig.recordings.lvm import read_lvm
+
+        raw = read_lvm(path)
+    else:
+        from pipeline.rig.recordings.delimited import read_csv
+
+        raw = read_csv(path, csv or CsvMap())
+    if not raw.names:
+        raise SpecError(f"{path}: holds no channel of numbers.")
+    return raw
+
+
+# ---- recordings ------------------------------------------------------------------------------------
 
 DIM = "sample"
 
@@ -61,27 +116,12 @@ def read_recording(
         rates, or the window is empty.
     """
     chosen = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
-    raw = formats.read_raw(Path(path), chosen.format, chosen.csv)
+    raw = read_raw(Path(path), chosen.format, chosen.csv)
     return recording_of(raw, chosen, window_s=window_s)
 
 
 def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
-    """Convert the channels already read from a file to a recording. See `read_recording`.
-
-    Parameters
-    ----------
-    raw
-        All channels of a file.
-    mapping
-        Mapping of the channels.
-    window_s
-        Start and end of the part to keep [s since the first sample]; takes precedence over the mapping's.
-
-    Raises
-    ------
-    SpecError
-        See `read_recording`.
-    """
+    """Convert the channels already read from a file to a recording. See `read_recording`."""
     columns = _resolved(raw, mapping)
     findings = list(raw.findings)
     parts = [_timed(s, mapping, columns, findings) for s in raw.stretches]
@@ -134,9 +174,7 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
-    """Return the channel name in the file for each mapped quantity, and for ``time`` and ``piece``. Raise `SpecError`
-    if a channel is missing.
-    """
+    """Return the file's channel of each quantity, of ``time`` and ``piece``; raise `SpecError` for missing ones."""
     wanted: dict[str, Scaled | TimeMap | PieceMap] = dict(_entries(mapping))
     for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
         if axis is not None:
@@ -168,9 +206,7 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the one channel in the file whose name is that in the mapping file followed by a unit in brackets, else
-    None.
-    """
+    """Return the one channel whose name is the mapping's followed by a unit in brackets, else None."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
@@ -246,9 +282,7 @@ def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clo
 
 
 def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, list[Finding]]:
-    """Check the readings of a channel for faults and convert them to SI units; return the values and the findings
-    (fault reports).
-    """
+    """Check the readings of a channel for faults; return them in SI units, and the findings."""
     entry = _entries(mapping)[signal.name]
     found = checks.missing(signal)
     raw = np.where(np.isfinite(signal.raw), signal.raw, np.nan)

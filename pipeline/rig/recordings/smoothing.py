@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout.vocabulary import model_of
-from pipeline.rig.recordings.findings import runs
+from pipeline.rig.recordings.channels import runs
 from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.specification.problems import SpecError
 
@@ -143,9 +143,7 @@ def _switches(ds: xr.Dataset) -> np.ndarray:
 
 
 def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
-    """Return the start and end index, (n, 2), of each stretch without a gap, a missing value or a switch of the drive.
-    The end index is one after the last sample.
-    """
+    """Return start and end index, (n, 2), of each stretch without a gap, a missing value or a switch."""
     values, piece, time = ds[name].values, ds["piece"].values, ds["time"].values
     known = np.isfinite(values)
     number = piece + 0.0
@@ -251,16 +249,12 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
 
 
 def _order_of(own: int, width: int, order: int) -> int:
-    """Return the polynomial order for a stretch shorter than the smoothing window; the shorter the stretch, the lower
-    the order.
-    """
+    """Return the polynomial order for a stretch shorter than the window: the shorter, the lower."""
     return max(order - sum(own < share * width for share in SHORT), 1)
 
 
 def _fit_ends(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
-    """Smooth the samples within half a window of the start or end of each stretch, by the polynomial of the first or
-    last whole window.
-    """
+    """Smooth samples within half a window of a stretch's ends by the polynomial of the outermost window."""
     basis, half = _basis(width, order), width // 2
     for begins, rows in ((parts[:, 0], slice(0, half + 1)), (parts[:, 1] - width, slice(half, width))):
         window = values[begins[:, None] + np.arange(width)]

@@ -11,10 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.rig.recordings.findings import Finding
-from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.specification.extras import import_extra
-from pipeline.specification.problems import SpecError
+from pipeline.rig.recordings.channels import Channel, Finding, Raw, digest
+from pipeline.specification.problems import SpecError, import_extra
 
 SIMULATED = "simulated"
 """Property of a file with simulated readings."""
@@ -31,14 +29,8 @@ _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 def read_tdms(path: Path) -> Raw:
     """Read all channels of numbers or times in a TDMS file, under the names ``GROUP/CHANNEL``.
 
-    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by
-    default rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a
-    finding.
-
-    Raises
-    ------
-    SpecError
-        If it is not a TDMS file.
+    Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by default
+    rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a finding.
     """
     TdmsFile = import_extra("nptdms", "rig", str(path)).TdmsFile
     with _listening() as warnings:
@@ -73,9 +65,7 @@ def _channel(name: str, values: np.ndarray, properties: Mapping[str, Any], zero:
 
 
 def _numbers(data: Any, zero: int) -> np.ndarray | None:
-    """Return a channel's data as floats (time stamps become seconds since `zero`), or None if they are neither numbers
-    nor times.
-    """
+    """Return data as floats (time stamps as seconds since `zero`), or None if they are no numbers or times."""
     array = np.asarray(data)
     names = array.dtype.names or ()
     if "second_fractions" in names:
@@ -85,9 +75,7 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Return the whole second at or before the earliest start of all channels. Times are counted from it without loss
-    of digits.
-    """
+    """Return the whole second at or before the earliest start: times count from it without loss of digits."""
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 
@@ -97,9 +85,7 @@ def _seconds(stamp: Any, zero: int) -> float:
 
 
 def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
-    """Report data that the file announces but does not contain, from the file's segment lengths and the warnings of
-    npTDMS.
-    """
+    """Report data that the file announces but lacks, by its segment lengths and the warnings of npTDMS."""
     status = file.file_status
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:

@@ -57,15 +57,9 @@ def spelled(unit: str) -> str:
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return the factor from a unit to an SI unit. Return None if the two measure different quantities or the unit is
-    unknown.
+    """Return the factor from a unit to an SI unit; None if the two measure different quantities or the unit is unknown.
 
-    Parameters
-    ----------
-    unit
-        Unit in a mapping or a file; empty for the wanted unit.
-    wanted
-        SI unit of the quantity.
+    An empty unit is the wanted one.
     """
     return 1.0 if unit in ("", wanted) else UNITS.get(wanted, {}).get(unit)
 
@@ -84,14 +78,6 @@ def same(one: str, other: str) -> bool:
 
 
 def names_with_unit(wanted: str, names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the column names that consist of `wanted` and a unit in brackets, each with the unit.
-
-    Parameters
-    ----------
-    wanted
-        Such as ``Winkel oben``.
-    names
-        Of a file's columns or channels, such as ``Winkel oben [deg]``.
-    """
+    """Return the names, such as ``Winkel oben [deg]``, that are `wanted` and a unit in brackets, with the unit."""
     parts = [(name, match) for name in names if (match := _WITH_UNIT.fullmatch(name))]
     return [(name, match[2]) for name, match in parts if match[1] == wanted.strip()]

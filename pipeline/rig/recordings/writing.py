@@ -13,13 +13,13 @@ import xarray as xr
 
 from pipeline.layout.vocabulary import model_of
 from pipeline.layout.writing import write_atomically, write_netcdf
+from pipeline.rig.recordings.channels import Channel, Raw
 from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
-from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.tdms import SIMULATED
-from pipeline.specification.extras import import_extra
 from pipeline.specification.files import check_new_file
 from pipeline.specification.models import kept_reference
+from pipeline.specification.problems import import_extra
 
 SUFFIXES = (".tdms", ".csv", ".nc")
 GROUP = "recording"
@@ -57,9 +57,7 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
 
 
 def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
-    """Return the mapping (description of the channels) with which `read_recording` reads a file that `write_recording`
-    wrote.
-    """
+    """Return the mapping with which `read_recording` reads a file that `write_recording` wrote."""
     is_tdms = Path(path).suffix.lower() == ".tdms"
 
     def own(name: str) -> str:
@@ -83,19 +81,10 @@ def _is_one_waveform(ds: xr.Dataset) -> bool:
 
 
 def write_raw(raw: Raw, path: str | Path) -> Path:
-    """Write the channels of a file unchanged to a TDMS or CSV file.
+    """Write one stretch of channels of a file unchanged to a TDMS or CSV file.
 
-    Parameters
-    ----------
-    raw
-        One stretch of channels. In a CSV file the sampling interval becomes a column ``time``.
-    path
-        ``.tdms`` or ``.csv``.
-
-    Raises
-    ------
-    SpecError
-        If the suffix is another one, or the folder does not exist.
+    In a CSV file the sampling interval becomes a column ``time``. Raise `SpecError` if the suffix is another one, or
+    the folder does not exist.
     """
     target = check_new_file(path, SUFFIXES[:2])
     (channels,) = raw.stretches

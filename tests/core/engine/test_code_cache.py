@@ -119,39 +119,45 @@ def test_keep__what_cannot_be_an_entry_is_no_failure(cache, what):
     assert not [p for p in Path(__file__).parent.rglob("*.nbc") if "cubed" in p.name]
 
 
+@pytest.fixture
+def said(caplog):
+    """Take the one record of the log, which has one line."""
+
+    def take():
+        (record,) = caplog.records
+        assert "\n" not in record.message
+        caplog.clear()
+        return record.message
+
+    code_cache._made.cache_clear()
+    return take
+
+
 @EXPOSED
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o1777])
 @pytest.mark.parametrize("depth", [0, 1, 2])
-def test_keep__a_folder_that_others_can_write_to_is_not_used(cache, caplog, mode, depth):
+def test_keep__a_folder_that_others_can_write_to_is_not_used(cache, said, caplog, mode, depth):
     called()
     (path,) = entries(cache)
     exposed = [cache, cache / "digest", path.parent][depth]
     exposed.chmod(mode)
-    from magpend_core.engine.code_cache import _made
-
-    _made.cache_clear()
+    code_cache._made.cache_clear()
     assert called() == (cubed(0.3).hex(), False)
-    (record,) = caplog.records
-    assert "\n" not in record.message
+    message = said()
     for word in (str(exposed), f"owner {os.geteuid()}", f"mode {mode:04o}", f"chmod go-w {exposed}"):
-        assert word in record.message
-    caplog.clear()
+        assert word in message
     assert called() == (cubed(0.3).hex(), False)
     assert not caplog.records  # said once
 
 
 @EXPOSED
-def test_keep__another_users_folder_is_not_used(cache, caplog, monkeypatch):
+def test_keep__another_users_folder_is_not_used(cache, said, monkeypatch):
     called()
     me = os.geteuid()
     monkeypatch.setattr(os, "geteuid", lambda: me + 1)
-    from magpend_core.engine.code_cache import _made
-
-    _made.cache_clear()
+    code_cache._made.cache_clear()
     assert called() == (cubed(0.3).hex(), False)
-    (record,) = caplog.records
-    assert f"belongs to user {me}" in record.message
-    assert "MAGPEND_CACHE_DIR" in record.message
+    assert f"belongs to user {me}" in said()
 
 
 @EXPOSED
@@ -173,14 +179,13 @@ def test_keep__folders_are_made_for_their_owner_alone(cache):
     assert {path.stat().st_mode & 0o077 for path in (cache, *cache.rglob("*"))} == {0}
 
 
-def test_keep__a_full_disk_costs_the_entry_alone(cache, caplog, monkeypatch):
+def test_keep__a_full_disk_costs_the_entry_alone(cache, said, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
     assert called() == (cubed(0.3).hex(), False)
-    (record,) = caplog.records
-    assert "No space left on device" in record.message
+    assert "No space left on device" in said()
 
 
 def test_cache_folder__empty_is_as_unset_and_it_stays_when_the_process_goes_elsewhere(monkeypatch, tmp_path):

@@ -71,19 +71,11 @@ def digest_of(source, module=__name__):
 def test_functions_digest__changes_with_all_that_is_reached(old, new):
     assert SOURCE.count(old) == 1
     assert digest_of(SOURCE.replace(old, new)) != digest_of(SOURCE)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [("    return 3.0 * x", "    # a reason\n    return 3.0 * x"), ("FACTOR = 2.0", "FACTOR = 2.0\nUNUSED = 5")],
-)
-def test_functions_digest__does_not_change_with_the_rest(old, new):
-    assert digest_of(SOURCE.replace(old, new)) == digest_of(SOURCE)
-
-
-def test_functions_digest__none_for_functions_of_no_module():
-    # the compile cache imports the module when it is read
-    assert digest_of(SOURCE, "a_module_that_is_not_there") is None
+    # and with nothing else
+    rest = SOURCE.replace("    return 3.0 * x", "    # a reason\n    return 3.0 * x").replace(
+        "= 2.0", "= 2.0\nUNUSED = 5"
+    )
+    assert digest_of(rest) == digest_of(SOURCE)
 
 
 class Counter:
@@ -124,15 +116,15 @@ def test_functions_digest__none_if_something_cannot_be_followed(function):
     assert keeping(function) is None
 
 
-def test_functions_digest__follows_functions_that_call_themselves():
+def test_functions_digest__of_recursion_of_no_module_and_of_the_package():
     @inline
     def falling(n):
         return 1.0 if n <= 0 else n * falling(n - 1)
 
     assert len(functions_digest(falling)) == 64
+    # the compile cache imports the module when it is read
+    assert digest_of(SOURCE, "a_module_that_is_not_there") is None
 
-
-def test_keeping__nothing_for_the_package_and_a_digest_for_others():
     @inline
     def mine(x):
         return vecmath.exp(x) + math.pi

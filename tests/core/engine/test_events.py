@@ -20,47 +20,23 @@ from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import sincos
 from magpend_core.orbits import polish_orbits
 from magpend_core.sampling import sample
-from tests.core.maps import stroboscopic_map
-
-
-@inline
-def copy_parameters(frequency, p, out):
-    for i in range(len(out)):
-        out[i] = p[i]
-
-
-def flow(name, states, parameters, rhs, **fields):
-    """An autonomous system whose constants are its parameters."""
-    return System(
-        name=name,
-        state_names=states,
-        parameter_names=parameters,
-        n_constants=len(parameters),
-        constants=copy_parameters,
-        rhs=rhs,
-        **fields,
-    )
-
-
-@inline
-def _rotor(y, u, c):
-    return y[1], c[0] - c[1] * y[1] - sincos(y[0])[0]
-
+from tests.core.cells import run_cells, stroboscopic_map
+from tests.core.flows import table
+from tests.zoo.nonsmooth import coulomb_map, linear_motion
 
 # an engine for each direction and choice of quantities: of the library's, which others compile too, those
 # where v falls; where it rises it is watched
 VAN_DER_POL = load_model("van-der-pol").system
 RISING = {"quantities": ("v",)}
 CIRCLE = [0.0]  # its parameter at which it turns on circles, with angular velocity 1
-ROTOR = flow("rotor", ("th", "w"), ("torque", "d"), _rotor, is_angle=(True, False))
-
-
-def run_cells(system, parameters, frequency, starts, *, n_transient=0, n_keep=1, rtol=1e-8, **options):
-    starts = np.atleast_2d(np.asarray(starts, float))
-    packed = np.broadcast_to(np.asarray(parameters, float), (len(starts), 1, len(system.parameter_names)))
-    hertz = None if frequency is None else np.full((len(starts), 1), frequency)
-    options |= {"n_transient": n_transient, "n_keep": n_keep, "rtol": rtol, "atol": rtol}
-    return run_branches(packed, hertz, starts, system=system, **options)
+ROTOR = load_model(
+    table(
+        "rotor",
+        {"th": "w", "w": "torque - d*w - sin(th)"},
+        {"torque": 1.0, "d": 1.0},
+        states={"th": {"on_circle": True}},
+    )
+).system
 
 
 def returns(system, parameters, starts, section, *, rtol=1e-10, **options):
@@ -85,16 +61,9 @@ VAN_DER_POL_PERIOD = 6.6632868593231301
 @pytest.mark.slow
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_section__of_van_der_pol_has_the_published_period(direction):
-    found = returns(
-        VAN_DER_POL,
-        [1.0],
-        [[0.5, 0.1], [2.0, 3.0]],
-        Crossing("v", 0.0, direction, 20.0),
-        n_transient=8,
-        n_keep=6,
-        rtol=1e-12,
-        **(RISING if direction == "up" else {}),
-    )
+    options = {"n_transient": 8, "n_keep": 6, "rtol": 1e-12, **(RISING if direction == "up" else {})}
+    section = Crossing("v", 0.0, direction, 20.0)
+    found = returns(VAN_DER_POL, [1.0], [[0.5, 0.1], [2.0, 3.0]], section, **options)
     assert found.status.tolist() == [[Status.PERIODIC]] * 2
     assert found.orbit_period.tolist() == [[1]] * 2
     assert abs(found.return_time - VAN_DER_POL_PERIOD).max() < 2e-11
@@ -153,7 +122,7 @@ def test_section__of_an_angle_is_crossed_modulo_a_turn_and_one_way():
 
 
 @pytest.mark.slow
-def test_section__the_crossing_at_the_start_does_not_count():
+def test_section__counts_a_pair_within_a_step_and_not_the_crossing_at_the_start():
     # x = cos t, v = -sin t falls through v = 0 at the start and a period later
     section = Crossing("v", 0.0, "down")
     for v in (0.0, 1e-13, -1e-13):
@@ -162,31 +131,6 @@ def test_section__the_crossing_at_the_start_does_not_count():
     # a start before the section is another matter
     found = returns(VAN_DER_POL, CIRCLE, [[np.cos(0.01), np.sin(0.01)]], section, rtol=1e-12)
     assert found.return_time[0, 0, 0] == pytest.approx(0.01, abs=1e-12)
-
-
-def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
-    # mu < 0: to rest; then mu = 1 at the second point
-    packed = np.array([[[-1.0], [1.0]]])
-    found = run_branches(
-        packed,
-        None,
-        [[-1.0, -0.3]],
-        n_transient=0,
-        n_keep=2,
-        rtol=1e-9,
-        atol=1e-9,
-        system=VAN_DER_POL,
-        section=Crossing("v", -0.5, "down", 60.0),
-    )
-    assert found.status[0].tolist() == [Status.NO_RETURN, Status.BOUNDED]
-    assert np.isnan(found.section[0, 0]).all()
-    assert np.isnan(found.return_time[0, 0]).all()
-    assert np.isfinite(found.section[0, 1]).all()
-    assert "section.longest" in Status.NO_RETURN.sentence
-
-
-@pytest.mark.slow
-def test_section__finds_a_pair_of_crossings_within_a_step():
     # the top of a circle of radius 1 reaches beyond the level by 5e-5, for 0.02 s; steps are ten times longer
     for depth in (1e-3, 5e-5, 1e-6):
         section = Crossing("v", 1.0 - depth, "up", 20.0)
@@ -199,23 +143,26 @@ def test_section__finds_a_pair_of_crossings_within_a_step():
         assert found.return_time[0, 0] == pytest.approx(2.0 * np.pi, abs=1e-5)
 
 
-def test_section__at_rest_on_the_section_is_no_crossing():
-    found = returns(VAN_DER_POL, [1.0], [[0.0, 0.0]], Crossing("v", 0.0, "down", 30.0))
-    assert found.status[0, 0] == Status.NO_RETURN
+def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
+    # mu < 0: to rest; then mu = 1 at the second point
+    packed, section = np.array([[[-1.0], [1.0]]]), Crossing("v", -0.5, "down", 60.0)
+    options = {"n_transient": 0, "n_keep": 2, "rtol": 1e-9, "atol": 1e-9, "section": section}
+    found = run_branches(packed, None, [[-1.0, -0.3]], system=VAN_DER_POL, **options)
+    assert found.status[0].tolist() == [Status.NO_RETURN, Status.BOUNDED]
+    assert np.isnan(found.section[0, 0]).all()
+    assert np.isnan(found.return_time[0, 0]).all()
+    assert np.isfinite(found.section[0, 1]).all()
+    assert "section.longest" in Status.NO_RETURN.sentence
 
 
-def test_section__continues_from_its_final_state():
+def test_section__continues_and_watches_over_a_return():
     section = Crossing("v", 0.0, "down", 40.0)
     whole = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=6, rtol=1e-8)
     first = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=2, rtol=1e-8)
-    second = returns(
-        VAN_DER_POL, [1.0], first.final_state[:, 0], section, n_keep=4, rtol=1e-8, step_size=first.step_size[:, 0]
-    )
+    state, step = first.final_state[:, 0], first.step_size[:, 0]
+    second = returns(VAN_DER_POL, [1.0], state, section, n_keep=4, rtol=1e-8, step_size=step)
     together = np.concatenate([first.section, second.section], axis=2)
     assert together.tobytes() == whole.section.tobytes()
-
-
-def test_section__watched_quantities_are_means_over_the_return():
     # over a turn of the circle v is 0 in the mean, its extremes are 1
     found = returns(
         VAN_DER_POL, CIRCLE, [[-0.8, 0.6]], Crossing("v", 0.6), n_transient=1, n_keep=2, rtol=1e-10, **RISING
@@ -228,6 +175,8 @@ def test_section__too_many_steps_end_it(steps):
     section = Crossing("v", 0.0, "down")
     found = returns(VAN_DER_POL, [1.0], [[-0.5, -0.1]], section, max_steps_per_period=steps)
     assert found.status[0, 0] == Status.STEP_LIMIT
+    found = returns(VAN_DER_POL, [1.0], [[0.0, 0.0]], Crossing("v", 0.0, "down", 30.0))
+    assert found.status[0, 0] == Status.NO_RETURN
 
 
 @pytest.mark.parametrize(
@@ -251,17 +200,7 @@ def test_with_section__refuses(duffing):
     with pytest.raises(ValueError, match="has a section already"):
         with_section(with_section(VAN_DER_POL, "x", 1), "v", 1)
     with pytest.raises(ValueError, match="frequency_hz must be None"):
-        run_branches(
-            np.ones((1, 1, 1)),
-            [[1.0]],
-            [[1.0, 0.0]],
-            n_transient=0,
-            n_keep=1,
-            rtol=1e-8,
-            atol=1e-8,
-            system=VAN_DER_POL,
-            section=Crossing("v"),
-        )
+        run_cells(VAN_DER_POL, [1.0], 1.0, [[1.0, 0.0]], section=Crossing("v"))
 
 
 @pytest.mark.slow
@@ -412,68 +351,20 @@ def test_segments__of_a_square_drive_turn_about_two_centres():
     assert found.n_rejected.max() <= 3 * 5
 
 
-class DryFriction:
-    """x'' = force cos(w t) - x - mu sign(x'), slip by slip and stick by stick in closed form."""
-
-    def __init__(self, force, mu, frequency):
-        self.force, self.mu, self.w = force, mu, 2.0 * np.pi * frequency
-        self.forced = force / (1.0 - self.w**2)
-        self.stuck = 0.0
-
-    def slip(self, t0, x0, v0, sign):
-        """Position and velocity as functions of time while the velocity has one sign."""
-        a = x0 + self.mu * sign - self.forced * np.cos(self.w * t0)
-        b = v0 + self.forced * self.w * np.sin(self.w * t0)
-
-        def at(t):
-            c, s = np.cos(t - t0), np.sin(t - t0)
-            x = -self.mu * sign + self.forced * np.cos(self.w * t) + a * c + b * s
-            return x, -self.forced * self.w * np.sin(self.w * t) - a * s + b * c
-
-        return at
-
-    def state(self, x, times):
-        """States at rising times, from rest at `x` at time 0; the time that it sticks goes to `stuck`."""
-        t, out = 0.0, []
-        while len(out) < len(times):
-            end = self._first(lambda s, x=x: abs(self.force * np.cos(self.w * s) - x) - self.mu, t)
-            while len(out) < len(times) and times[len(out)] <= end:
-                out.append((x, 0.0))
-            self.stuck += end - t
-            t, v, sign = end, 0.0, np.sign(self.force * np.cos(self.w * end) - x)
-            while len(out) < len(times) and sign != 0.0:
-                at = self.slip(t, x, v, sign)
-                end = self._first(lambda s, at=at, sign=sign: -sign * at(s)[1], t + 1e-6)
-                while len(out) < len(times) and times[len(out)] <= end:
-                    out.append(at(times[len(out)]))
-                t, (x, v) = end, at(end)
-                pull = self.force * np.cos(self.w * t) - x
-                sign = 0.0 if abs(pull) < self.mu else -sign
-        return np.array(out)
-
-    @staticmethod
-    def _first(function, t):
-        """First zero after `t` of a function that is negative there."""
-        if function(t) >= 0.0:
-            return t
-        step = 1e-3
-        while function(t + step) < 0.0:
-            t += step
-        return brentq(function, t, t + step, xtol=1e-15, rtol=1e-14)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("force", "mu", "frequency"), [(1.0, 0.6, 0.05), (1.0, 0.3, 0.07), (2.0, 0.4, 0.11)])
 def test_switch__of_dry_friction_sticks_and_slips_as_in_closed_form(force, mu, frequency):
-    times = np.arange(1, 13) / frequency
-    exact = DryFriction(force, mu, frequency)
-    states = [exact.state(x, times) for x in (0.3, 0.9)]
-    # it does stick, or never does
-    assert exact.stuck > 0.2 * times[-1] or (exact.stuck == 0.0 and force == 2.0)
-    found = run_cells(STICK, dry(force, mu), frequency, [[0.3, 0.0], [0.9, 0.0]], n_keep=12, rtol=1e-12)
+    starts = [[0.3, 0.0], [0.9, 0.0]]
+    found = run_cells(STICK, dry(force, mu), frequency, starts, n_keep=12, rtol=1e-12)
     assert (found.status != Status.STEP_LIMIT).all()
-    for sections, state in zip(found.section[:, 0], states, strict=True):
-        assert sections == pytest.approx(state, abs=2e-10)
+    for state, sections in zip(starts, found.section[:, 0], strict=True):
+        stops = 0
+        for section in sections:
+            state, n = coulomb_map(state, 2.0 * np.pi * frequency, force, mu)
+            stops += n
+            assert section == pytest.approx(state, abs=2e-10)
+        # it does stick, or never does
+        assert (stops > 0) == (force < 2.0)
 
 
 def test_switch__sticks_for_ever_under_a_weak_force():
@@ -498,47 +389,15 @@ def test_switch__that_sticks_is_torn_off_by_an_edge():
 # --- impacts ----------------------------------------------------------------------------------------------
 
 
-@inline
-def _toss(y, u, c):
-    return y[1], 0.0 * y[0] - c[0] - c[1] * c[6]
-
-
-@inline
-def _toss_jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return zero, zero + 1.0, zero, zero
-
-
-@inline
-def _of_level(t, y, dy, c):
-    return ((y[0] - c[2], dy[0]),)
-
-
-@inline
-def _of_floor(t, y, dy, c):
-    return ((y[0] - c[3], dy[0]),)
-
-
-@inline
-def _bounce(k, t, y, c):
-    return y[0] - c[5], -c[4] * y[1]
-
-
-# x'' = -g - k sign(x - level); at the floor it is thrown back, or put down below
-TOSS = flow(
-    "toss",
-    ("x", "v"),
-    ("g", "k", "level", "floor", "r", "down"),
-    _toss,
-    jacobian=_toss_jacobian,
-    n_modes=1,
-    n_switches=1,
-    switches=_of_level,
-    n_impacts=1,
-    impacts=_of_floor,
-    impact_directions=(-1,),
-    reset=_bounce,
-)
+# at the floor it is thrown back, or put down below
+TOSS = load_model(
+    table(
+        "toss",
+        {"x": "v", "v": "-g - k*sign(x - level)"},
+        dict.fromkeys(("g", "k", "level", "floor", "r", "down"), 0.0),
+        impacts=[{"of": "x - floor", "direction": "down", "set": {"x": "x - down", "v": "-r*v"}}],
+    )
+).system
 
 
 def ball(g, r, down=0.0):
@@ -614,6 +473,7 @@ def test_impact__endless_ones_end_in_a_status(r):
 
 # x'' + 2 zeta x' + x = force cos(w t) left of a wall; parameters zeta, force, gap, r
 STRUCK = load_model("impact").system
+IMPACTS, IMPACT_HZ = [0.05, 1.0, 0.4, 0.8], 0.13
 
 
 class ImpactOscillator:
@@ -623,24 +483,11 @@ class ImpactOscillator:
         self.gap, self.r, self.w = gap, r, 2.0 * np.pi * frequency
         self.force, self.zeta = force, zeta
         self.matrix = np.array([[0.0, 1.0], [-1.0, -2.0 * zeta]])
-        response = force / (1.0 - self.w**2 + 2j * zeta * self.w)
-        self.response = response * np.array([1.0, 1j * self.w])
 
     def flight(self, t0, y0):
-        """State at a time, or position at several."""
-        forced = (self.response * np.exp(1j * self.w * t0)).real
-        x, v = y0 - forced
-        decay, turning = self.zeta, math.sqrt(1.0 - self.zeta**2)
-
-        def at(t):
-            s = turning * (t - t0)
-            fading = np.exp(-decay * (t - t0))
-            free = fading * (x * np.cos(s) + (v + decay * x) / turning * np.sin(s))
-            rate = fading * (v * np.cos(s) - (x + decay * v) / turning * np.sin(s))
-            drive = np.exp(1j * self.w * t)
-            return np.array([free + (self.response[0] * drive).real, rate + (self.response[1] * drive).real])
-
-        return at
+        """State at a time, or states at several."""
+        motion = linear_motion(t0, *y0, self.w, self.force, self.zeta)
+        return lambda t: np.array(motion(t))
 
     def after(self, y, time):
         """State and derivative by the start after `time`, and the number of impacts."""
@@ -668,15 +515,12 @@ class ImpactOscillator:
 
 @pytest.mark.slow
 def test_impact__oscillator_follows_its_exact_map_and_its_derivative():
-    zeta, force, gap, r, frequency, n_periods = 0.05, 1.0, 0.4, 0.8, 0.13, 3
-    exact = ImpactOscillator(zeta, force, gap, r, frequency)
+    exact = ImpactOscillator(*IMPACTS, IMPACT_HZ)
     starts = np.array([[0.1, 0.0], [-0.7, 0.5], [-2.0, 1.0], [0.2, -1.5]])
-    images, derivatives = stroboscopic_map(
-        np.tile([zeta, force, gap, r], (4, 1)), np.full(4, frequency), starts, n_periods, system=STRUCK
-    )
+    images, derivatives = stroboscopic_map(np.tile(IMPACTS, (4, 1)), np.full(4, IMPACT_HZ), starts, 3, system=STRUCK)
     counts = []
     for start, image, derivative in zip(starts, images[:, -1], derivatives, strict=True):
-        state, matrix, count = exact.after(start, n_periods / frequency)
+        state, matrix, count = exact.after(start, 3 / IMPACT_HZ)
         assert image == pytest.approx(state, abs=1e-9)
         assert derivative == pytest.approx(matrix, abs=1e-8 * abs(matrix).max())
         counts.append(count)
@@ -685,19 +529,18 @@ def test_impact__oscillator_follows_its_exact_map_and_its_derivative():
 
 @pytest.mark.slow
 def test_impact__multipliers_of_an_orbit_are_those_of_the_exact_map():
-    zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
-    packed = np.array([[zeta, force, gap, r]])
+    packed, frequency = np.array([IMPACTS]), IMPACT_HZ
     settled = run_cells(STRUCK, packed, frequency, [[-0.7, 0.5]], n_transient=60, rtol=1e-10)
     assert settled.orbit_period[0, 0] in (0, 1)
     orbit = polish_orbits(packed, np.array([frequency]), settled.section[0, :, 0], np.array([1]), system=STRUCK)
     assert orbit.converged[0]
-    image, matrix, count = ImpactOscillator(zeta, force, gap, r, frequency).after(orbit.section[0], 1 / frequency)
+    image, matrix, count = ImpactOscillator(*IMPACTS, frequency).after(orbit.section[0], 1 / frequency)
     assert count >= 1
     assert image == pytest.approx(orbit.section[0], abs=1e-9)
     exact = np.linalg.eigvals(matrix)
     assert np.sort_complex(orbit.multipliers[0]) == pytest.approx(np.sort_complex(exact), abs=1e-9)
     # each impact shrinks areas by r^2, the flow by exp(-2 zeta T)
-    area = r ** (2 * count) * math.exp(-2.0 * zeta / frequency)
+    area = IMPACTS[3] ** (2 * count) * math.exp(-2.0 * IMPACTS[0] / frequency)
     assert orbit.multipliers[0].prod() == pytest.approx(area, rel=1e-8)
 
 
@@ -730,55 +573,28 @@ def test_switch__sliding_forgets_the_velocity():
 
 
 @pytest.mark.slow
-def test_lyapunov__exponents_through_impacts_add_up_to_the_loss_of_area():
-    zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
-    packed = np.tile([zeta, force, gap, r], (2, 1))
-    found = lyapunov_exponents(
-        packed,
-        np.full(2, frequency),
-        np.array([[-0.7, 0.5], [0.2, 0.1]]),
-        n_transient=40,
-        n_periods=64,
-        system=STRUCK,
-        rtol=1e-9,
-        atol=1e-9,
-    )
+def test_lyapunov__through_impacts_and_sticking():
+    (zeta, _, _, r), frequency = IMPACTS, IMPACT_HZ
+    packed, starts = np.tile(IMPACTS, (2, 1)), np.array([[-0.7, 0.5], [0.2, 0.1]])
+    options = {"n_transient": 40, "n_periods": 64, "rtol": 1e-9, "atol": 1e-9}
+    found = lyapunov_exponents(packed, np.full(2, frequency), starts, system=STRUCK, **options)
     assert found.exponents.sum(axis=1) == pytest.approx(found.divergence, abs=1e-6)
     # volumes shrink by exp(-2 zeta T) in the flow, by r^2 at each impact
     settled = run_cells(STRUCK, packed[:1], frequency, [[-0.7, 0.5]], n_transient=40, rtol=1e-10)
-    exact = ImpactOscillator(zeta, force, gap, r, frequency)
-    _, _, count = exact.after(settled.section[0, 0, 0], 64 / frequency)
+    _, _, count = ImpactOscillator(*IMPACTS, frequency).after(settled.section[0, 0, 0], 64 / frequency)
     area = -2.0 * zeta + 2.0 * count * math.log(r) * frequency / 64
     assert found.divergence[0] == pytest.approx(area, abs=0.05 * frequency)
     assert count >= 64
-
-
-@pytest.mark.slow
-def test_lyapunov__through_sticking_has_a_largest_exponent():
     # sticking forgets the velocity: the second exponent is none, the first is that of where it stuck
     force, mu, frequency = 1.0, 0.6, 0.05
-    packed = np.array([dry(force, mu)])
-    found = lyapunov_exponents(
-        packed,
-        np.array([frequency]),
-        np.array([[0.3, 0.2]]),
-        n_exponents=2,
-        n_transient=8,
-        n_periods=32,
-        system=STICK,
-        rtol=1e-9,
-        atol=1e-9,
-    )
+    packed, hertz, start = np.array([dry(force, mu)]), np.array([frequency]), np.array([[0.3, 0.2]])
+    options = {"n_exponents": 2, "n_transient": 8, "n_periods": 32, "rtol": 1e-9, "atol": 1e-9}
+    found = lyapunov_exponents(packed, hertz, start, system=STICK, **options)
     assert found.status[0] == Status.BOUNDED
     assert found.loss[0] > 1e14
     assert found.exponents[0, 1] < -1.0
-    _, derivative = stroboscopic_map(
-        packed,
-        np.array([frequency]),
-        run_cells(STICK, packed[0], frequency, [[0.3, 0.2]], n_transient=8).section[0, 0],
-        1,
-        system=STICK,
-    )
+    settled = run_cells(STICK, packed, frequency, start, n_transient=8).section[0, 0]
+    _, derivative = stroboscopic_map(packed, hertz, settled, 1, system=STICK)
     largest = abs(np.linalg.eigvals(derivative[0])).max()
     expected = math.log(largest) * frequency if largest > 1e-9 else -1.0
     assert found.exponents[0, 0] == pytest.approx(expected, abs=1e-6) or found.exponents[0, 0] < expected
@@ -806,33 +622,18 @@ def test_rates__take_switches_by_their_signs_and_segments_by_time():
 # --- checks -------------------------------------------------------------------------------------------------
 
 
-@inline
-def _wrong_rate(t, y, dy, c):
-    return ((y[0], 2.0 * dy[0]),)
-
-
-@inline
-def _no_pair(t, y, dy, c):
-    return (y[0], dy[0])
-
-
-@inline
-def _half_a_state(k, t, y, c):
-    return (y[0],)
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"n_modes": 0}, "n_modes = 0; it must be 1: one for each of the 1 switches"),
         ({"switches": None}, "switches is missing"),
         ({"slides": (True, False)}, "slides has 2 entries; it must have one for each of the 1 switches"),
-        ({"switches": _wrong_rate}, "switches: the rate of number 0"),
-        ({"switches": _no_pair}, "switches must return a tuple of 1 pairs"),
+        ({"switches": inline(lambda t, y, dy, c: ((y[0], 2.0 * dy[0]),))}, "switches: the rate of number 0"),
+        ({"switches": inline(lambda t, y, dy, c: (y[0], dy[0]))}, "switches must return a tuple of 1 pairs"),
         ({"has_segments": True, "n_modes": 2}, "there is no edge"),
         ({"reset": None}, "reset is missing"),
         ({"impact_directions": (0,)}, "impact_directions: 0 must be 1"),
-        ({"reset": _half_a_state}, "reset returns 1 numbers; it must return a tuple of 2"),
+        ({"reset": inline(lambda k, t, y, c: (y[0],))}, "reset returns 1 numbers; it must return a tuple of 2"),
     ],
 )
 def test_check_system__names_what_is_wrong_with_events(fields, message):

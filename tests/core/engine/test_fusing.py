@@ -200,7 +200,7 @@ def test_rule__sums_and_differences():
     assert_follows_the_rule(_sums, rng.normal(size=(400, 4)))
 
 
-def test_rule__is_for_float64_alone():
+def test_rule__is_for_float64_alone_and_ends_at_branches_and_loops():
     @njit(**OPTIONS)
     def of(a, b, c):
         return a * b + c
@@ -210,8 +210,6 @@ def test_rule__is_for_float64_alone():
     assert of(a, a, c) == 0.0
     assert of(1, 2, 3) == 5
 
-
-def test_rule__ends_at_branches_and_loops():
     @njit(**OPTIONS)
     def of(a, b, c, n):
         here = a * b

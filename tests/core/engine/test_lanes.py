@@ -1,19 +1,18 @@
 """The engine: its tableau, order, steps and statuses."""
 
-import dataclasses
 import itertools
 
 import numpy as np
 import pytest
 from numba import njit
-from scipy.integrate import solve_ivp
 
 from magpend_core import Status, load_preset, run_branches, sections, trajectory
-from magpend_core.engine.jit import OPTIONS, inline
-from magpend_core.engine.lanes import FADED, engine_bindings, rows_of
+from magpend_core.engine.jit import OPTIONS
+from magpend_core.engine.lanes import engine_bindings, rows_of
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, store
 from magpend_core.engine.tableau import DENSE, ERROR, N_STAGES, NODES, STAGES
+from tests.core.cells import scipy_end
 
 # row 6 of the tableau holds the weights of the solution of order 5
 WEIGHTS = np.append(STAGES[6], 0.0)
@@ -133,20 +132,17 @@ def duffing_exactly(time, frequency, state):
         force = f * np.cos(2 * np.pi * frequency * t)
         return v, force - d * v - k * x - k3 * x**3, da, db, -d * da - s * a, -d * db - s * b
 
-    return solve_ivp(rhs, (0.0, time), [*state, 1, 0, 0, 1], "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    return scipy_end(rhs, [*state, 1, 0, 0, 1], time, 1e-13)
 
 
 @pytest.mark.slow
-def test_engine__converges_with_order_5(stepper):
+def test_engine__converges_with_order_5_and_so_does_its_estimate(stepper):
     frequency, state, time = 0.5 / np.pi, [0.5, 0.3], 3.0
     exact = duffing_exactly(time, frequency, state)
     n = np.array([24, 32, 48, 64, 96])
     errors = [np.max(abs(stepper(DUFFING, frequency, state, time / k, k)[0] - exact)) for k in n]
     slope = np.polyfit(np.log(n), np.log(errors), 1)[0]
     assert -slope == pytest.approx(5.0, abs=0.2)
-
-
-def test_engine__error_estimate_has_order_5(stepper):
     # of a step h: the embedded solution of order 4 leaves h^5
     frequency, state = 0.5 / np.pi, [0.5, 0.3]
     h = np.array([0.2, 0.1, 0.05, 0.025])
@@ -176,92 +172,6 @@ def test_engine__few_attempts_are_rejected(preset, rtol):
     assert found.n_periods.tolist() == [10] * 32
 
 
-@inline
-def _one_layer(y, dy, c):
-    # the value is x, the half-width 0.01, the strength that of a jump of 50
-    return ((y[0], dy[0], 0.0 * y[0] + 0.01, 0.0 * y[0] + 1.0 / (0.01 * 50.0)),)
-
-
-def step_of(rows, w, name):
-    row = getattr(rows, name)
-    return w[row : row + WIDTH]
-
-
-def rough_hypot(a, b):
-    """Within 2.2 % of the hypotenuse (see `vecmath.hypot_rough`)."""
-    value = np.maximum(np.maximum(a, b), 0.898 * np.maximum(a, b) + 0.486 * np.minimum(a, b))
-    assert np.allclose(value, np.hypot(a, b), rtol=0.022, atol=0.0)
-    return value
-
-
-def limits(slack, x, rate, passed, remaining, widths, ratios, fades):
-    """Bounds of the docstring of `choose_step`, one row each: the layer, the edge behind, the edge ahead.
-
-    Also where the layer's bound is about to end.
-    """
-    c = (slack * abs(rate) / (0.01 * 50.0)) ** (1.0 / 6.0)
-    away, width = abs(x / rate), abs(0.01 / rate)
-    towards = np.maximum(c * away / (1.0 + c), c * width)
-    behind_it = c * rough_hypot(away, width)
-    reach = width * np.maximum(FADED - 1.32 * np.log2(c), 1.0)
-    if fades:
-        towards = np.maximum(towards, np.minimum(away - reach, 0.9 * away))
-        behind_it = np.where(away > reach, np.inf, behind_it)
-    layer = np.where(x * rate < 0.0, towards, behind_it)
-    behind = ratios[0] * rough_hypot(passed, widths[0])
-    ahead = np.maximum(ratios[1] * remaining / (1.0 + ratios[1]), ratios[1] * widths[1])
-    return np.array([layer, behind, ahead]), fades & (abs(away - reach) < 0.01 * reach)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fades", [False, True])
-def test_choose_step__keeps_the_distance_from_layers_and_edges(oscillator, fades):
-    system = dataclasses.replace(oscillator, n_edges=2, has_layers=True, layers=_one_layer, layers_fade=fades)
-    part, rows = engine_bindings(system, RECORD)["choose_step"], rows_of(system)
-    choose_step = njit(lambda w, base, slack: part(w, base, slack))
-    rng = np.random.default_rng(5)
-    slack, tightest = 1e-3, np.zeros(4, int)
-    for _ in range(50):
-        w = np.zeros(rows.size)
-        x, rate = rng.uniform(-0.1, 0.1, WIDTH), rng.uniform(-3.0, 3.0, WIDTH)
-        passed, remaining = 10.0 ** rng.uniform(-5.0, 0.0, (2, WIDTH))
-        widths, ratios = 10.0 ** rng.uniform(-4.0, -2.0, (2, WIDTH)), rng.uniform(0.2, 2.0, (2, WIDTH))
-        wish = 10.0 ** rng.uniform(-4.0, 0.0, WIDTH)
-        fresh = rng.integers(0, 8, WIDTH) == 0
-        for name, values in {
-            "state": x,
-            "slopes": rate,
-            "time": 1.0 + passed,
-            "start": 1.0,
-            "wish": wish,
-            "target": 1.0 + passed + remaining,
-            "start_width": widths[0],
-            "target_width": widths[1],
-            "start_ratio": ratios[0],
-            "target_ratio": ratios[1],
-            "target_share": ratios[1] / (1.0 + ratios[1]),
-            "fresh": fresh,
-        }.items():
-            step_of(rows, w, name)[:] = values
-        choose_step(w, 0, slack)
-        bounds, ending = limits(slack, x, rate, passed, remaining, widths, ratios, fades)
-        bounds = np.vstack([bounds, wish])
-        tightest += np.bincount(np.argmin(bounds, axis=0), minlength=4)
-        share = bounds.min(axis=0) / remaining
-        # the last two steps before the end share the rest; the last one ends there
-        h = np.where(share >= 1.0, 1.0, np.where(share > 0.5, 0.5, share)) * remaining
-        # the layer's bound is a rough power, good to a thousandth; next to a threshold either will do
-        near = (abs(share - 1.0) < 3e-3) | (abs(share - 0.5) < 3e-3)
-        good = np.isclose(step_of(rows, w, "step"), np.where(fresh, 0.0, h), rtol=2e-3, atol=0.0)
-        assert (good | near | ending).all()
-        assert near.sum() < 3
-        assert ending.sum() < 4
-        # times are sums of some units
-        assert (step_of(rows, w, "step") <= remaining * (1.0 + 1e-9)).all()
-    # each of the four was the tightest often
-    assert tightest.min() > (20 if fades else 50)
-
-
 @pytest.mark.parametrize("eps_drive", [1e3, 1e6])
 def test_engine__steps_end_at_the_drives_edges(preset, eps_drive):
     # edges of a microsecond; at a wrong instant each would cost a dozen rejections
@@ -283,9 +193,6 @@ def test_run_branches__rotating_orbits_count_their_turns(preset):
         between = found.section[k, -1, :2] - found.section[k, 0, :2] + 2.0 * np.pi * found.turns[k]
         assert between == pytest.approx(unwrapped, abs=1e-6)
         assert y[:, 2:] == pytest.approx(found.section[k, :, 2:], abs=1e-6)
-
-
-def test_run_branches__angles_of_half_a_turn_stay_in_the_interval():
     # far from the bottom and at rest: sections next to the cut, on both sides of it
     still = load_preset(g=0.0, q=0.0, alpha1=0.0, alpha2=0.0)
     angles = np.array([np.pi, -np.pi, np.nextafter(np.pi, 4.0), 3.0 * np.pi, -3.0 * np.pi, 7.0])
@@ -298,19 +205,13 @@ def test_run_branches__angles_of_half_a_turn_stay_in_the_interval():
     assert (result.final_state[:, :2] == found).all()
 
 
-def oscillate(system, parameters, starts, frequency=1.0, n_points=1, **options):
-    n = len(starts)
-    settings = {"n_transient": 0, "n_keep": 3, "rtol": 1e-8, "atol": 1e-8, **options}
-    full = np.array([[*s, 1.0, 0.0, 0.0, 1.0] for s in starts])
-    packed = np.tile(np.array(parameters, dtype=float), (n, n_points, 1))
-    return run_branches(packed, np.full((n, n_points), frequency), full, system=system, **settings)
-
-
 @pytest.mark.slow
 def test_run_branches__diverged_cells_and_what_follows_them(oscillator):
     # x'' = 9 x grows by e^3 a period: the first passes the bound of 1000 in its second period, the
     # derivatives of the second their bound of 1e6 in its fifth
-    found = oscillate(oscillator, [0.0, -9.0, 0.0, 0.0], [[1.0, 3.0], [1e-9, 3e-9]], n_points=3)
+    starts = np.array([[1.0, 3.0, 1.0, 0.0, 0.0, 1.0], [1e-9, 3e-9, 1.0, 0.0, 0.0, 1.0]])
+    packed, settings = np.tile([0.0, -9.0, 0.0, 0.0], (2, 3, 1)), {"rtol": 1e-8, "atol": 1e-8}
+    found = run_branches(packed, np.ones((2, 3)), starts, system=oscillator, n_transient=0, n_keep=3, **settings)
     assert found.status.tolist() == [
         [Status.DIVERGED, Status.UNREACHED, Status.UNREACHED],
         [Status.BOUNDED, Status.DIVERGED, Status.UNREACHED],
@@ -339,13 +240,6 @@ def test_run_branches__step_limit(preset):
     assert (found.status < Status.DIVERGED).all()
 
 
-def test_run_branches__no_branches_no_work(preset):
-    nothing = np.zeros((0, 2, 34)), np.zeros((0, 2)), np.zeros((0, 4))
-    found = run_branches(*nothing, n_transient=1, n_keep=3, rtol=1e-6, atol=1e-6)
-    assert found.section.shape == (0, 2, 3, 4)
-    assert found.status.shape == (0, 2)
-
-
 def test_run_branches__counts_periods_and_keeps_the_last(preset):
     start = [[0.2, 0.2, 0.0, 0.0]]
     for n_transient, n_keep in itertools.product((0, 3), (1, 4)):
@@ -353,3 +247,7 @@ def test_run_branches__counts_periods_and_keeps_the_last(preset):
         every = sections(preset, 2.2, start, n_transient=0, n_keep=n_transient + n_keep)
         assert found.n_periods[0] == n_transient + n_keep
         assert (found.section[0] == every.section[0, n_transient:]).all()
+    nothing = np.zeros((0, 2, 34)), np.zeros((0, 2)), np.zeros((0, 4))
+    found = run_branches(*nothing, n_transient=1, n_keep=3, rtol=1e-6, atol=1e-6)
+    assert found.section.shape == (0, 2, 3, 4)
+    assert found.status.shape == (0, 2)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853, solve_ivp
 
-from magpend_core import Crossing, load_model, run_branches
+from magpend_core import Crossing, load_model
 from magpend_core.engine.tableau import METHODS
 from magpend_core.orbits import polish_orbits, section_map
+from tests.core.cells import run_cells
 
 EIGHTH = METHODS["dop853"]
 # smooth, so that an order shows, and without load-dependent friction, which `pendulum_rhs` does not know
@@ -17,21 +18,9 @@ FORCED = {"damping": 0.1, "linear": -1.0, "cubic": 1.0, "amplitude": 0.4}
 
 
 def run(name, method, tolerance, n_periods, starts, values=None, **options):
-    model = load_model(name)
-    n = len(starts)
-    packed = np.broadcast_to(model.load(**values or {}).pack(), (n, 1, len(model.parameters)))
-    return run_branches(
-        packed,
-        np.full((n, 1), options.pop("frequency", 0.2)),
-        starts,
-        n_transient=n_periods - 1,
-        n_keep=1,
-        rtol=tolerance,
-        atol=tolerance,
-        system=model.system,
-        method=method,
-        **options,
-    )
+    model, frequency = load_model(name), options.pop("frequency", 0.2)
+    options |= {"n_transient": n_periods - 1, "rtol": tolerance, "method": method}
+    return run_cells(model.system, model.load(**values or {}).pack(), frequency, starts, **options)
 
 
 def some_starts(n):
@@ -111,9 +100,6 @@ def test_run_branches__of_order_8_finds_crossings_and_carries_tangents():
         assert found.times[0, 0] == pytest.approx(6.663286859323, abs=1e-10)
         derivatives.append(found.derivatives)
     np.testing.assert_allclose(derivatives[0], derivatives[1], atol=1e-9)
-
-
-def test_run_branches__refuses_an_unknown_method_and_quantities_with_order_8():
     with pytest.raises(ValueError, match=r"method = 'rk4': \w+ can be integrated by dopri5, dop853"):
         run("duffing", "rk4", 1e-6, 1, some_starts(1))
     with pytest.raises(ValueError, match="quantities are watched with method dopri5 alone"):

@@ -67,25 +67,12 @@ def test_closed_period__a_spiral_is_not_closed_before_it_is_near(modulus, angle)
     assert closed(sections[:first]) == 1
 
 
-def test_closed_period__small_steps_of_a_slow_spiral_do_not_deceive():
+def test_closed_period__of_small_steps_and_of_rounding():
     # neighbours differ by half of the tolerance, the orbit is 25 tolerances away
     sections, distance = spiral(200, 0.98, 0.0, size=25.0 * TOLERANCE / 0.98**199)
     assert np.max(abs(np.diff(sections[-2:, 0]))) < 0.6 * TOLERANCE
     assert distance[-1] > 20.0 * TOLERANCE
     assert closed(sections) == 0
-
-
-def test_closed_period__no_decay_is_no_orbit():
-    # a drift of a tenth of the tolerance a period goes on for ever
-    n = np.arange(200)
-    drift = np.stack([0.3 + 0.1 * TOLERANCE * n, np.full(200, -2.0)], axis=1)
-    assert closed(drift) == 0
-    # a slow rotation with a small step
-    sections, _ = spiral(200, 1.0, 1e-4, size=1e-3)
-    assert closed(sections) == 0
-
-
-def test_closed_period__rounding_counts_as_closed():
     # an orbit reached to the integration's accuracy goes on to shake by a hundredth of the tolerance
     noise = np.random.default_rng(3).uniform(-1.0, 1.0, (200, 2)) * TOLERANCE * [0.004, 0.04]
     assert closed([0.3, -2.0] + noise) == 1
@@ -93,16 +80,20 @@ def test_closed_period__rounding_counts_as_closed():
     assert closed([0.3, -2.0] + 10.0 * noise) in (0, 1)
 
 
-def test_closed_period__chaos_and_noise_are_not_closed():
+def test_closed_period__no_decay_chaos_noise_or_a_near_miss_is_no_orbit():
+    # a drift of a tenth of the tolerance a period goes on for ever
+    n = np.arange(200)
+    drift = np.stack([0.3 + 0.1 * TOLERANCE * n, np.full(200, -2.0)], axis=1)
+    assert closed(drift) == 0
+    # a slow rotation with a small step
+    sections, _ = spiral(200, 1.0, 1e-4, size=1e-3)
+    assert closed(sections) == 0
     rng = np.random.default_rng(4)
     assert closed(rng.normal(size=(300, 2))) == 0
     logistic = [0.4]
     for _ in range(300):
         logistic.append(4.0 * logistic[-1] * (1.0 - logistic[-1]))
     assert closed(np.stack([logistic, logistic], axis=1)) == 0
-
-
-def test_closed_period__near_misses_of_one_section_do_not_count():
     # one large difference within the window is enough
     orbit = np.tile([0.3, -2.0], (100, 1))
     orbit[80, 0] += 1e-3
@@ -111,15 +102,12 @@ def test_closed_period__near_misses_of_one_section_do_not_count():
     assert closed(orbit) == 1
 
 
-def test_closed_period__angles_close_on_the_circle():
+def test_closed_period__angles_are_on_the_circle_and_rates_scaled():
     # an orbit at the cut: the sections alternate between both ends of the interval
     n = np.arange(100)
     sections = np.stack([np.where(n % 2 == 0, np.pi - 1e-10, -np.pi + 1e-10), np.full(100, 5.0)], axis=1)
     assert closed(sections) == 1
     assert closed(sections, is_angle=(False, False)) == 2
-
-
-def test_closed_period__rates_are_scaled():
     # 2e-7 rad/s is a fiftieth of the tolerance in units of 10 rad/s, twenty times it in units of 0.01
     n = np.arange(200)
     shake = np.stack([np.full(200, 0.3), 2.0 + 2e-7 * (n % 2)], axis=1)
@@ -127,16 +115,13 @@ def test_closed_period__rates_are_scaled():
     assert closed(shake, scales=(1.0, 0.01)) == 2
 
 
-def test_closed_period__a_pair_of_spirals_has_period_two():
+def test_closed_period__of_a_pair_of_spirals_and_of_one_that_alternates():
     for n, expected in ((100, 0), (200, 2)):
         around, distance = spiral(n, 0.9, 1.0, size=1.0)
         sections = np.empty((2 * n, 2))
         sections[0::2], sections[1::2] = around, around + [0.5, 3.0]
         assert closed(sections) == expected
         assert (distance[-1] < TOLERANCE) == (expected == 2)
-
-
-def test_closed_period__spiral_that_halves_its_turn_is_not_taken_for_period_two():
     # multipliers near -1: sections two apart settle first, the orbit's period is 1
     for modulus in (0.9, 0.97):
         sections, _ = spiral(2000, modulus, np.pi - 0.05, size=0.1)

@@ -1,8 +1,7 @@
 """Parts of engines: compiled once for all systems, kept on disk, linked with each system's sizes."""
 
-from __future__ import annotations
-
 import os
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
@@ -112,14 +111,8 @@ def _sum_of_states(w, out):
 
 
 def sizes(n):
-    rows = parts_rows(n)
+    rows = namedtuple("Rows", ("state", "size"))(n * WIDTH, 3 * n * WIDTH)
     return {"N": n, "ROWS": rows, "SCALES": np.arange(1.0, n + 1), "IS_ANGLE": np.arange(n) % 2}
-
-
-def parts_rows(n):
-    from collections import namedtuple
-
-    return namedtuple("Rows", ("state", "size"))(n * WIDTH, 3 * n * WIDTH)
 
 
 def expected(n):

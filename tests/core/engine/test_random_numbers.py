@@ -44,7 +44,7 @@ def drawn() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_normal_pair__distribution(drawn: tuple[np.ndarray, np.ndarray]) -> None:
+def test_normal_pair__is_normal_and_neighbours_are_independent(drawn) -> None:
     for sample in drawn:
         x = sample.ravel()
         n = len(x)
@@ -58,9 +58,6 @@ def test_normal_pair__distribution(drawn: tuple[np.ndarray, np.ndarray]) -> None
             expected = n * stats.norm.sf(level)
             for beyond in ((x > level).sum(), (x < -level).sum()):
                 assert abs(beyond - expected) < 4 * np.sqrt(expected) + 1
-
-
-def test_normal_pair__neighbours_are_independent(drawn: tuple[np.ndarray, np.ndarray]) -> None:
     first, second = drawn
     pairs = {
         "both of a pair": (first, second),
@@ -83,13 +80,10 @@ def test_normal_pair__differs_by_seed_source_purpose_and_cell() -> None:
     assert len({float(pair[0]) for pair in found}) == len(calls)
 
 
-def test_uniform__ends() -> None:
+def test_words__ends_and_low_bits() -> None:
     make = plain(uniform)
     assert make(word(0), word(0)) == 2.0**-53
     assert make(word(WORDS), word(WORDS)) == 1.0 - 2.0**-53
-
-
-def test_count_offset__leaves_the_count_in_the_low_bits() -> None:
     for count in (0, 1, 2**32 - 1, 2**32, 2**51 - 1):
         bits = int(np.float64(count + COUNT_OFFSET).view(np.int64))
         assert bits & (2**51 - 1) == count

@@ -117,10 +117,18 @@ def test_negate_if_bit__all_forms_agree(bit):
     assert same_bits([negate_if_bit(*pair, bit) for pair in zip(x, shifted, strict=True)], expected)
 
 
-def test_upper__products_are_exact():
+def test_upper_and_load_rows__in_plain_python():
     x, y = simd.upper(np.random.default_rng(2).normal(size=(2, 1000)))
     exact = [Fraction(a) * Fraction(b) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
     assert [Fraction(v) for v in (x * y).tolist()] == exact
+    rows = np.arange(3.0 * WIDTH)
+    first, second = load_rows(rows, WIDTH, 2)
+    assert (first[0], second[-1]) == (WIDTH, 3 * WIDTH - 1)
+    store_rows(rows, 0, (second, 0.5))
+    assert rows[0] == 2 * WIDTH
+    assert (rows[WIDTH : 2 * WIDTH] == 0.5).all()
+    # a copy, not a view: what is loaded does not change with the array
+    assert first[0] == WIDTH
 
 
 def test_primitives__mean_what_they_say():
@@ -148,18 +156,6 @@ def test_multiply_add__forms_agree_within_one_rounding():
     # exact products leave no room for a difference
     whole = np.round(100.0 * a)
     assert same_bits(on_lanes(simd.multiply_add, 3)(whole, whole, c), whole * whole + c)
-
-
-@njit(**OPTIONS)
-def _arithmetic(rows, out):
-    a, b = load_rows(rows, 0, 2)
-    values = (a + b, a - b, a * b, a / b, -a, 2.0 + a, a - 2.0, 2.0 * a, 2.0 / a)
-    store_rows(out, 0, values)
-    store_rows(out, 9 * WIDTH, (a, 5.0))
-    store(out, 11 * WIDTH, 7.0)
-
-
-def test_lanes__arithmetic_is_that_of_float64():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, WIDTH))
     b[0], a[1] = 0.0, -0.0
@@ -170,12 +166,10 @@ def test_lanes__arithmetic_is_that_of_float64():
     assert same_bits(out.reshape(12, WIDTH), expected)
 
 
-def test_load_rows__in_plain_python():
-    rows = np.arange(3.0 * WIDTH)
-    first, second = load_rows(rows, WIDTH, 2)
-    assert (first[0], second[-1]) == (WIDTH, 3 * WIDTH - 1)
-    store_rows(rows, 0, (second, 0.5))
-    assert rows[0] == 2 * WIDTH
-    assert (rows[WIDTH : 2 * WIDTH] == 0.5).all()
-    # a copy, not a view: what is loaded does not change with the array
-    assert first[0] == WIDTH
+@njit(**OPTIONS)
+def _arithmetic(rows, out):
+    a, b = load_rows(rows, 0, 2)
+    values = (a + b, a - b, a * b, a / b, -a, 2.0 + a, a - 2.0, 2.0 * a, 2.0 / a)
+    store_rows(out, 0, values)
+    store_rows(out, 9 * WIDTH, (a, 5.0))
+    store(out, 11 * WIDTH, 7.0)

@@ -7,15 +7,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from magpend_core import Status, lyapunov_exponents, polish_orbits, run_branches
+from magpend_core import Status, lyapunov_exponents, polish_orbits
 from magpend_core.engine.entry import integrate
 from magpend_core.engine.jit import CACHE_FOLDER, inline, is_covered
 from magpend_core.engine.lanes import engine_of
 from magpend_core.engine.observers import RECORD, Observer
-from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
-from magpend_core.engine.vecmath import TWO_PI, sincos
 from magpend_core.models.pendulum.systems import PENDULUM_DIPOLE, PENDULUM_FITTED
+from tests.core.cells import run_cells
+from tests.core.flows import model_of
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
 PERIOD = 2.0 * np.pi
@@ -23,26 +23,11 @@ PERIOD = 2.0 * np.pi
 
 def run(system, parameters, starts, frequency=UNIT_FREQUENCY, **settings):
     """Sections (x, x', and the derivative of the map, row by row) of each start, shape (n, n_keep, 6)."""
-    full = np.array([[*s, 1.0, 0.0, 0.0, 1.0] for s in starts])
-    packed = np.tile(np.array(parameters), (len(full), 1, 1))
-    result = run_branches(
-        packed, np.full((len(full), 1), frequency), full, system=system, rtol=1e-11, atol=1e-11, **settings
-    )
-    return result.section[:, 0]
+    full = [[*s, 1.0, 0.0, 0.0, 1.0] for s in starts]
+    return run_cells(system, parameters, frequency, full, rtol=1e-11, **settings).section[:, 0]
 
 
-def test_linear_oscillator__section_is_the_closed_form(oscillator):
-    # F (k - w^2)/D and F c w^2/D with D = (k - w^2)^2 + (c w)^2: the forced response at t = 2 pi n/w
-    c, k, force = 0.2, 2.0, 1.0
-    d = (k - 1.0) ** 2 + c**2
-    expected = np.array([force * (k - 1.0) / d, force * c / d])
-    assert expected == pytest.approx([0.9615384615, 0.1923076923], abs=5e-11)
-    # the transient shrinks by exp(-c T/2), half of a decade a period
-    found = run(oscillator, [c, k, 0.0, force], [[3.0, -2.0], [0.0, 0.0]], n_transient=45, n_keep=1)[:, 0, :2]
-    assert np.max(abs(found - expected)) < 1e-9
-
-
-def test_linear_oscillator__transient_is_exact(oscillator):
+def test_linear_oscillator__is_the_closed_form(oscillator):
     # free decay: exp(-c t/2) (cos s t + c/(2 s) sin s t) with s^2 = k - c^2/4
     c, k = 0.3, 2.0
     s = np.sqrt(k - c * c / 4.0)
@@ -52,6 +37,14 @@ def test_linear_oscillator__transient_is_exact(oscillator):
     assert np.max(abs(found[:, 0] - exact)) < 1e-9
     # the variational equation of a linear system is the system
     assert found[:, 2] == pytest.approx(found[:, 0], abs=1e-9)
+    # F (k - w^2)/D and F c w^2/D with D = (k - w^2)^2 + (c w)^2: the forced response at t = 2 pi n/w
+    c, k, force = 0.2, 2.0, 1.0
+    d = (k - 1.0) ** 2 + c**2
+    expected = np.array([force * (k - 1.0) / d, force * c / d])
+    assert expected == pytest.approx([0.9615384615, 0.1923076923], abs=5e-11)
+    # the transient shrinks by exp(-c T/2), half of a decade a period
+    found = run(oscillator, [c, k, 0.0, force], [[3.0, -2.0], [0.0, 0.0]], n_transient=45, n_keep=1)[:, 0, :2]
+    assert np.max(abs(found - expected)) < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -73,12 +66,11 @@ def test_duffing__two_attractors_at_their_published_points(oscillator, start, po
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.15, 0.5])
-@pytest.mark.parametrize("start", [(0.3, 0.2), (-1.5, 1.0)])
-def test_duffing__determinant_of_the_map_is_that_of_the_damping(oscillator, damping, start):
-    found = run(oscillator, [damping, -1.0, 1.0, 0.3], [start], n_transient=0, n_keep=2)[0]
-    for n, section in enumerate(found, start=1):
-        determinant = np.linalg.det(section[2:].reshape(2, 2))
-        assert determinant == pytest.approx(np.exp(-damping * n * PERIOD), rel=1e-8)
+def test_duffing__determinant_of_the_map_is_that_of_the_damping(oscillator, damping):
+    starts = [(0.3, 0.2), (-1.5, 1.0)]
+    found = run(oscillator, [damping, -1.0, 1.0, 0.3], starts, n_transient=0, n_keep=2)
+    determinants = np.linalg.det(found[..., 2:].reshape(2, 2, 2, 2))
+    assert determinants == pytest.approx(np.tile(np.exp(-damping * PERIOD * np.array([1, 2])), (2, 1)), rel=1e-8)
 
 
 def test_engine_of__keeps_systems_from_outside_apart(oscillator):
@@ -99,40 +91,9 @@ def test_engine_of__keeps_systems_from_outside_apart(oscillator):
 
 # ---- the least that a system can be: one state, neither angles, edges nor layers ------------------
 
-
-@inline
-def _relaxation_constants(frequency, p, out):
-    out[0] = p[0]
-    out[1] = TWO_PI * frequency
-
-
-@inline
-def _relaxation_forcing(t, c):
-    return sincos(c[1] * t)[1]
-
-
-@inline
-def _relaxation_rhs(y, u, c):
-    return (u - c[0] * y[0],)
-
-
-@inline
-def _relaxation_jacobian(y, u, c):
-    return (0.0 * y[0] - c[0],)
-
-
-RELAXATION = System(
-    name="relaxation",
-    state_names=("x",),
-    parameter_names=("rate",),
-    n_constants=2,
-    constants=_relaxation_constants,
-    forcing=_relaxation_forcing,
-    rhs=_relaxation_rhs,
-    jacobian=_relaxation_jacobian,
-)
-"""x' = cos(2 pi f t) - rate x"""
-BOUNDED_RELAXATION = dataclasses.replace(RELAXATION, name="bounded_relaxation", escape=(10.0,))
+RELAXATION = model_of({"x": "cos(2*pi*f*t) - rate*x"}, {"rate": 0.5}, states={"x": {"escape": 10.0}}).system
+GROWTH = model_of({"x": "x*(1 - x)"}).system
+"""The least of all: neither forcing nor parameters."""
 
 
 def test_system__takes_lists_and_whole_numbers(duffing):
@@ -149,16 +110,7 @@ def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     rate, omega = 0.5, 1.0
     packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
     starts = np.array([[0.3], [-2.0]])
-    result = run_branches(
-        packed[:, None],
-        frequency[:, None],
-        starts,
-        system=BOUNDED_RELAXATION,
-        n_transient=10,
-        n_keep=1,
-        rtol=1e-11,
-        atol=1e-11,
-    )
+    result = run_cells(RELAXATION, packed, frequency, starts, n_transient=10, rtol=1e-11)
     orbit = rate / (rate**2 + omega**2)
     decayed = (starts[:, 0] - orbit) * np.exp(-rate * 11 * PERIOD)
     assert result.section[:, 0, 0, 0] == pytest.approx(orbit + decayed, abs=1e-10)
@@ -169,22 +121,6 @@ def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     found = lyapunov_exponents(packed, frequency, starts, n_periods=32, system=RELAXATION)
     assert found.exponents == pytest.approx(-rate, abs=1e-6)
     assert found.divergence == pytest.approx(-rate, abs=1e-12)
-
-
-@inline
-def _no_constants(frequency, p, out):
-    return
-
-
-@inline
-def _growth_rhs(y, u, c):
-    return (y[0] * (1.0 - y[0]),)
-
-
-GROWTH = System(
-    name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants, rhs=_growth_rhs
-)
-"""x' = x (1 - x), the least of all: neither forcing nor parameters"""
 
 
 # ---- an observer of one's own ------------------------------------------------------------------------
@@ -212,19 +148,9 @@ def test_observer__of_ones_own_on_one_state_without_forcing_or_parameters(n_keep
     codes = {"PENDING": int(Status.PENDING), "BOUNDED": int(Status.BOUNDED), "LEVEL": 0.5}
     observer = Observer("count_above", _count_above, _no_memory, codes)
     starts = np.array([0.0, 0.1, 0.9])
-    cells = integrate(
-        GROWTH,
-        observer,
-        _Count(7),
-        parameters=np.empty((3, 1, 0)),
-        frequency_hz=np.full((3, 1), 2.0),
-        initial_states=starts[:, None],
-        n_keep=n_keep,
-        n_measures=1,
-        rtol=1e-11,
-        atol=1e-11,
-        max_steps_per_period=20_000,
-    )
+    given = {"parameters": np.empty((3, 1, 0)), "frequency_hz": np.full((3, 1), 2.0), "initial_states": starts[:, None]}
+    options = {"n_keep": n_keep, "n_measures": 1, "rtol": 1e-11, "atol": 1e-11, "max_steps_per_period": 20_000}
+    cells = integrate(GROWTH, observer, _Count(7), **given, **options)
     # logistic growth: x(t) = 1/(1 + (1/x0 - 1) exp(-t)), 1/2 at t = ln 9 from the second start
     assert cells.measures.ravel().tolist() == [0.0, 3.0, 7.0]
     assert cells.n_periods.ravel().tolist() == [7, 7, 7]

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from magpend_core import load_model, lyapunov_exponents, run_branches
+from magpend_core import lyapunov_exponents, run_branches
 from magpend_core.disturbance import Disturbance
 from magpend_core.engine import threads
 from magpend_core.engine.simd import WIDTH, take
@@ -16,6 +16,7 @@ from magpend_core.models.noisy import noisy
 from magpend_core.noisy import noisy_sections
 from magpend_core.pointwise import WORTH, evaluate_packed
 from magpend_core.sampling import Drive, sample
+from tests.core.flows import model_of
 
 N = 75
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="plain Python runs in one thread")
@@ -51,27 +52,12 @@ def samples():
 
 
 def with_noise():
-    table = {
-        "name": "well",
-        "states": {"x": {"meaning": "position"}},
-        "parameters": {"a": 1.0},
-        "equations": {"x": "a*x - x**3"},
-    }
-    model = noisy(load_model(table), Disturbance((("x", 0.5),)))
+    model = noisy(model_of({"x": "a*x - x**3"}, {"a": 1.0}), Disturbance((("x", 0.5),)))
     packed = np.tile(model.load().pack(), (N, 1))
     packed[:, -1] = np.arange(N)
-    steps = np.arange(20, 20 + N)
-    found = noisy_sections(
-        packed,
-        np.ones(N),
-        np.full((N, 1), 0.2),
-        system=model.system,
-        noise=model.noise,
-        seed=1,
-        steps_per_period=steps,
-        n_transient=2,
-        n_keep=3,
-    )
+    options = {"seed": 1, "steps_per_period": np.arange(20, 20 + N), "n_transient": 2, "n_keep": 3}
+    cells = packed, np.ones(N), np.full((N, 1), 0.2)
+    found = noisy_sections(*cells, system=model.system, noise=model.noise, **options)
     return found.section, found.status, found.strong_error
 
 
@@ -108,10 +94,6 @@ def test_take__gives_each_number_to_one_thread():
     with using_threads(3):
         share(lambda queue, n_lanes: count(queue, counts), len(counts), 64)
     assert (counts == 1).all()
-
-
-@compiled
-def test_share__uses_as_many_threads_as_there_are_groups_at_most():
     assert [len(threads_seen(3, n)) for n in (1, WIDTH, WIDTH + 1, 3 * WIDTH, 20 * WIDTH)] == [1, 1, 2, 3, 3]
 
 
@@ -171,13 +153,9 @@ def test_share__interruption_does_not_wait_for_the_others():
 
 @pytest.mark.slow
 @compiled
-def test_number_of_threads__from_the_variable(run_python):
+def test_number_of_threads__from_the_variable(run_python, monkeypatch):
     script = "from magpend_core.engine.threads import number_of_threads; print(number_of_threads())"
     assert run_python(script, MAGPEND_NUM_THREADS="3").strip() == "3"
-
-
-@compiled
-def test_number_of_threads__refuses_what_is_none(monkeypatch):
     threads._default.cache_clear()
     for text in ("0", "-1", "two", "1.5"):
         monkeypatch.setenv(threads.VARIABLE, text)

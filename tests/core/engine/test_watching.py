@@ -10,7 +10,7 @@ from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.watching import HIGHEST, LOWEST, MEAN
 from magpend_core.models.duffing.system import DUFFING
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from tests.core.watched import OF_THE_MOTION, OF_THE_PENDULUM
+from tests.core.cells import OF_THE_MOTION, OF_THE_PENDULUM, run_cells
 
 # an engine is compiled for each choice of quantities: two choices do
 NAMES = ("energy", "power_in", "power_dissipated", "drive", "v")
@@ -22,9 +22,9 @@ def linear_oscillator(n=3, **options):
     omega = 2.0 * np.pi * FREQUENCY
     response = AMPLITUDE / (STIFFNESS - omega**2 + 1j * DAMPING * omega)
     start = [response.real, (1j * omega * response).real]
-    packed = np.tile([DAMPING, STIFFNESS, 0.0, AMPLITUDE], (n, 1, 1))
-    settings = {"n_transient": 1, "n_keep": 2, "rtol": 1e-9, "atol": 1e-9, **options}
-    found = run_branches(packed, np.full((n, 1), FREQUENCY), np.tile(start, (n, 1)), system=DUFFING, **settings)
+    options = {"n_transient": 1, "n_keep": 2, "rtol": 1e-9, **options}
+    values = [DAMPING, STIFFNESS, 0.0, AMPLITUDE]
+    found = run_cells(DUFFING, values, FREQUENCY, np.tile(start, (n, 1)), **options)
     return found, abs(response), omega
 
 
@@ -53,9 +53,6 @@ def test_extremes__of_a_linear_oscillator_are_the_closed_forms():
     # parabolas over some 100 steps per period; the largest is that of the power put in
     assert error[..., [LOWEST, HIGHEST]].max() < 1e-6
     assert error[..., MEAN].max() < 1e-8
-
-
-def test_extremes__errors_are_of_order_four():
     # halving the step takes both kinds of error down by 2^4 or more; the steps of error control
     # shrink with the fifth root of the tolerance
     tolerances = 10.0 ** np.arange(-9.0, -3.0)
@@ -115,16 +112,13 @@ def test_watching__changes_no_section_and_depends_on_no_neighbour():
 def test_extremes__belong_to_the_period_that_ends_at_their_section(stop_when_closed):
     # with damping the sections close early, after a number of periods of their own
     start = {"n_transient": 400 if stop_when_closed else 5, "stop_when_closed": stop_when_closed}
-    rng = np.random.default_rng(1)
-    n = 20
-    packed = np.tile([0.5, 2.0, 1.0, 0.7], (n, 1, 1))
-    frequency, starts = np.full((n, 1), FREQUENCY), rng.uniform(-1.0, 1.0, (n, 2))
-    settings = {"rtol": 1e-6, "atol": 1e-6, "system": DUFFING, "quantities": NAMES}
-    found = run_branches(packed, frequency, starts, n_keep=3, **start, **settings)
+    starts = np.random.default_rng(1).uniform(-1.0, 1.0, (20, 2))
+    cells, settings = (DUFFING, [0.5, 2.0, 1.0, 0.7], FREQUENCY, starts), {"rtol": 1e-6, "quantities": NAMES}
+    found = run_cells(*cells, n_keep=3, **start, **settings)
     periods = int(found.n_periods.max())
     assert not stop_when_closed or periods < 400
-    every = run_branches(packed, frequency, starts, n_transient=0, n_keep=periods, **settings)
-    for i in range(n):
+    every = run_cells(*cells, n_keep=periods, **settings)
+    for i in range(20):
         last = found.n_periods[i, 0]
         assert (found.section[i, 0] == every.section[i, 0, last - 3 : last]).all()
         assert (found.extremes[i, 0] == every.extremes[i, 0, last - 3 : last]).all()
@@ -133,20 +127,13 @@ def test_extremes__belong_to_the_period_that_ends_at_their_section(stop_when_clo
 def test_extremes__of_failed_cells_are_nan():
     packed, frequency, starts = many(3)
     starts[1] = [0.0, 0.0, 9e3, -9e3]
-    found = run_branches(
-        packed,
-        frequency,
-        starts,
-        n_transient=0,
-        n_keep=2,
-        rtol=1e-6,
-        atol=1e-6,
-        max_steps_per_period=2000,
-        quantities=OF_THE_PENDULUM,
-    )
+    options = {"n_transient": 0, "n_keep": 2, "rtol": 1e-6, "atol": 1e-6, "max_steps_per_period": 2000}
+    found = run_branches(packed, frequency, starts, quantities=OF_THE_PENDULUM, **options)
     assert (found.status[1] > found.status[0]).all()
     assert np.isnan(found.extremes[1]).all()
     assert np.isfinite(found.extremes[[0, 2]]).all()
+    # those of the system would be called with too many states
+    assert with_tangents(PENDULUM_FITTED, 1).quantity_names == ()
 
 
 @pytest.mark.parametrize(
@@ -159,8 +146,3 @@ def test_extremes__of_failed_cells_are_nan():
 def test_run_branches__refuses_unknown_quantities(names, message):
     with pytest.raises(ValueError, match=message):
         linear_oscillator(quantities=names)
-
-
-def test_with_tangents__has_no_quantities():
-    # those of the system would be called with too many states
-    assert with_tangents(PENDULUM_FITTED, 1).quantity_names == ()

@@ -1,7 +1,5 @@
 """The double pendulum against Lagrange's equations, drag by quadrature, and the balance of energy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy as sp

@@ -1,40 +1,43 @@
 """Parameters that move, against closed forms and another integrator."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from magpend_core import load_model, load_preset, rates, run_branches
+from magpend_core import load_model, load_preset, rates
 from magpend_core.models.drift.ramps import STEEPNESS, TABLE, Ramp, motions_of
 from magpend_core.models.drift.sections import Drift, drifting_sections
 from magpend_core.models.drift.structure import DriftError
 from magpend_core.models.drift.system import AFFINE, DEGREE
 from magpend_core.status import Status
+from tests.core.cells import run_cells, scipy_end
+from tests.core.flows import table
 
 OSCILLATOR = load_model(
-    {
-        "name": "driven-oscillator",
-        "states": {"x": {}, "v": {}},
-        "parameters": {"k": 1.0, "d": 0.1, "A": 0.5},
-        "equations": {"x": "v", "v": "A*cos(2*pi*f*t) - d*v - k*x"},
-        "quantities": {"force": "A*cos(2*pi*f*t)", "size": "A"},
-    }
+    table(
+        "driven-oscillator",
+        {"x": "v", "v": "A*cos(2*pi*f*t) - d*v - k*x"},
+        {"k": 1.0, "d": 0.1, "A": 0.5},
+        quantities={"force": "A*cos(2*pi*f*t)", "size": "A"},
+    )
 )
 SWITCHED = load_model(
-    {
-        "name": "switched-oscillator",
-        "states": {"x": {}, "v": {}},
-        "parameters": {"d": 0.1, "A": 0.5, "duty": 0.3, "w": 0.0},
-        "equations": {"x": "v", "v": "A*square(t*f, duty) - d*v - x - 0.2*sign(v - w)"},
-    }
+    table(
+        "switched-oscillator",
+        {"x": "v", "v": "A*square(t*f, duty) - d*v - x - 0.2*sign(v - w)"},
+        {"d": 0.1, "A": 0.5, "duty": 0.3, "w": 0.0},
+    )
 )
 HZ = 0.3
 START = np.array([0.3, 0.1])
 RAMP = (("from", 0.5), ("to", 2.0), ("start_s", 7.3), ("duration_s", 21.7))
+
+
+def linear(name, first, last, **times):
+    """Ramp of a parameter from one value to another."""
+    return Ramp(name, "linear", (("from", first), ("to", last), *times.items()))
 
 
 def drifted(model, ramps, cells, *, hz=HZ, start=START, n_transient=0, n_keep=20, rtol=1e-10, **more):
@@ -57,7 +60,7 @@ def by_scipy(rhs, marks, start, breaks, wanted):
     y, found = np.asarray(start, float), []
     times = sorted({0.0, *marks, *(b for b in breaks if 0.0 < b < marks[-1])})
     for a, b in itertools.pairwise(times):
-        y = solve_ivp(rhs, (a, b), y, args=(0.5 * (a + b),), method="DOP853", rtol=wanted, atol=wanted).y[:, -1]
+        y = scipy_end(rhs, y, b, wanted, begin=a)
         if b in marks:
             found.append(y)
     return np.array(found)
@@ -99,7 +102,7 @@ def closed_form(n, start_s, duration_s, a, b):
 @pytest.mark.slow
 def test_drifting_sections__keeps_the_order_across_the_corners_of_a_ramp():
     """Of a force's amplitude, by the closed form of the linear oscillator: order 5 with both corners within a step."""
-    ramp = Ramp("A", "linear", (("from", 0.5), ("to", 9.0), ("start_s", 7.3), ("duration_s", 1.7)))
+    ramp = linear("A", 0.5, 9.0, start_s=7.3, duration_s=1.7)
     expected = closed_form(6, 7.3, 1.7, 0.5, 9.0)
     errors, steps = [], []
     for rtol in (1e-5, 1e-10):
@@ -118,7 +121,7 @@ def test_drifting_sections__against_another_integrator(name):
     """Smooth ramps; linear ones of both are in the closed form above and the table below."""
     drift, found = drifted(OSCILLATOR, [Ramp(name, "tanh", RAMP)], [{}])
 
-    def rhs(t, y, _):
+    def rhs(t, y):
         p = {"k": 1.0, "d": 0.1, "A": 0.5, name: value(t, 0.5, 2.0, 7.3, 21.7, True)}
         return [y[1], p["A"] * np.cos(2 * np.pi * HZ * t) - p["d"] * y[1] - p["k"] * y[0]]
 
@@ -138,7 +141,7 @@ def test_drifting_sections__of_two_parameters_and_a_table():
     ]
     _, found = drifted(OSCILLATOR, ramps, [{}])
 
-    def rhs(t, y, _):
+    def rhs(t, y):
         k, d = np.interp(t - 3.0, times, values), 0.1 + 0.3 * np.clip(t / 15.0, 0.0, 1.0)
         return [y[1], 0.5 * np.cos(2 * np.pi * HZ * t) - d * y[1] - k * y[0]]
 
@@ -150,7 +153,7 @@ def test_drifting_sections__of_two_parameters_and_a_table():
 @pytest.mark.slow
 def test_drifting_sections__of_a_switched_drive():
     """True jumps of the drive and of friction: corners lie between the edges of a period, and on one of them."""
-    ramp = Ramp("A", "linear", (("from", 0.5), ("to", 2.0), ("start_periods", 1.0 + 0.3), ("duration_periods", 2.45)))
+    ramp = linear("A", 0.5, 2.0, start_periods=1.0 + 0.3, duration_periods=2.45)
     _, found = drifted(SWITCHED, [ramp], [{}], n_keep=6)
 
     def force(t, middle):
@@ -186,11 +189,11 @@ def test_drifting_sections__of_the_pendulum():
     """A parameter by which its constants are divided."""
     base, name = load_preset(), "J2"
     a, b = base[name], 1.4 * base[name]
-    ramp = Ramp(name, "linear", (("from", a), ("to", b), ("start_s", 0.3), ("duration_s", 1.0)))
+    ramp = linear(name, a, b, start_s=0.3, duration_s=1.0)
     start = np.array([0.2, -0.1, 0.5, 1.0])
     drift, found = drifted(base.model, [ramp], [{}], hz=2.0, start=start, n_keep=4)
 
-    def rhs(t, y, _):
+    def rhs(t, y):
         p = base.replace(**{name: value(t, a, b, 0.3, 1.0, False)})
         return rates(np.array([t]), y[None], p, 2.0)[0]
 
@@ -202,27 +205,15 @@ def test_drifting_sections__of_the_pendulum():
 
 @pytest.mark.slow
 def test_drifting_sections__of_a_ramp_to_the_same_value_are_those_of_an_ordinary_run():
-    ramp = Ramp("A", "linear", (("from", 0.5), ("to", 0.5), ("start_s", 0.0), ("duration_s", 1.0)))
+    ramp = linear("A", 0.5, 0.5, start_s=0.0, duration_s=1.0)
     _, found = drifted(OSCILLATOR, [ramp], [{}], n_transient=300, n_keep=80)
-    packed = OSCILLATOR.load().pack()[None, None]
-    plain = run_branches(
-        packed,
-        np.full((1, 1), HZ),
-        START[None],
-        n_transient=300,
-        n_keep=80,
-        system=OSCILLATOR.system,
-        rtol=1e-10,
-        atol=1e-10,
-    )
+    options = {"n_transient": 300, "n_keep": 80, "rtol": 1e-10}
+    plain = run_cells(OSCILLATOR.system, OSCILLATOR.load().pack(), HZ, START, **options)
     np.testing.assert_allclose(found.section, plain.section, atol=1e-9)
     assert found.status[0, 0] == plain.status[0, 0] == Status.PERIODIC
     assert found.orbit_period[0, 0] == 1
-
-
-def test_drifting_sections__close_after_the_drift_alone():
-    """A slow ramp looks closed while it lasts; of a run that ends within it nothing is said."""
-    slow = Ramp("A", "linear", (("from", 0.5), ("to", 0.5 + 1e-7), ("start_s", 0.0), ("duration_periods", 399.0)))
+    # A slow ramp looks closed while it lasts; of a run that ends within it nothing is said
+    slow = linear("A", 0.5, 0.5 + 1e-7, start_s=0.0, duration_periods=399.0)
     _, during = drifted(OSCILLATOR, [slow], [{}], n_transient=340, n_keep=20)
     _, after = drifted(OSCILLATOR, [slow], [{}], n_transient=440, n_keep=20)
     assert during.status[0, 0] == Status.BOUNDED
@@ -249,15 +240,9 @@ def test_drifting_sections__same_bits_in_any_company():
 @pytest.mark.slow
 def test_drifting_sections__turns_of_angles_with_corners_among_the_kept_sections():
     """A rotor under a torque that grows: turns are those of its closed form, per cell alone."""
-    rotor = load_model(
-        {
-            "name": "rotor",
-            "states": {"a": {"on_circle": True}, "w": {}},
-            "parameters": {"m": 0.0},
-            "equations": {"a": "w", "w": "m + 0*sin(a)"},
-        }
-    )
-    ramp = Ramp("m", "linear", (("from", 0.0), ("to", 2.0), ("start_s", 2.5), ("duration_s", 4.0)))
+    rates = {"a": "w", "w": "m + 0*sin(a)"}
+    rotor = load_model(table("rotor", rates, {"m": 0.0}, states={"a": {"on_circle": True}}))
+    ramp = linear("m", 0.0, 2.0, start_s=2.5, duration_s=4.0)
     cells = [{"m_duration_s": d} for d in (1.0, 4.0, 40.0)]
     _, found = drifted(rotor, [ramp], cells, hz=1.0, start=np.array([0.0, 1.0]), n_transient=2, n_keep=8)
 
@@ -274,7 +259,7 @@ def test_drifting_sections__turns_of_angles_with_corners_among_the_kept_sections
 
 def test_drifting_sections__extremes_of_a_moving_parameter():
     """The parameter itself, as a quantity: exact at both ends of each period and between."""
-    ramp = Ramp("A", "linear", (("from", 0.5), ("to", 2.0), ("start_s", 4.0), ("duration_s", 10.0)))
+    ramp = linear("A", 0.5, 2.0, start_s=4.0, duration_s=10.0)
     _, found = drifted(OSCILLATOR, [ramp], [{}], n_keep=6, n_transient=1, quantities=["size"])
     ends = [value(np.array([k, k + 1]) / HZ, 0.5, 2.0, 4.0, 10.0, False) for k in range(1, 7)]
     np.testing.assert_allclose(found.extremes[0, 0, :, 0, 0], [e.min() for e in ends], atol=1e-12)
@@ -283,16 +268,6 @@ def test_drifting_sections__extremes_of_a_moving_parameter():
     length, up = 1.0 / HZ, 2.0 / HZ - 4.0
     mean = 0.5 + 0.5 * up * (ends[0][1] - 0.5) / length
     assert found.extremes[0, 0, 0, 0, 2] == pytest.approx(mean, abs=1e-12)
-
-
-@pytest.mark.parametrize("name", ["duty", "w"])
-def test_drift__refuses_what_moves_edges_or_surfaces(name):
-    ramp = Ramp(name, "linear", (("from", 0.3), ("to", 0.4), ("duration_s", 1.0)))
-    with pytest.raises(DriftError, match=name):
-        drifted(SWITCHED, [ramp], [{}])
-
-
-def test_motions__numbers_in_periods_and_rates():
     ramp = Ramp("A", "linear", (("to", 2.0), ("rate_per_period", 0.5), ("start_periods", 3.0)))
     names = ("k", "d", "A", *ramp.names)
     packed = np.array([[1.0, 0.1, 1.0, 2.0, 0.5, 3.0]])
@@ -300,3 +275,10 @@ def test_motions__numbers_in_periods_and_rates():
     assert motion.start_s[0] == 12.0
     assert motion.duration_s[0] == 8.0
     np.testing.assert_allclose(motion.at(0, np.array([0.0, 12.0, 16.0, 20.0, 99.0])), [1.0, 1.0, 1.5, 2.0, 2.0])
+
+
+@pytest.mark.parametrize("name", ["duty", "w"])
+def test_drift__refuses_what_moves_edges_or_surfaces(name):
+    ramp = Ramp(name, "linear", (("from", 0.3), ("to", 0.4), ("duration_s", 1.0)))
+    with pytest.raises(DriftError, match=name):
+        drifted(SWITCHED, [ramp], [{}])

@@ -3,8 +3,6 @@
 `data/library.json` and its provenance: see data/README.md. Exponents of flows: see test_flows.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,9 +12,9 @@ from scipy.integrate import solve_ivp
 from magpend_core.crossing import Crossing
 from magpend_core.models import LIBRARY, load_model
 from magpend_core.models.sectioned import sectioned
-from magpend_core.orbits import polish_orbits, scaled_distance
+from magpend_core.orbits import scaled_distance
 from magpend_core.pointwise import evaluate, rates
-from magpend_core.sections import run_branches
+from tests.core.cells import polish, run_cells
 
 HZ = 1.0 / (2.0 * math.pi)
 """1 rad/s."""
@@ -87,28 +85,14 @@ def _flutter(t, y, p):
     mass = np.array(
         [[p["mT"] + pi * rho * b**2, off, 0], [off, p["Ia"] + pi * (0.125 + a**2) * rho * b**4, 0], [0, 0, 1]]
     )
-    damping = np.array(
-        [
-            [
-                p["ch"] + 2 * pi * rho * b * u * s,
-                (1 + s * (1 - 2 * a)) * pi * rho * b**2 * u,
-                2 * pi * rho * u**2 * b * lag,
-            ],
-            [
-                -2 * pi * (a + 0.5) * rho * b**2 * s * u,
-                p["ca"] + (0.5 - a) * (1 - s * (1 + 2 * a)) * pi * rho * b**3 * u,
-                -2 * pi * rho * b**2 * u**2 * (a + 0.5) * lag,
-            ],
-            [-1 / b, a - 0.5, (c2 + c4) * u / b],
-        ]
-    )
-    stiffness = np.array(
-        [
-            [p["kh"], 2 * pi * rho * b * u**2 * s, 2 * pi * rho * u**3 * product],
-            [0, p["ka"] - 2 * pi * (0.5 + a) * rho * s * b**2 * u**2, -2 * pi * rho * b * u**3 * (a + 0.5) * product],
-            [0, -u / b, c2 * c4 * u**2 / b**2],
-        ]
-    )
+    air, half = pi * rho * b, a + 0.5
+    heave = [p["ch"] + 2 * air * u * s, (1 + s * (1 - 2 * a)) * air * b * u, 2 * air * u**2 * lag]
+    own = p["ca"] + (0.5 - a) * (1 - s * (1 + 2 * a)) * air * b**2 * u
+    pitch = [-2 * half * air * b * s * u, own, -2 * air * b * u**2 * half * lag]
+    damping = np.array([heave, pitch, [-1 / b, a - 0.5, (c2 + c4) * u / b]])
+    heave = [p["kh"], 2 * air * u**2 * s, 2 * pi * rho * u**3 * product]
+    pitch = [0, p["ka"] - 2 * half * air * s * b * u**2, -2 * air * u**3 * half * product]
+    stiffness = np.array([heave, pitch, [0, -u / b, c2 * c4 * u**2 / b**2]])
     v, rate = y[:3], y[3:]
     spring = np.array([0.0, p["ka2"] * v[1] ** 2 + p["ka3"] * v[1] ** 3, 0.0])
     return np.concatenate([rate, np.linalg.solve(mass, -damping @ rate - stiffness @ v - spring)])
@@ -154,16 +138,6 @@ def test_library__rates_are_those_of_the_literature(name):
     assert rates(times, states, parameters, HZ) == pytest.approx(np.array(expected), rel=1e-13, abs=1e-13)
 
 
-def _polished(name, orbits, frequency_hz=HZ, off=1e-3, **values):
-    """Polish each published orbit from near a point of it."""
-    model = load_model(name)
-    packed = np.stack([model.load(**values).pack()] * len(orbits))
-    points = np.array([orbit["points"][0] for orbit in orbits]) + off
-    periods = np.array([orbit["period"] for orbit in orbits])
-    frequency = np.full(len(orbits), frequency_hz)
-    return polish_orbits(packed, frequency, points, periods, system=model.system)
-
-
 @pytest.mark.parametrize("name", ["duffing5", "driven-pendulum"])
 def test_library__coexisting_orbits(name, library):
     """Ueda's five orbits, Kennedy and Yorke's three: points and multipliers of an independent program."""
@@ -178,29 +152,15 @@ def test_library__coexisting_orbits(name, library):
             assert np.abs(found.multipliers[i] - complex(*expected)).min() < 1e-7
 
 
+def _polished(name, orbits, frequency_hz=HZ, off=1e-3, **values):
+    """Polish each published orbit from near a point of it."""
+    points = np.array([orbit["points"][0] for orbit in orbits]) + off
+    return polish(load_model(name).load(**values), points, [orbit["period"] for orbit in orbits], frequency_hz)
+
+
 def _run(model, states, n_transient, n_keep, tolerance=1e-9, preset=None, frequency_hz=HZ, **values):
-    n = len(states)
-    packed = np.broadcast_to(model.load(preset, **values).pack(), (n, 1, len(model.parameters)))
-    return run_branches(
-        np.ascontiguousarray(packed),
-        np.full((n, 1), frequency_hz),
-        np.asarray(states, float),
-        n_transient=n_transient,
-        n_keep=n_keep,
-        rtol=tolerance,
-        atol=tolerance,
-        system=model.system,
-    )
-
-
-def test_driven_pendulum__constant_torque_of_menck_et_al():
-    """Rest .152 +- .004 (bSTAB, case 1) of the states around the rest; all else rotates."""
-    model = load_model("driven-pendulum")
-    middle = math.asin(0.5)
-    th, w = np.meshgrid(np.linspace(middle - np.pi, middle + np.pi, 60, endpoint=False), np.linspace(-10.0, 10.0, 61))
-    states = np.stack([th.ravel(), w.ravel()], -1)
-    found = _run(model, states, 40, 1, 1e-7, preset="constant-torque").section[:, 0, 0]
-    assert np.mean(np.abs(found[:, 1]) < 0.1) == pytest.approx(0.152, abs=0.01)
+    options = {"n_transient": n_transient, "n_keep": n_keep, "rtol": tolerance}
+    return run_cells(model.system, model.load(preset, **values).pack(), frequency_hz, states, **options)
 
 
 def test_three_magnets__rests_are_the_roots_of_the_forces(library):
@@ -213,11 +173,7 @@ def test_three_magnets__rests_are_the_roots_of_the_forces(library):
 
 
 def _cycles(name, crossing, points, periods, **values):
-    model = sectioned(load_model(name), crossing)
-    packed = np.stack([model.load(**values).pack()] * len(points))
-    return polish_orbits(
-        packed, np.full(len(points), 1.0 / crossing.longest), np.array(points), np.array(periods), system=model.system
-    )
+    return polish(sectioned(load_model(name), crossing).load(**values), points, periods)
 
 
 @pytest.mark.slow
@@ -296,16 +252,13 @@ def pendulums():
     return load_model("pendulum-free").load(), load_model("pendulum-text").load()
 
 
-def test_pendulum_text__has_the_built_in_parameters(pendulums):
+@pytest.mark.slow
+def test_pendulum_text__has_the_built_in_parameters_accelerations_and_quantities(pendulums):
     built_in, text = pendulums
     assert {p.name: (p.unit, text[p.name]) for p in text.model.parameters} == {
         p.name: (p.unit, built_in[p.name]) for p in built_in.model.parameters
     }
-
-
-@pytest.mark.slow
-def test_pendulum_text__accelerations_and_quantities(pendulums):
-    """Four sweeps of the loads against two Newton steps: 1e-9 of accelerations of up to 1e3 rad/s2."""
+    # Four sweeps of the loads against two Newton steps: 1e-9 of accelerations of up to 1e3 rad/s2
     built_in, text = pendulums
     rng = np.random.default_rng(8)
     states = rng.uniform([-3.0, -3.0, -10.0, -20.0], [3.0, 3.0, 10.0, 20.0], (300, 4))

@@ -16,11 +16,18 @@ def uneven():
     return load_model("pendulum").load(**changes)
 
 
+@pytest.mark.slow
 def test_magnet_moment__is_that_of_the_model():
     p = uneven()
     turned = STATES + 2 * np.pi * RNG.integers(-2, 3, (200, 1)) * [1, 1, 0, 0]
     expected = evaluate(["magnet_moment"], 0.0, turned, p, 2.0)[:, 0]
     np.testing.assert_allclose(laws.magnet_moment(PSI1, PSI_REL, p), expected, rtol=0, atol=1e-12)
+    p, h = uneven(), 1e-6
+    up, down = (evaluate(["energy"], 0.0, STATES + s * np.array([h, h, 0, 0]), p, 2.0)[:, 0] for s in (1, -1))
+    np.testing.assert_allclose(laws.weight_torque(PSI1, PSI_REL, p), -(up - down) / (2 * h), atol=1e-8)
+    p = load_model("pendulum-dipole").load(pole1=150.0)
+    expected = evaluate(["magnet_moment"], 0.0, STATES, p, 2.0)[:, 0]
+    np.testing.assert_allclose(laws.dipole_moment(PSI1, PSI_REL, p), expected, rtol=1e-9, atol=1e-13)
 
 
 def test_moment_slopes__are_those_of_the_law():
@@ -32,9 +39,6 @@ def test_moment_slopes__are_those_of_the_law():
         up, down = (laws.magnet_moment(PSI1, PSI_REL, p.replace(**{name: p[name] + s})) for s in (step, -step))
         # second order of the differences, about 1e-10 of the third derivative's size
         np.testing.assert_allclose(slopes[:, i], (up - down) / (2 * step), rtol=1e-6, atol=1e-7, err_msg=name)
-
-
-def test_bump_slopes__are_those_of_the_curve():
     at = np.array([1.2, -0.06, 0.055])
     slopes = laws.bump_slopes(PSI1, *at)
     for i in range(3):
@@ -49,16 +53,3 @@ def test_transition__is_where_the_two_bumps_have_equal_shares():
     at = line.slope * 0.3 + line.offset
     peaks = [-(p[f"p{i}"] * 0.3 + p[f"r{i}"]) for i in (1, 2)]
     assert at == pytest.approx(np.mean(peaks), abs=1e-15)
-
-
-@pytest.mark.slow
-def test_dipole_moment__is_that_of_the_model():
-    p = load_model("pendulum-dipole").load(pole1=150.0)
-    expected = evaluate(["magnet_moment"], 0.0, STATES, p, 2.0)[:, 0]
-    np.testing.assert_allclose(laws.dipole_moment(PSI1, PSI_REL, p), expected, rtol=1e-9, atol=1e-13)
-
-
-def test_weight_torque__is_minus_the_slope_of_the_energy():
-    p, h = uneven(), 1e-6
-    up, down = (evaluate(["energy"], 0.0, STATES + s * np.array([h, h, 0, 0]), p, 2.0)[:, 0] for s in (1, -1))
-    np.testing.assert_allclose(laws.weight_torque(PSI1, PSI_REL, p), -(up - down) / (2 * h), atol=1e-8)

@@ -6,7 +6,7 @@ from scipy.optimize import brentq
 
 from magpend_core import ParameterError, energy, evaluate, jacobian, load_model, model_names, rates, torques
 from magpend_core.models import LIBRARY
-from magpend_core.models.pendulum.sides import Side, classify, slowest_hz
+from magpend_core.models.pendulum.sides import slowest_hz
 
 FREQUENCY = 1.7
 CASES = [(name, preset) for name in model_names() for preset in load_model(name).preset_names]
@@ -35,9 +35,11 @@ def test_model__digests_tell_models_apart():
     assert len(rooms) == 3 + len(list(LIBRARY.glob("*.toml")))  # the pendulum's kinds share their sources
 
 
-def test_load_model__reports_an_unknown_name():
+def test_unknown_names__have_the_nearest_beside(preset):
     with pytest.raises(ParameterError, match="model 'dufing' does not exist; did you mean duffing"):
         load_model("dufing")
+    with pytest.raises(ParameterError, match="'energie' is not a quantity of pendulum; did you mean energy"):
+        evaluate(["energie"], 0.0, np.zeros(4), preset, 2.2)
 
 
 @pytest.mark.slow
@@ -87,30 +89,19 @@ def test_pendulum_sine__has_a_sinusoidal_torque():
 
 
 @pytest.mark.slow
-def test_evaluate__energy_changes_by_the_powers(preset):
-    model, h = preset.model, 1e-6
-    y = states_of(model)
-    rate = rates(0.1, y, preset, FREQUENCY)
-    slope = (energy(y + h * rate, preset) - energy(y - h * rate, preset)) / (2 * h)
-    names = ["energy", "power_in", "power_dissipated", "magnet_torque1", "magnet_torque2"]
-    e, power_in, lost, q1, q2 = evaluate(names, 0.1, y, preset, FREQUENCY).T
-    np.testing.assert_allclose(e, energy(y, preset), rtol=1e-13)
-    magnets = q1 * y[:, 2] + q2 * y[:, 3]
-    np.testing.assert_allclose(slope, power_in - lost + magnets, rtol=1e-6, atol=1e-6)
-
-
-def test_evaluate__duffing_energy_changes_by_the_powers():
-    parameters = load_model("duffing").load("twin-well")
-    h, y = 1e-5, states_of(parameters.model)
+@pytest.mark.parametrize(("name", "given", "h"), [("pendulum", "wojna2018", 1e-6), ("duffing", "twin-well", 1e-5)])
+def test_evaluate__energy_changes_by_the_powers(name, given, h):
+    parameters = load_model(name).load(given)
+    y = states_of(parameters.model)
     rate = rates(0.1, y, parameters, FREQUENCY)
     ahead, behind = (evaluate(["energy"], 0.1, y + s * h * rate, parameters, FREQUENCY)[:, 0] for s in (1, -1))
     power_in, lost = evaluate(["power_in", "power_dissipated"], 0.1, y, parameters, FREQUENCY).T
-    np.testing.assert_allclose((ahead - behind) / (2 * h), power_in - lost, rtol=1e-7, atol=1e-7)
-
-
-def test_evaluate__names_the_nearest_quantity(preset):
-    with pytest.raises(ParameterError, match="'energie' is not a quantity of pendulum; did you mean energy"):
-        evaluate(["energie"], 0.0, np.zeros(4), preset, 2.2)
+    work = 0.0
+    if name == "pendulum":
+        e, q1, q2 = evaluate(["energy", "magnet_torque1", "magnet_torque2"], 0.1, y, parameters, FREQUENCY).T
+        np.testing.assert_allclose(e, energy(y, parameters), rtol=1e-13)
+        work = q1 * y[:, 2] + q2 * y[:, 3]
+    np.testing.assert_allclose((ahead - behind) / (2 * h), power_in - lost + work, rtol=1e-6, atol=1e-6)
 
 
 def test_drawing__magnet_is_where_the_quantities_say(preset):
@@ -134,25 +125,3 @@ def test_slowest_hz__is_a_root_of_the_characteristic_polynomial(preset):
     k = p["g"] * np.diag([p["m1"] * p["e1"] + p["m2"] * p["l1"], p["m2"] * p["e2"]])
     root = brentq(lambda f: np.linalg.det(k - (2 * np.pi * f) ** 2 * b), 0.1, 1.05 * float(slowest_hz(p)))
     assert slowest_hz(p) == pytest.approx(root, rel=1e-9)
-
-
-def test_classify__follows_the_arms_of_the_run(preset):
-    # psi1 right, psi2 left: which side the magnet is on depends on the lengths
-    section = np.array([[[0.3, -0.25, 0.0, 0.0]] * 3])
-    turns, frequency = np.zeros((1, 2)), np.array([2.2])
-    assert classify(section, turns, frequency, preset).tolist() == [Side.RIGHT]
-    long = preset.replace(l2=0.3, h=0.6)
-    assert classify(section, turns, frequency, long).tolist() == [Side.LEFT]
-    # swept lengths: one value per cell
-    both = {**preset.as_dict(), "l2": np.array([0.1788, 0.3])}
-    two = classify(np.repeat(section, 2, axis=0), np.zeros((2, 2)), np.full(2, 2.2), both)
-    assert two.tolist() == [Side.RIGHT, Side.LEFT]
-
-
-def test_classify__words_for_every_case(preset):
-    right, left = [0.3, 0.2, 0, 0], [-0.3, -0.2, 0, 0]
-    section = np.array([[right, right], [left, left], [right, left], [right, right], [right, right]], float)
-    turns = np.array([[0, 0], [0, 0], [0, 0], [1, 0], [0, 0]])
-    frequency = np.array([2.0, 2.0, 2.0, 2.0, 0.5])
-    found = [preset.model.classifier.words[c] for c in classify(section, turns, frequency, preset)]
-    assert found == ["right", "left", "straddling", "rotating", "undecided"]

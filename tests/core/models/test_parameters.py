@@ -56,31 +56,22 @@ def problems_of(**overrides):
 
 def test_load_preset__has_the_values_of_table_1_and_of_the_calibration(preset):
     assert preset.as_dict() == TABLE_1 | CALIBRATED
-
-
-def test_load_preset__overrides_by_name(preset):
     changed = load_preset(q=1.6, l1=0.2, alpha2=-2, mu=np.float32(0.0)).as_dict()
     expected = preset.as_dict() | {"q": 1.6, "l1": 0.2, "alpha2": -2.0, "mu": 0.0}
     assert changed == expected
     assert all(type(v) is float for v in changed.values())
-
-
-def test_load_preset__reports_an_unknown_preset():
-    with pytest.raises(ParameterError, match="did you mean wojna2018"):
-        load_preset("wojna2019")
-    with pytest.raises(ParameterError, match="known presets: wojna2018"):
-        load_preset("zzz")
-
-
-def test_preset_names__lists_what_ships():
-    assert preset_names() == ("wojna2018",)
-
-
-def test_preset_provenance__says_which_values_are_calibrated(preset):
     origin = preset_provenance()
     assert set(origin) == set(preset.names)
     assert {n for n, text in origin.items() if text == "calibrated"} == set(CALIBRATED)
     assert all(origin[n].startswith("paper") for n in TABLE_1)
+
+
+def test_preset_names__list_what_ships_and_an_unknown_one_is_refused():
+    with pytest.raises(ParameterError, match="did you mean wojna2018"):
+        load_preset("wojna2019")
+    with pytest.raises(ParameterError, match="known presets: wojna2018"):
+        load_preset("zzz")
+    assert preset_names() == ("wojna2018",)
 
 
 @pytest.mark.parametrize(
@@ -113,12 +104,15 @@ def test_load_preset__reports_all_problems_at_once():
     assert len(problems) == 7
 
 
-def test_replace__leaves_the_original_alone(preset):
+def test_parameters__are_replaced_and_pickled_whole(preset):
     before = preset.as_dict()
     assert preset.replace(q=0.0)["q"] == 0.0
     assert preset.as_dict() == before
     with pytest.raises(TypeError, match="item assignment"):
         preset["q"] = 0.0
+    again = pickle.loads(pickle.dumps(preset.replace(q=1.7)))
+    assert again == preset.replace(q=1.7)
+    assert again.model is preset.model
 
 
 @pytest.mark.parametrize("h", [0.3528, 0.1])
@@ -138,17 +132,8 @@ def test_pack__has_the_order_of_the_systems(preset, dipoles):
         assert parameters.names == system.parameter_names
         assert dict(zip(parameters.names, packed, strict=True)) == parameters.as_dict()
     assert preset.names[:18] == dipoles.names[:18] == tuple(TABLE_1) + ("q", "eps_drive")
-
-
-def test_model__knows_unit_meaning_and_bound_of_each_parameter(preset):
     parameters = preset.model.parameters
     assert tuple(p.name for p in parameters) == preset.names
     assert all(p.meaning and p.unit and p.bound for p in parameters)
     m1 = preset.model.parameter("m1")
     assert (m1.unit, m1.meaning, m1.bound) == ("kg", "mass of link 1", "greater than 0")
-
-
-def test_parameters__survive_pickling(preset):
-    again = pickle.loads(pickle.dumps(preset.replace(q=1.7)))
-    assert again == preset.replace(q=1.7)
-    assert again.model is preset.model

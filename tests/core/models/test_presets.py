@@ -1,7 +1,5 @@
 """Presets in files: what is written reads back, and what is wrong is said."""
 
-from __future__ import annotations
-
 import tomllib
 
 import pytest
@@ -36,6 +34,13 @@ def test_write_preset__reads_back_to_the_same_numbers_and_phrases(written):
     assert {n: found.provenance[n] for n in FIT} == SOURCES
     assert found.provenance["l1"] == "paper, Table 1"
     assert (found.name, found.title, found.base) == ("rig", "discs of the rig", "wojna2018")
+    for name in ("pendulum", "pendulum-dipole"):
+        model = load_model(name)
+        assert model.load(model.preset(written)) == model.load(written)
+    found = find_preset("rig.toml", written.parent)
+    assert isinstance(found, Preset)
+    assert dict(found.values) == FIT
+    assert find_preset("wojna2018", written.parent) == "wojna2018"
 
 
 @pytest.mark.parametrize("kind", [str, lambda path: path, Preset.read])
@@ -44,17 +49,16 @@ def test_load__takes_a_file_by_its_name_its_path_or_as_read(written, kind):
     assert model.load(kind(written), q=1.6) == model.load("wojna2018", **FIT, q=1.6)
 
 
-def test_load__a_file_serves_all_models_that_share_its_presets(written):
+def test_load__a_file_serves_all_models_that_share_its_presets(written, tmp_path):
     assert load_model("pendulum-sine").load(written)["alpha1"] == FIT["alpha1"]
     assert load_model("pendulum-free").load(written) == load_model("pendulum-free").load()
     (problem,) = problems_of(written, "duffing")
     assert "rig.toml: is of model 'pendulum'" in problem
-
-
-def test_load__takes_what_preset_returned(written):
-    for name in ("pendulum", "pendulum-dipole"):
-        model = load_model(name)
-        assert model.load(model.preset(written)) == model.load(written)
+    model = load_model("duffing")
+    values = model.load().as_dict()
+    path = write_preset(tmp_path / "d.toml", "duffing", values, dict.fromkeys(values, "fit"))
+    assert model.load(path) == model.load()
+    assert "base" not in tomllib.loads(path.read_text())
 
 
 def test_write_preset__takes_over_the_values_and_sources_of_a_base_from_a_file(written, tmp_path):
@@ -71,14 +75,6 @@ def test_write_preset__takes_over_the_values_and_sources_of_a_base_from_a_file(w
     found = model.preset(second)
     assert (found.provenance["c1"], found.provenance["alpha1"]) == ("ruler", SOURCES["alpha1"])
     assert found.base == "wojna2018"
-
-
-def test_write_preset__needs_no_base_if_it_has_every_value(tmp_path):
-    model = load_model("duffing")
-    values = model.load().as_dict()
-    path = write_preset(tmp_path / "d.toml", "duffing", values, dict.fromkeys(values, "fit"))
-    assert model.load(path) == model.load()
-    assert "base" not in tomllib.loads(path.read_text())
 
 
 @pytest.mark.parametrize(
@@ -132,15 +128,5 @@ def test_load__says_all_that_is_wrong_with_a_file_at_once(tmp_path):
         (False, True, False),
         (False, False, True),
     ]
-
-
-def test_load__says_that_a_file_is_not_there(tmp_path):
     (problem,) = problems_of(tmp_path / "absent.toml")
     assert "cannot be read" in problem
-
-
-def test_find_preset__counts_paths_from_the_folder(written):
-    found = find_preset("rig.toml", written.parent)
-    assert isinstance(found, Preset)
-    assert dict(found.values) == FIT
-    assert find_preset("wojna2018", written.parent) == "wojna2018"

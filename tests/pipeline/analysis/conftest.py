@@ -1,12 +1,11 @@
 """One cascade of period doublings for all tests of branches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, explore
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 
 from .cubes import integrated

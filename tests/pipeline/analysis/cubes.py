@@ -1,12 +1,22 @@
 """Cubes of what the engine found, as a run stores them."""
 
-from __future__ import annotations
+import json
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from magpend_core import Status, load_preset, run_branches
+from magpend_core import Status, load_preset
+from magpend_core.models.sectioned import sectioned
+from pipeline.compute.integrate import rest_states
+from pipeline.layout.vocabulary import section_attributes
+from tests.core.cells import run_cells
+from tests.core.flows import flow
 
+ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
+"""Orbits of the preset, the right and the left one at 2.2 Hz first."""
+WELLS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
+"""Section points of x'' = .2 cos t + x - x^3 - .15 x': DynamicalSystemsBase.jl, issue 139, recomputed independently."""
 OWN = {"section": ("period_index", "state"), "turns": ("link",), "status": (), "orbit_period": (), "n_periods": ()}
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 
@@ -18,9 +28,7 @@ def attributes_of(parameters):
 
 def integrated(parameters, frequency_hz, states, **options):
     """Result of `run_branches` for cells at one parameter point."""
-    n, states = len(states), np.asarray(states, float)
-    packed, options = np.tile(parameters.pack(), (n, 1, 1)), {"rtol": 1e-9, "atol": 1e-9, **options}
-    return run_branches(packed, np.full((n, 1), frequency_hz), states, system=parameters.model.system, **options)
+    return run_cells(parameters.model.system, parameters.pack(), frequency_hz, states, **{"rtol": 1e-9, **options})
 
 
 def cube_of(found, states, cells=("initial_condition",), shape=None, **coords):
@@ -31,6 +39,51 @@ def cube_of(found, states, cells=("initial_condition",), shape=None, **coords):
         values = values[:, 0] if np.ndim(found.status) == 2 else values
         data[name] = ((*cells, *dims), values.reshape(*(shape or values.shape[:1]), *values.shape[1:]))
     return xr.Dataset(data, coords={"state": list(states), **coords})
+
+
+def flow_cube(table, states, *, crossing=None, frequency_hz=1.0, n_transient=200, n_keep=20, values=()):
+    """Cells of a flow at one parameter point, by crossings or at even times, as a run stores them."""
+    model = flow(table) if crossing is None else sectioned(flow(table), crossing)
+    parameters = model.load(**dict(values))
+    rate = frequency_hz if crossing is None else crossing.frequency_hz
+    found = integrated(parameters, rate, states, n_transient=n_transient, n_keep=n_keep)
+    ds = cube_of(found, model.state_names)
+    if crossing is None:
+        ds = ds.assign_coords(frequency=float(frequency_hz))
+    else:
+        ds["rest_state"] = (("initial_condition", "state"), rest_states(found)[:, 0])
+    own = {
+        "model": json.dumps(model.reference),
+        "closure_tolerance": 1e-6,
+        "n_transient": n_transient,
+        "n_keep": n_keep,
+    }
+    return ds.assign_attrs({**attributes_of(parameters), **own, **section_attributes(model.crossing)})
+
+
+def sweep(model, starts, *, axes=(), frequency_hz=None, lengths=(200, 8), tolerance=1e-9, closes=0.0, **more):
+    """A sweep as plain data: starts are points or a grid, `lengths` n_transient and n_keep.
+
+    Cells stop once they close within `closes`, if it is given.
+    """
+    grid = starts if isinstance(starts, dict) else {"kind": "list", "points": starts}
+    integration = {"rtol": tolerance, "atol": tolerance, "n_transient": lengths[0], "n_keep": lengths[1]}
+    if closes:
+        integration |= {"stop_when_closed": True, "closure_tolerance": closes}
+    if frequency_hz is not None:
+        more["parameters"] = {"frequency_hz": frequency_hz, **more.get("parameters", {})}
+    spec = {"kind": "sweep", "model": model, "initial_conditions": grid, "integration": integration, **more}
+    return {**spec, "axes": dict(axes)} if axes else spec
+
+
+def line(start, stop, num):
+    """Values of an axis at even distances."""
+    return {"start": start, "stop": stop, "num": num}
+
+
+def artists(figure, gid):
+    """Artists of a figure with an id."""
+    return figure.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)
 
 
 def exponents_cube(rates, *, n_exponents=4, n_blocks=8, **dims):

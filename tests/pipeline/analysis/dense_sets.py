@@ -1,7 +1,5 @@
 """Attractors with their sets on the dim ``attractor``, as a test reads or builds them, and as rows."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.analysis.attractors import attractors

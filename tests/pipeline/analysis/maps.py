@@ -1,8 +1,17 @@
-"""Orbits of the Henon map x' = 1 - 1.4 x^2 + y, y' = .3 x, whose numbers are known."""
+"""Maps whose numbers are known: that of Henon, x' = 1 - 1.4 x^2 + y, y' = .3 x; any map as a parameter point."""
 
 from __future__ import annotations
 
 import numpy as np
+
+from magpend_core.status import Status
+from pipeline.analysis.attractors.extension.extending import Outcome, extend
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Slopes
+from pipeline.analysis.sets import Geometry
+
+N_KEEP = 20
 
 
 def henon(n_cells, n, seed=0, n_transient=200):
@@ -22,3 +31,75 @@ def slopes_of(section):
     slopes[..., 0, 1], slopes[..., 1, 0] = 1.0, 0.3
     slopes[..., 0, 0] = -2.8 * section[..., 0]
     return slopes
+
+
+class MapPoint:
+    """Cells of a map in place of a parameter point."""
+
+    can_rest, is_flow, n_neutral = False, False, 0
+    at_rest = on_cycle = None
+
+    def __init__(self, step, slope, starts, seen=N_KEEP):
+        self.step, self.slope = step, slope
+        self.section = np.empty((len(starts), N_KEEP, starts.shape[1]))
+        state = starts.copy()
+        for i in range(N_KEEP):
+            state = step(state)
+            self.section[:, i] = state
+        self.n_cells, self.n_periods, self.n_states = len(starts), seen * len(starts), starts.shape[1]
+        self.rtols = []
+
+    def blocks(self):
+        n = self.n_cells
+        yield Block(slice(0, n), self.section, np.full(n, Status.BOUNDED), np.zeros(n, int), np.zeros((n, 0)))
+
+    def volumes(self, derivatives, before, after):
+        return np.linalg.slogdet(derivatives)[1]
+
+
+def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0, n_sample=32) -> Outcome:
+    """Drive the extension of a point by its own map."""
+    n_states = point.section.shape[2]
+    geometry = Geometry((False,) * n_states, (scale,) * n_states)
+    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry)
+    work = extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, n_sample)
+    answer = None
+    while True:
+        try:
+            asked = work.send(answer)
+        except StopIteration as stop:
+            return stop.value
+        if isinstance(asked, Leg):
+            section, state = np.empty((len(asked.state), LEG, n_states)), asked.state.copy()
+            for i in range(LEG):
+                state = point.step(state)
+                section[:, i] = state
+            n = len(state)
+            status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
+            none = np.zeros(n, int)
+            answer = Block(
+                slice(0, n), section, status, none, np.zeros((n, 0), int), seconds=np.ones((n, LEG)), step=np.zeros(n)
+            )
+        elif isinstance(asked, Slopes):
+            point.rtols.append(asked.rtol)
+            answer = point.step(asked.point), point.slope(asked.point)
+        else:
+            assert isinstance(asked, Polish)
+            answer = [None] * len(asked.guesses.key)
+
+
+def tent(slope):
+    """Tent map on [0, 1]; what leaves through the top is drawn to 2."""
+
+    def step(x):
+        inside = slope * np.minimum(x, 1.0 - x)
+        return np.where(x <= 1.0, inside, 2.0 + 0.5 * (x - 2.0))
+
+    def derivative(x):
+        return np.where(x < 0.5, slope, -slope)[:, :, None]
+
+    return step, derivative
+
+
+FIXED = Orbit(np.array([[2.0]]), np.array([0.5 + 0j]), 1e-12, np.array([[0.5]]))
+"""Where what leaves a tent map ends."""

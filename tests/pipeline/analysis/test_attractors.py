@@ -1,22 +1,16 @@
 """Attractors of the pendulum and of a driven pendulum whose orbits rotate, through the engine."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from magpend_core import load_preset, sections
+from magpend_core import energy, load_preset, sections, trajectory
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from pipeline.layout.vocabulary import ATTRACTS, EXTENDED, PERIODIC_ORBIT
 from tests.pipeline.analysis.dense_sets import identify, match
 
-from .cubes import STATES, attributes_of, cube_of, integrated
+from .cubes import ORBITS, STATES, attributes_of, cube_of, integrated
 
-ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
 FREQUENCY = 2.2
 
 
@@ -76,11 +70,6 @@ def test_identify__features_of_the_reference_orbits(found):
     assert (found["energy_max"] > found["energy_min"]).values[[right, left]].all()
     modulus = max(np.hypot(*m) for m in ORBITS[0]["multipliers"])
     assert found["lyapunov_max"].values[right] == pytest.approx(np.log(modulus) * FREQUENCY, rel=1e-5)
-
-
-def test_identify__ranges_are_those_of_the_motion(found):
-    from magpend_core import energy, trajectory
-
     right = row_of(found, ORBITS[0]["section"])
     times = np.linspace(0, 1 / FREQUENCY, 777)
     states = trajectory(load_preset(), FREQUENCY, np.array(ORBITS[0]["section"]), times)
@@ -102,6 +91,9 @@ def test_identify__every_cell_where_it_belongs(cube, found):
         assert set(ids[near]) == {row_of(found, orbit["section"])}
     assert found["n_cells"].values.tolist() == np.bincount(ids).tolist()
     assert found["share"].values == pytest.approx(np.bincount(ids) / 64)
+    named = match(found)
+    assert same(found, named)
+    assert named.attrs["matched"] == 1
 
 
 @pytest.mark.slow
@@ -151,12 +143,6 @@ def test_identify__parameters_from_the_run_and_its_axes(cube, found):
         identify(cube)
     with pytest.raises(ValueError, match="orbit_period"):
         identify(cube.drop_vars("orbit_period"))
-
-
-def test_match__one_point(found):
-    named = match(found)
-    assert same(found, named)
-    assert named.attrs["matched"] == 1
 
 
 # ---- a driven pendulum: th'' = -th'/2 - sin(th) + g cos(2 t/3) ---------------------------------

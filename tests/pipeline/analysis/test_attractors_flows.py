@@ -1,45 +1,18 @@
 """Attractors of flows: limit cycles and equilibria at crossings and at even times."""
 
-from __future__ import annotations
-
-import json
-
 import numpy as np
 import pytest
 
 from magpend_core.crossing import Crossing
-from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.attractors.table import attractors_table
-from pipeline.compute.integrate import rest_states
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
-from tests.core.flows import BAUTIN, HOPF, flow
+from tests.core.flows import BAUTIN, HOPF, table
 from tests.pipeline.analysis.dense_sets import identify
 
-from .cubes import attributes_of, cube_of, integrated
+from .cubes import flow_cube, sweep
 
 GRID = [[x, y] for x in np.linspace(-1.2, 1.2, 7) for y in np.linspace(-1.1, 1.1, 7)]
-
-
-def cube(table, states, *, crossing=None, frequency_hz=1.0, n_transient=200, n_keep=20, **values):
-    """Cells of one parameter point, as a run stores them."""
-    model = flow(table)
-    model = model if crossing is None else sectioned(model, crossing)
-    parameters = model.load(**values)
-    rate = frequency_hz if crossing is None else crossing.frequency_hz
-    found = integrated(parameters, rate, states, n_transient=n_transient, n_keep=n_keep)
-    ds = cube_of(found, model.state_names)
-    if crossing is None:
-        ds = ds.assign_coords(frequency=float(frequency_hz))
-    else:
-        ds["rest_state"] = (("initial_condition", "state"), rest_states(found)[:, 0])
-    attrs = {
-        **attributes_of(parameters),
-        "model": json.dumps(model.reference),
-        "closure_tolerance": 1e-6,
-        **section_attributes(model.crossing),
-    }
-    return ds.assign_attrs(attrs)
 
 
 def kinds(found):
@@ -53,7 +26,7 @@ def test_identify__cycle_beside_equilibrium(value):
 
     With s the squared radius, s' = 2 s (mu + s - s**2): the boundary is s = (1 - sqrt(1 + 4 mu))/2.
     """
-    ds = cube(BAUTIN, GRID, crossing=Crossing("y", value, longest=20.0), mu=-0.1)
+    ds = flow_cube(BAUTIN, GRID, crossing=Crossing("y", value, longest=20.0), values={"mu": -0.1})
     found = identify(ds)
     assert sorted(kinds(found)) == [EQUILIBRIUM, PERIODIC_ORBIT]
     rest, orbit = kinds(found).index(EQUILIBRIUM), kinds(found).index(PERIODIC_ORBIT)
@@ -76,7 +49,7 @@ def test_identify__cycle_beside_equilibrium(value):
 @pytest.mark.parametrize("frequency_hz", [1.0 / np.pi, 2.0 / np.pi, 0.41])
 def test_identify__strobed_cycle_is_one(frequency_hz):
     """A strobe of the cycle's period, of half of it and of another one: one limit cycle, not one per cell."""
-    found = identify(cube(HOPF, GRID, frequency_hz=frequency_hz))
+    found = identify(flow_cube(HOPF, GRID, frequency_hz=frequency_hz))
     assert sorted(kinds(found)) == [EQUILIBRIUM, PERIODIC_ORBIT]
     orbit = kinds(found).index(PERIODIC_ORBIT)
     assert int(found["n_cells"][orbit]) == len(GRID) - 1
@@ -88,7 +61,7 @@ def test_identify__strobed_cycle_is_one(frequency_hz):
 
 def test_identify__order_of_cells():
     """It does not matter which cell comes first."""
-    ds = cube(BAUTIN, GRID, crossing=Crossing("y", 0.0, longest=20.0), mu=-0.1)
+    ds = flow_cube(BAUTIN, GRID, crossing=Crossing("y", 0.0, longest=20.0), values={"mu": -0.1})
     order = np.random.default_rng(1).permutation(len(GRID))
     one, other = identify(ds), identify(ds.isel(initial_condition=order))
     np.testing.assert_array_equal(one["attractor_id"].values[order], other["attractor_id"].values)
@@ -97,19 +70,9 @@ def test_identify__order_of_cells():
 
 @pytest.mark.slow
 def test_attractors_table__names_the_angle_by_which_cells_ran_away(computed):
-    spec = """
-    kind = "sweep"
-    [model]
-    name = "turning"
-    states = { th = { escape = 1e3 }, w = "rad/s" }
-    parameters = { torque = 1.5 }
-    equations = { th = "w", w = "torque - 0.2*w - sin(th)" }
-    [parameters]
-    frequency_hz = 1.0
-    [initial_conditions]
-    kind = "list"
-    points = [[0.0, 0.0]]
-    """
+    rates = {"th": "w", "w": "torque - 0.2*w - sin(th)"}
+    turning = table("turning", rates, {"torque": 1.5}, states={"th": {"escape": 1e3}})
+    spec = sweep(turning, [[0.0, 0.0]], frequency_hz=1.0)
     lines = attractors_table(derive(computed(spec), "attractors")).lines
     assert sum("th = { on_circle = true }" in line for line in lines) == 1
 
@@ -119,25 +82,12 @@ def test_attractors_table__prints_the_largest_and_counts_the_others(computed):
     """x' = sin x rests at odd multiples of pi; 35 of them have one start each, the last has ten."""
     rests = [(2 * k + 1) * np.pi for k in range(35)]
     starts = [*(x + 0.5 for x in rests), *(rests[-1] - 0.1 * k for k in range(1, 10))]
-    spec = f"""
-    kind = "sweep"
-    [model]
-    name = "staircase"
-    states = {{ x = {{ escape = 1e3 }} }}
-    equations = {{ x = "sin(x)" }}
-    [parameters]
-    frequency_hz = 1.0
-    [initial_conditions]
-    kind = "list"
-    points = {[[x] for x in starts]}
-    [integration]
-    n_transient = 60
-    n_keep = 16
-    """
-    table = attractors_table(derive(computed(spec), "attractors"))
-    assert sorted(row["section_x"] for row in table.rows) == pytest.approx(rests, abs=1e-8)
-    printed = [line for line in table.lines if "equilibrium  attracts" in line]
+    staircase = table("staircase", {"x": "sin(x)"}, states={"x": {"escape": 1e3}})
+    spec = sweep(staircase, [[x] for x in starts], frequency_hz=1.0, lengths=(60, 16))
+    found = attractors_table(derive(computed(spec), "attractors"))
+    assert sorted(row["section_x"] for row in found.rows) == pytest.approx(rests, abs=1e-8)
+    printed = [line for line in found.lines if "equilibrium  attracts" in line]
     assert len(printed) == 30
     assert sum("0.2273" in line for line in printed) == 1  # ten of 44 cells, though its id is the last
-    (others,) = [line for line in table.lines if "smaller ones" in line]
+    (others,) = [line for line in found.lines if "smaller ones" in line]
     assert others.strip() == "and 5 smaller ones: 5 equilibrium; all are in --csv and --json"

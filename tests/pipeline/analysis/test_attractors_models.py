@@ -1,20 +1,18 @@
 """Attractors of another model: two states, no angles, no words for its motions, other units."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from magpend_core import load_model, sections
-from pipeline.analysis.attractors.describing.portraits import portraits
-from pipeline.analysis.attractors.settling_table import settling_table
-from pipeline.analysis.attractors.table import attractors_table
-from pipeline.analysis.basins.basins import basins
-from pipeline.analysis.chaos.chaos import chaos
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.attractors.portraits import portraits
+from pipeline.analysis.attractors.settling import settling_table
+from pipeline.analysis.basins.analysis import basins_of
+from pipeline.analysis.chaos.analysis import chaos_of
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET
 from tests.pipeline.analysis.dense_sets import identify, match, rows_of
 
-from .cubes import attributes_of, cube_of
+from .cubes import WELLS, attributes_of, cube_of
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.0 / (2.0 * np.pi)
@@ -60,24 +58,6 @@ def test_identify__chaos_without_angles(chaotic, strange):
     text = "\n".join(attractors_table(rows_of(match(strange))).lines)
     assert "rotation" not in text
     assert "side" not in text
-
-
-def test_identify__two_published_orbits(two):
-    """Section points and multipliers, DynamicalSystemsBase.jl, issue 139; recomputed independently."""
-    found = identify(two)
-    assert found["orbit_period"].values.tolist() == [1, 1]
-    points = found["attractor_points"].values[:, 0]
-    assert points == pytest.approx(np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]]), abs=1e-9)
-    multipliers = found["multiplier_real"].values + 1j * np.abs(found["multiplier_imag"].values)
-    assert multipliers == pytest.approx(np.full((2, 2), -0.226806 + 0.581567j), abs=1e-6)
-    assert found["mirror_partner"].values.tolist() == [1, 0]
-    assert found["mirror_distance"].values.max() < 1e-7
-    assert found["lyapunov_max"].values == pytest.approx(np.log(0.624230) * FREQUENCY, rel=1e-5)
-    fractions = basins(two, rows_of(found))["fraction"].values
-    assert fractions.sum() == pytest.approx(1.0)
-
-
-def test_identify__a_strange_attractor_stays(strange):
     assert strange["stability"].values.tolist() == [ATTRACTS]
     assert strange["n_left"].values.tolist() == [0]
     # the sample stayed for ten times the 300 periods that the cube tells of
@@ -88,15 +68,27 @@ def test_identify__a_strange_attractor_stays(strange):
     assert "chaotic set  attracts" in table.lines[2]
 
 
+def test_identify__two_published_orbits(two):
+    """Section points and multipliers, DynamicalSystemsBase.jl, issue 139; recomputed independently."""
+    found = identify(two)
+    assert found["orbit_period"].values.tolist() == [1, 1]
+    points = found["attractor_points"].values[:, 0]
+    assert points == pytest.approx(WELLS, abs=1e-9)
+    multipliers = found["multiplier_real"].values + 1j * np.abs(found["multiplier_imag"].values)
+    assert multipliers == pytest.approx(np.full((2, 2), -0.226806 + 0.581567j), abs=1e-6)
+    assert found["mirror_partner"].values.tolist() == [1, 0]
+    assert found["mirror_distance"].values.max() < 1e-7
+    assert found["lyapunov_max"].values == pytest.approx(np.log(0.624230) * FREQUENCY, rel=1e-5)
+    fractions = basins_of(two, rows_of(found))["fraction"].values
+    assert fractions.sum() == pytest.approx(1.0)
+
+
 def test_chaos__by_the_zero_one_test(chaotic, strange):
-    found = chaos(chaotic, rows_of(strange))
+    found = chaos_of(chaotic, rows_of(strange))
     assert found["nature"].attrs["flag_meanings"].split()[found["nature"].item()] == "chaotic"
     assert found["median_zero_one"].item() > 0.95
     # 1.37 from 1e4 points
     assert found["attractor_correlation"].item() == pytest.approx(1.35, abs=0.15)
-
-
-def test_portraits__of_a_model_without_a_drawing(strange):
     found = portraits(strange, n_periods=2, n_samples=16)
     assert found["orbit"].shape == (1, 33, 2)
     assert "points" not in found

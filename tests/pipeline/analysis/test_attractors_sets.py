@@ -1,7 +1,5 @@
 """Distances on circles, boxes, and when a cell counts as on its way to an orbit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -22,6 +20,8 @@ def test_distance__circle_and_scales():
     assert GEOMETRY.distance(a, b) == pytest.approx(0.2)
     assert GEOMETRY.distance(a, b + [0, 0, 0, 30]) == pytest.approx(3.0)
     assert nearest_distances(a[None], b[None], GEOMETRY) == pytest.approx([0.2])
+    few, many = np.zeros((1, 2)), np.array([[0.0, 0.0], [0.0, 4.0]])
+    assert mean_distance(few, many, PLANE) == mean_distance(many, few, PLANE) == pytest.approx(0.2)
 
 
 def test_tree__any_number_of_turns():
@@ -31,11 +31,6 @@ def test_tree__any_number_of_turns():
     assert (scaled[:, 0] < 2 * np.pi).all()
     distance, _ = PLANE.tree(points).query(PLANE.scaled(points + [2 * np.pi, 0.0]), p=np.inf)
     assert distance == pytest.approx(0, abs=1e-12)
-
-
-def test_mean_distance__the_larger_way():
-    few, many = np.zeros((1, 2)), np.array([[0.0, 0.0], [0.0, 4.0]])
-    assert mean_distance(few, many, PLANE) == mean_distance(many, few, PLANE) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("side", [0.1, 1e-4, 0.7])
@@ -60,9 +55,6 @@ def test_hashes__of_the_row_alone():
 def test_groups__connected():
     assert groups(5, np.array([[0, 3], [3, 4]])).tolist() == [0, 1, 2, 0, 0]
     assert len(set(groups(3, np.zeros((0, 2), int)))) == 3
-
-
-def test_raw_orbit__the_same_from_any_phase():
     points = np.array([[0.3, 1.0], [-0.2, 0.0], [0.1, 3.0]])
     for shift in range(3):
         found = raw_orbit(np.roll(points, shift, axis=0), PLANE)
@@ -103,26 +95,17 @@ def decision_of(*sections, status=2, period=0, orbit=None):
     return decision.tolist()
 
 
-def test_decide__spirals():
+def test_decide__of_spirals_neighbours_and_closed_cells():
     """The bounds are half and twice of 1 - 0.95."""
     cells = [spiral(0.2), spiral(0.2, 0.02), spiral(0.2, 0.04), spiral(0.2, 0.05), spiral(0.2, -0.2)]
     assert decision_of(*cells) == [CERTAIN, CERTAIN, APPROACHING, UNDECIDED, UNDECIDED]
-
-
-def test_decide__what_is_near_but_stays_is_not_on_the_orbit():
-    """Another orbit at a distance of 0.1, and one beyond the reach."""
+    # Another orbit at a distance of 0.1, and one beyond the reach
     other = np.tile([np.pi - 0.1, 2.0], (32, 1))
     assert decision_of(other) == [UNDECIDED]
     assert decision_of(other, status=1, period=1) == [UNDECIDED]
     assert decision_of(spiral(3.0)) == [UNDECIDED]
-
-
-def test_decide__closed_within_the_tolerance():
     on, off = (np.tile([np.pi + d - 2 * np.pi, 2.0], (32, 1)) for d in (5e-5, 2e-4))
     assert decision_of(on, off, status=1, period=1) == [CLOSED, UNDECIDED]
-
-
-def test_decide__never_on_an_unstable_orbit():
     orbit = stable_orbit()
     unstable = Orbit(orbit.points, orbit.multipliers / SHRINK * 1.01, 1e-12, orbit.derivative)
     assert decision_of(spiral(0.2), orbit=unstable) == [UNDECIDED]

@@ -1,18 +1,17 @@
 """Attractors built by hand: which cells belong together, ids along an axis, hysteresis."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
 
 from pipeline.analysis.attractors.finding.points import PASSING
-from pipeline.analysis.attractors.matching.hysteresis import hysteresis
+from pipeline.analysis.attractors.hysteresis import find_hysteresis
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.products.reporting import reporting
 from tests.pipeline.analysis.dense_sets import identify, match
 
-STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+from .cubes import STATES
+
 K = 64
 PERIODIC, BOUNDED = 1, 2
 
@@ -89,9 +88,6 @@ def test_identify__known_labels():
     failed = np.array(truth) == -1
     assert set(found["status"].values[failed]) == {3, 4, 5, 6}
     assert not found["decision"].values[failed].any()
-
-
-def test_identify__inferred_cells_are_their_orbits():
     rng = np.random.default_rng(0)
     computed = [on(A, noise=1e-7, rng=rng), on(B, noise=1e-7, rng=rng)]
     inferred = [(section.copy(), 7, period, turns) for section, _, period, turns in computed]
@@ -147,9 +143,6 @@ def test_identify__many_cells_few_anchors():
     cells += [(cloud([2, 2, 0, 0], rng), BOUNDED, 0, (0, 0)) for _ in range(2)]
     found = identify(cube(cells), polish=False, n_sample=20)
     assert sorted(found["n_cells"].values.tolist()) == [2, 200]
-
-
-def test_identify__orbits_nearer_than_the_tolerance_are_one():
     rng = np.random.default_rng(4)
     near = np.array(A) + [[3e-3, 0, 0, 0]]
     cells = [on(A, noise=1e-7, rng=rng) for _ in range(4)] + [on(near, noise=1e-7, rng=rng) for _ in range(4)]
@@ -203,6 +196,10 @@ def test_match__ids_follow_through_gap_crossing_birth_and_death():
     assert named["orbit_period"].values[0].tolist() == [1, 2, 0]
     assert named["n_cells"].values[4].tolist() == [0, 6, 12]
     assert np.isnan(named["attractor_points"].values[4, 0]).all()
+    order = np.random.default_rng(8).permutation(30)
+    shuffled = match(identify(sweep(order=order)[0], polish=False))
+    assert np.array_equal(shuffled["attractor_id"].values, ids[:, order])
+    assert np.array_equal(shuffled["attractor_points"].values, named["attractor_points"].values, equal_nan=True)
 
 
 @pytest.mark.slow
@@ -218,14 +215,6 @@ def test_match__options_decide_what_follows():
         match(found, threshold=0.0)
     with pytest.raises(ValueError, match="look_back"):
         match(found, look_back=0)
-
-
-@pytest.mark.slow
-def test_match__does_not_depend_on_the_order_of_the_cells():
-    order = np.random.default_rng(8).permutation(30)
-    plain, shuffled = (match(identify(sweep(order=o)[0], polish=False)) for o in (None, order))
-    assert np.array_equal(shuffled["attractor_id"].values, plain["attractor_id"].values[:, order])
-    assert np.array_equal(shuffled["attractor_points"].values, plain["attractor_points"].values, equal_nan=True)
 
 
 def rows(*points, rotation=None):
@@ -260,21 +249,21 @@ def test_match__assigns_all_at_once():
     # each alone may stay without a partner rather than take another's: 0.0 died, 0.45 was born
     named = match(rows([0.0, 0.25], [0.2, 0.45]), threshold=0.3)
     assert named["attractor_id"].values.tolist() == [[0, 1], [1, 2]]
-
-
-def test_match__mirror_partners_are_renamed():
     named = match(rows([0.0, 1.0], [0.02, 0.98], [-3.0, 1.0]), threshold=0.3)
     assert named["attractor_id"].values.tolist() == [[0, 1], [0, 1], [2, 1]]
     assert named["mirror_partner"].values.tolist() == [[1, 0, -1], [1, 0, -1], [-1, 2, 1]]
+    one = rows([0.0, 1.0], [0.05, 0.95])
+    two = xr.concat([one, one.isel(attractor=slice(None, None, -1))], "q").assign_coords(q=[1.0, 2.0])
+    two = two.transpose("q", "frequency", ...)
+    named = match(two)
+    points = named["attractor_points"].values[..., 0, 0]
+    assert points.tolist() == [[[0.0, 1.0], [0.05, 0.95]]] * 2
 
 
-def test_match__rotation_tells_apart():
+def test_match__rotation_and_side_tell_apart():
     ds = rows([0.0], [0.0], rotation=[[[0, 0]], [[0, 1]]])
     assert match(ds)["attractor_id"].values.tolist() == [[0], [1]]
-
-
-def test_match__side_tells_apart():
-    """Left never takes the id of right; what is not known of a motion says nothing."""
+    # Left never takes the id of right; what is not known of a motion says nothing
     ds = rows([0.0], [0.0])
     dims = ("frequency", "attractor")
     assert match(ds.assign(side=(dims, [[1], [2]])))["attractor_id"].values.tolist() == [[0], [1]]
@@ -282,15 +271,6 @@ def test_match__side_tells_apart():
     assert unknown["attractor_id"].values.tolist() == [[0], [0]]
     words = unknown["match_basis"].attrs["flag_meanings"].split()
     assert [words[b] for b in unknown["match_basis"].values[:, 0]] == ["first_appearance", "distance"]
-
-
-def test_match__two_axes():
-    one = rows([0.0, 1.0], [0.05, 0.95])
-    two = xr.concat([one, one.isel(attractor=slice(None, None, -1))], "q").assign_coords(q=[1.0, 2.0])
-    two = two.transpose("q", "frequency", ...)
-    named = match(two)
-    points = named["attractor_points"].values[..., 0, 0]
-    assert points.tolist() == [[[0.0, 1.0], [0.05, 0.95]]] * 2
 
 
 # ---- hysteresis --------------------------------------------------------------------------------
@@ -312,7 +292,7 @@ def test_hysteresis__loop_and_jumps():
         {**{name: (dims, v) for name, v in states.items()}, "stability": (("frequency", "attractor"), shown)},
         {**coords, "attractor": [0, 1]},
     )
-    table = hysteresis(ds, ids)
+    table = find_hysteresis(ds, ids)
     assert table["differs"].values.tolist() == [False, False, True, True, True, False]
     assert table["loop_from"].values.tolist() == [2.2]
     assert table["loop_to"].values.tolist() == [2.4]
@@ -328,10 +308,10 @@ def test_hysteresis__loop_and_jumps():
     )
     assert jumps == {(1, 2.4, 2.5, 0, 1, 2), (-1, 2.2, 2.1, 1, 0, 1), (-1, 2.2, 2.0, 1, 0, 1)}
     with pytest.raises(ValueError, match="both"):
-        hysteresis(ds.isel(branch=[0, 1]), ids.isel(branch=[0, 1]))
+        find_hysteresis(ds.isel(branch=[0, 1]), ids.isel(branch=[0, 1]))
     # what is not shown to attract makes no loop
     ids["stability"][:, 0] = NOT_SETTLED
-    assert not hysteresis(ds, ids)["differs"].any()
+    assert not find_hysteresis(ds, ids)["differs"].any()
 
 
 @pytest.mark.parametrize(
@@ -352,14 +332,8 @@ def test_match__unlike_things_have_different_ids_however_near(periods, width, sa
     points[1, 0, :, :2] = np.repeat(centres, 4, axis=0)
     points[1, 0, ::4, 0] += width  # a quarter of the points
     points[..., 2:] = np.where(np.isfinite(points[..., :1]), 0.0, np.nan)
-    ds = xr.Dataset(
-        {
-            "attractor_points": (("frequency", "attractor", "point", "state"), points),
-            "rotation": (("frequency", "attractor", "link"), np.zeros((2, 1, 2))),
-            "kind": (("frequency", "attractor"), [[PERIODIC_ORBIT if p else BOUNDED_SET] for p in periods]),
-            "orbit_period": (("frequency", "attractor"), np.array(periods)[:, None]),
-            "attractor_id": (("frequency", "initial_condition"), np.zeros((2, 1), np.int32)),
-        },
-        coords={"frequency": [2.0, 2.1]},
-    )
+    ds, dims = rows([0.0], [0.0]).drop_vars("attractor_points"), ("frequency", "attractor")
+    kinds = [[PERIODIC_ORBIT if p else BOUNDED_SET] for p in periods]
+    ds = ds.assign(kind=(dims, kinds), orbit_period=(dims, np.array(periods)[:, None]))
+    ds["attractor_points"] = ((*dims, "point", "state"), points)
     assert match(ds).sizes["attractor"] == (1 if same else 2)

@@ -1,13 +1,10 @@
 """Draws of the parameters carried through the branches of a run, on an oscillator with closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.branches.bands import GRID, orbit_data, place_variables
-from pipeline.analysis.branches.bands_product import bands_table
+from pipeline.analysis.branches.bands import GRID, bands_table, orbit_data, place_variables
 from pipeline.analysis.branches.carrying import Along
 from pipeline.analysis.draws import LEVELS, stretches
 from pipeline.runs.derive import derive, stored
@@ -47,9 +44,6 @@ def test_bands__bifurcations_are_those_of_the_closed_form(bench):
     np.testing.assert_allclose([row["low"], row["median"], row["high"]], np.quantile(fold, LEVELS), atol=1e-6)
     assert (row["n_draws"], row["share"]) == (60, 1.0)
     assert row["value"] == pytest.approx(0.05 - 1 / 4.8, abs=1e-7)
-
-
-def test_bands__quantiles_of_orbits_are_those_of_the_closed_form(bench):
     _, _, g, h, found = bench
     assert found.sizes["orbit"] > GRID
     is_stable = found["is_stable"].values
@@ -90,12 +84,23 @@ def test_orbit_data__a_branch_that_turns_back_is_cut_there():
 @pytest.mark.slow
 def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
     folder, directory, g, h, found = bench
+    with pytest.raises(SpecError, match=r"has no posterior.nc"):
+        derive(directory, "bands", {"posterior": str(tmp_path)})
     xr.testing.assert_equal(stored(directory, "bands"), found)
     write_draws(tmp_path / "posterior.nc", g[:10], h[:10])
     other = derive(directory, "bands", {"posterior": str(tmp_path)})
     np.testing.assert_array_equal(other["bifurcation_value"], found["bifurcation_value"][:10])
     some = derive(directory, "bands", {"posterior": str(folder / "fit"), "draws": 10})
     np.testing.assert_array_equal(other["bifurcation_value"], some["bifurcation_value"])
+    folder, directory, *_ = bench
+    along = {"parameter": "g", "low": 1.0, "high": 1.4}
+    with pytest.raises(SpecError, match=r"g was identified, and the branches run along it"):
+        derive(directory, "bands", {"posterior": str(folder / "fit"), **along})
+    with xr.open_dataset(folder / "fit" / "posterior.nc", engine="scipy") as ds:
+        draws = ds.load()
+    draws.assign_coords(parameter=["a", "b", "c", "d"]).to_netcdf(tmp_path / "other.nc", engine="scipy")
+    with pytest.raises(SpecError, match=r"has the parameters a, b, c, d: another model's"):
+        derive(directory, "bands", {"posterior": str(tmp_path / "other.nc")})
 
 
 @pytest.mark.slow
@@ -110,17 +115,3 @@ def test_figure__shades_the_bands_and_draws_the_intervals(bench, name):
     assert any(np.allclose(bar, np.quantile(h - 1 / (4 * g), [0.025, 0.975]), atol=1e-6) for bar in bars)
     assert "section_level_bands" in drawn.data
     assert "95 % of the orbits" in [t.get_text() for legend in drawn.legends for t in legend.get_texts()]
-
-
-def test_bands__names_the_problem(bench, tmp_path):
-    folder, directory, *_ = bench
-    with pytest.raises(SpecError, match=r"has no posterior.nc"):
-        derive(directory, "bands", {"posterior": str(tmp_path)})
-    along = {"parameter": "g", "low": 1.0, "high": 1.4}
-    with pytest.raises(SpecError, match=r"g was identified, and the branches run along it"):
-        derive(directory, "bands", {"posterior": str(folder / "fit"), **along})
-    with xr.open_dataset(folder / "fit" / "posterior.nc", engine="scipy") as ds:
-        draws = ds.load()
-    draws.assign_coords(parameter=["a", "b", "c", "d"]).to_netcdf(tmp_path / "other.nc", engine="scipy")
-    with pytest.raises(SpecError, match=r"has the parameters a, b, c, d: another model's"):
-        derive(directory, "bands", {"posterior": str(tmp_path / "other.nc")})

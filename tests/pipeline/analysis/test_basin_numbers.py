@@ -1,16 +1,15 @@
 """Numbers on basins against values known on paper, published values, and simulated truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
 from scipy import stats
 from scipy.spatial.distance import cdist
 
+from pipeline.analysis.basins.labels import read_labels
 from pipeline.analysis.basins.numbers import (
     basin_entropy,
-    basin_fractions,
+    basin_rows,
     binomial_interval,
     uncertainty_exponent,
     wada_merge_test,
@@ -62,23 +61,32 @@ def cantor_basins(levels=8):
 # --- fractions -------------------------------------------------------------------------------------------
 
 
-def test_basin_fractions__counts():
-    ds = basin_fractions([[1, 2, 2], [-3, 2, -1]])
-    assert ds["label"].values.tolist() == [-3, 1, 2]
+def fractions(labels, dims=(), inferred=None, method="wilson"):
+    """Basin fractions of labels, whose first dims are the parameters."""
+    labels = xr.DataArray(labels)
+    inferred = xr.zeros_like(labels, bool) if inferred is None else inferred
+    return basin_rows(labels, dims, inferred, 0.95, method)
+
+
+def test_basin_rows__counts():
+    ds = fractions([[1, 2, 2], [-3, 2, -1]])
+    assert ds["attractor"].values.tolist() == [-3, 1, 2]
     assert ds["count"].values.tolist() == [1, 1, 3]
     np.testing.assert_allclose(ds["fraction"], [0.2, 0.2, 0.6])
     assert (ds["n_cells"].item(), ds["n_unfinished"].item()) == (6, 1)
     assert ds["fraction_unfinished"].item() == pytest.approx(1 / 6)
     np.testing.assert_allclose(ds["fraction_if_none"], [1 / 6, 1 / 6, 3 / 6])
     np.testing.assert_allclose(ds["fraction_if_all"], [2 / 6, 2 / 6, 4 / 6])
-    assert basin_fractions([0, -1], unfinished=())["label"].values.tolist() == [-1, 0]
+    bound = fractions(np.zeros(1000, dtype=int))["unseen_high"].item()
+    assert (1 - bound) ** 1000 == pytest.approx(0.05)
+    assert bound == pytest.approx(3 / 1000, rel=0.01)
+    half = fractions(np.repeat([0, -1], 500))
+    assert half["unseen_high"].item() == pytest.approx(3 / 500, rel=0.01)
+    # all 500 unfinished cells may have gone to one that was not seen
+    assert 0.5 < half["unseen_high_if_all"].item() < 0.53
 
 
-@pytest.mark.parametrize(
-    ("method", "expected"),
-    # scipy.stats.binomtest(k, 20).proportion_ci; "exact" is Clopper and Pearson's
-    [("wilson", "wilson"), ("clopper-pearson", "exact")],
-)
+@pytest.mark.parametrize(("method", "expected"), [("wilson", "wilson"), ("clopper-pearson", "exact")])
 def test_binomial_interval__agrees_with_scipy(method, expected):
     for k in range(21):
         reference = stats.binomtest(k, 20).proportion_ci(0.9, method=expected)
@@ -86,79 +94,64 @@ def test_binomial_interval__agrees_with_scipy(method, expected):
         np.testing.assert_allclose([low, high], [reference.low, reference.high], atol=1e-12)
 
 
-def test_basin_fractions__rule_of_three():
-    ds = basin_fractions(np.zeros(1000, dtype=int))
-    bound = ds["unseen_high"].item()
-    assert (1 - bound) ** 1000 == pytest.approx(0.05)
-    assert bound == pytest.approx(3 / 1000, rel=0.01)
-    half = basin_fractions(np.repeat([0, -1], 500))
-    assert half["unseen_high"].item() == pytest.approx(3 / 500, rel=0.01)
-    # all 500 unfinished cells may have gone to one that was not seen
-    assert 0.5 < half["unseen_high_if_all"].item() < 0.53
+def rows_of(ds, outcome):
+    """Rows of an outcome, and the parameter points that have none."""
+    points = np.repeat(np.arange(ds["n_sets"].size), ds["n_sets"].values)
+    own = ds["attractor"].values == outcome
+    return ds.isel(set=own), np.setdiff1d(np.arange(ds["n_sets"].size), points[own])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_basin_fractions__simulated_coverage(method):
+def test_basin_rows__simulated_coverage(method):
     # starts in [-1.04, 2]; basins (-1, 1), (1, 2], [-1.04, -1) on paper
     rng = np.random.default_rng(7)
-    starts = rng.uniform(-1.04, 2.0, (2000, 150))
-    truth = np.array([2.0, 1.0, 0.04]) / 3.04
-    ds = basin_fractions(xr.DataArray(cubic_map(starts), dims=("run", "start")), dims=["start"], method=method)
-    assert ds["fraction"].dims == ("run", "label")
-    assert ds["fraction"].mean("run").values == pytest.approx(truth, abs=0.003)
-    rate = ((ds["low"] <= truth) & (truth <= ds["high"])).mean("run").values
-    # one standard error of a rate is 0.005; Wilson's rate swings about the level with p and n
-    assert np.all(rate > (0.92 if method == "wilson" else 0.94))
-    assert np.all(rate[:2] < 0.975)
-    # a sixth of the runs do not see the rarest basin at all, and still do not call it absent
-    assert (ds["count"].sel(label=2) == 0).mean() > 0.1
-    assert (ds["high"].sel(label=2) > truth[2]).mean() > 0.94
+    labels = cubic_map(rng.uniform(-1.04, 2.0, (2000, 150)))
+    ds = fractions(xr.DataArray(labels, dims=("run", "start")), ["run"], method=method)
+    for outcome, truth in enumerate(np.array([2.0, 1.0, 0.04]) / 3.04):
+        own, absent = rows_of(ds, outcome)
+        assert float(own["fraction"].sum()) / 2000 == pytest.approx(truth, abs=0.003)
+        # where no cell shows an outcome, the bound for one that was not seen holds
+        bounded = ds["unseen_high"].values[absent] >= truth
+        rate = (((own["low"] <= truth) & (truth <= own["high"])).sum().item() + bounded.sum()) / 2000
+        # one standard error of a rate is 0.005; Wilson's rate swings about the level with p and n
+        assert rate > (0.92 if method == "wilson" else 0.94)
+        assert rate < 0.975 or outcome == 2
+        # a sixth of the runs do not see the rarest basin at all, and still do not call it absent
+        assert len(absent) / 2000 > 0.1 or outcome < 2
 
 
-def test_basin_fractions__unfinished_cells_that_are_not_like_the_rest():
+def test_basin_rows__unfinished_cells_that_are_not_like_the_rest():
     rng = np.random.default_rng(8)
     labels = cubic_map(rng.uniform(-1.5, 1.5, (1000, 150)))
     labels[labels == 2] = -1  # one basin is slow: none of its cells finished
-    ds = basin_fractions(xr.DataArray(labels, dims=("run", "start")), dims="start", ids=[2], method="clopper-pearson")
-    truth = np.array([4, 1, 1]) / 6
-    naive = ((ds["low"] <= truth) & (truth <= ds["high"])).mean("run").values
-    honest = ((ds["low_if_none"] <= truth) & (truth <= ds["high_if_all"])).mean("run").values
-    assert np.all(naive < 0.9)
-    assert np.all(honest > 0.94)
+    ds = fractions(xr.DataArray(labels, dims=("run", "start")), ["run"], method="clopper-pearson")
+    for outcome, truth in ((0, 4 / 6), (1, 1 / 6)):
+        own, absent = rows_of(ds, outcome)
+        assert not len(absent)
+        assert ((own["low"] <= truth) & (truth <= own["high"])).mean() < 0.9
+        assert ((own["low_if_none"] <= truth) & (truth <= own["high_if_all"])).mean() > 0.94
     assert (ds["unseen_high_if_all"] >= 1 / 6).mean() > 0.92
 
 
-def test_basin_fractions__along_a_sweep():
-    labels = xr.DataArray(
-        [[[0, 0], [1, -1]], [[-1, -1], [-1, -1]]],
-        dims=("frequency", "y", "x"),
-        coords={"frequency": [2.0, 2.1], "x": [0.0, 1.0], "drive": "square"},
-    )
-    ds = basin_fractions(labels.transpose("x", "frequency", "y"), dims=["x", "y"])
-    np.testing.assert_allclose(ds["fraction"].sel(frequency=2.0), [2 / 3, 1 / 3])
-    assert ds["fraction"].sel(frequency=2.1).isnull().all()
-    assert ds["low"].sel(frequency=2.1).values.tolist() == [0.0, 0.0]
-    assert ds["high"].sel(frequency=2.1).values.tolist() == [1.0, 1.0]
-    assert ds["unseen_high"].sel(frequency=2.1).item() == 1.0
-    assert set(ds.coords) == {"frequency", "drive", "label"}
+def test_basin_rows__along_a_sweep():
+    labels = xr.DataArray([[[0, 0], [1, -1]], [[-1, -1], [-1, -1]]], dims=("frequency", "y", "x"))
+    ds = fractions(labels, ["frequency"])
+    np.testing.assert_allclose(ds["fraction"], [2 / 3, 1 / 3])
+    assert ds["n_sets"].values.tolist() == [2, 0]
+    assert ds["fraction_unfinished"].values.tolist() == [0.25, 1.0]
+    assert ds["unseen_high"].values[1] == 1.0
 
 
-def test_basin_fractions__inferred_cells_count_and_are_told():
+def test_basin_rows__inferred_cells_count_and_are_told():
     rng = np.random.default_rng(5)
     labels = xr.DataArray(rng.integers(-1, 3, (2, 30, 20)), dims=["frequency", "x", "y"])
     inferred = xr.DataArray(rng.random((2, 30, 20)) < 0.4, dims=["frequency", "x", "y"])
-    ds = basin_fractions(labels, dims=["x", "y"], inferred=inferred.transpose("y", "frequency", "x"))
-    plain = basin_fractions(labels, dims=["x", "y"])
-    assert ds.drop_vars("n_inferred").identical(plain)
-    assert ds["n_inferred"].dims == ("frequency", "label")
-    for f in range(2):
-        for i, label in enumerate(ds["label"].values):
-            assert ds["n_inferred"][f, i] == ((labels[f] == label) & inferred[f]).sum()
-    assert basin_fractions([0, 1, 1], inferred=[True, True, False])["n_inferred"].values.tolist() == [1, 1]
-    for wrong in ([True, False], [0, 1, 7]):
-        with pytest.raises(ValueError, match="inferred is"):
-            basin_fractions([0, 1, 1], inferred=wrong)
+    ds, plain = fractions(labels, ["frequency"], inferred), fractions(labels, ["frequency"])
+    assert ds.drop_vars("n_inferred").identical(plain.drop_vars("n_inferred"))
+    points = np.repeat([0, 1], ds["n_sets"].values)
+    for row, (f, label) in enumerate(zip(points, ds["attractor"].values, strict=True)):
+        assert ds["n_inferred"][row] == ((labels[f] == label) & inferred[f]).sum()
 
 
 # --- entropy ---------------------------------------------------------------------------------------------
@@ -184,9 +177,6 @@ def test_basin_entropy__on_paper():
     assert ds["boundary_entropy"].item() == pytest.approx((quarter + np.log(2)) / 2)
     assert (ds["n_boxes"].item(), ds["n_boundary_boxes"].item(), ds["n_labels"].item()) == (6, 2, 3)
     assert ds["fraction_used"].item() == pytest.approx(24 / 30)
-
-
-def test_basin_entropy__three_dimensions():
     labels = np.zeros((9, 8, 12), dtype=int)
     labels[:5] = 1
     labels[:, :, ::2] += 10
@@ -195,19 +185,6 @@ def test_basin_entropy__three_dimensions():
     mixed = np.log(3) - 2 / 3 * np.log(2)
     assert ds["entropy"].item() == pytest.approx(mixed / 3)
     assert ds["boundary_entropy"].item() == pytest.approx(mixed)
-
-
-def test_basin_entropy__ln_2():
-    rng = np.random.default_rng(0)
-    three = basin_entropy(rng.integers(3, size=(60, 60)))
-    assert three["boundary_entropy"].item() > 1.0
-    assert three["above_ln2"].item()
-    assert three["above_ln2_surely"].item()
-    two = basin_entropy(rng.integers(2, size=(60, 60)))
-    assert not two["above_ln2"].item()
-
-
-def test_basin_entropy__unfinished():
     labels = np.zeros((4, 4), dtype=int)
     labels[0, 0], labels[0, 1], labels[2:, 2:] = 1, -1, -1
     ds = basin_entropy(labels, 2)
@@ -216,6 +193,28 @@ def test_basin_entropy__unfinished():
     assert ds["n_boxes"].item() == 3
     assert ds["fraction_unfinished"].item() == 5 / 16
     assert basin_entropy(labels, 2, unfinished=())["n_labels"].item() == 3
+    rng = np.random.default_rng(0)
+    three = basin_entropy(rng.integers(3, size=(60, 60)))
+    assert three["boundary_entropy"].item() > 1.0
+    assert three["above_ln2"].item()
+    assert three["above_ln2_surely"].item()
+    two = basin_entropy(rng.integers(2, size=(60, 60)))
+    assert not two["above_ln2"].item()
+    # Three labels in one box exceed ln 2, and one box proves nothing
+    one = np.arange(25).reshape(5, 5) % 3
+    found = basin_entropy(one, 5)
+    assert found["above_ln2"]
+    assert not found["above_ln2_surely"]
+    assert np.isnan([found[f"{name}_stderr"] for name in ("entropy", "boundary_entropy")]).all()
+    # twenty boxes, four of them on the boundary
+    four = np.zeros((100, 5), int)
+    four[:20] = np.tile(one, (4, 1))
+    found = basin_entropy(four, 5)
+    assert np.isfinite(found["entropy_stderr"])
+    assert np.isnan(found["boundary_entropy_low"])
+    assert not found["above_ln2_surely"]
+    many = basin_entropy(np.tile(one, (8, 1)), 5)
+    assert many["above_ln2_surely"]
 
 
 @pytest.mark.slow
@@ -265,7 +264,7 @@ def test_uncertainty_exponent__grebogi_map():
     assert 0.2 <= ds["exponent"].item() <= 0.3
 
 
-def test_uncertainty_exponent__cantor_boundary_is_exact():
+def test_uncertainty_exponent__of_a_cantor_set_and_of_a_diagonal():
     # boxes that are the intervals of the construction: 2^level of 3^level see more than one basin
     ds = uncertainty_exponent(cantor_basins(), method="boxes", epsilons=[3**k for k in range(1, 8)])
     assert ds["exponent"].item() == pytest.approx(1 - np.log(2) / np.log(3), abs=1e-12)
@@ -273,6 +272,11 @@ def test_uncertainty_exponent__cantor_boundary_is_exact():
     np.testing.assert_allclose(ds["fitted"], ds["uncertain"])
     assert ds["exponent_stderr_fit"].item() < 1e-12
     assert ds["exponent_stderr"].item() > 0.005
+    i = np.arange(400)
+    ds = uncertainty_exponent((i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50])
+    # only the boxes on the diagonal are mixed, each about half and half
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.03)
+    np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3])
@@ -286,21 +290,30 @@ def test_uncertainty_exponent__plane_boundary_is_exact(dims):
     np.testing.assert_allclose(ds["uncertain"], 2 * ds["epsilon"] / room / dims)
 
 
-def test_uncertainty_exponent__entropy_of_a_straight_boundary():
-    i = np.arange(400)
-    ds = uncertainty_exponent((i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50])
-    # only the boxes on the diagonal are mixed, each about half and half
-    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.03)
-    np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)
-
-
-def test_uncertainty_exponent__boxes_that_see_nothing_are_no_part_of_the_fit():
+def test_uncertainty_exponent__of_empty_boxes_unfinished_cells_and_one_basin():
     labels = np.repeat([0, 1], 1200)  # sides of 4, 5 and 6 meet the boundary with an edge
     ds = uncertainty_exponent(labels, method="boxes", epsilons=[4, 5, 6, 7, 11, 16, 17])
     assert ds["used"].values.tolist() == [False, False, False, True, True, False, True]
     np.testing.assert_allclose(ds["uncertain"].values[[3, 4, 6]], [1 / 342, 1 / 218, 1 / 141])
     slope = np.polyfit(np.log([7, 11, 17]), np.log([1 / 342, 1 / 218, 1 / 141]), 1)[0]
     assert ds["exponent"].item() == pytest.approx(slope)
+    labels = np.zeros((200, 200), dtype=int)
+    labels[100:] = 1
+    spoilt = labels.copy()
+    spoilt[::7, ::5] = -1
+    ds = uncertainty_exponent(spoilt)
+    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.05)
+    assert ds["fraction_unfinished"].item() > 0.02
+    assert uncertainty_exponent(spoilt, unfinished=())["exponent"].item() < 0.7
+    labels = np.full((50, 50), 4)
+    for method in ("perturbation", "boxes", "entropy"):
+        ds = uncertainty_exponent(labels, method=method)
+        assert np.isnan(ds["exponent"].item())
+        assert not ds["used"].any()
+    ds = basin_entropy(labels)
+    assert ds["entropy"].item() == 0.0
+    assert np.isnan(ds["boundary_entropy"].item())
+    assert not ds["above_ln2"].item()
 
 
 @pytest.mark.slow
@@ -319,29 +332,6 @@ def test_uncertainty_exponent__bootstrap_tells_the_scatter():
     assert 0.6 < np.mean(errors) / np.std(values) < 1.5
 
 
-def test_uncertainty_exponent__unfinished_cells_are_no_boundary():
-    labels = np.zeros((200, 200), dtype=int)
-    labels[100:] = 1
-    spoilt = labels.copy()
-    spoilt[::7, ::5] = -1
-    ds = uncertainty_exponent(spoilt)
-    assert ds["exponent"].item() == pytest.approx(1.0, abs=0.05)
-    assert ds["fraction_unfinished"].item() > 0.02
-    assert uncertainty_exponent(spoilt, unfinished=())["exponent"].item() < 0.7
-
-
-def test_boundaries__of_one_basin():
-    labels = np.full((50, 50), 4)
-    for method in ("perturbation", "boxes", "entropy"):
-        ds = uncertainty_exponent(labels, method=method)
-        assert np.isnan(ds["exponent"].item())
-        assert not ds["used"].any()
-    ds = basin_entropy(labels)
-    assert ds["entropy"].item() == 0.0
-    assert np.isnan(ds["boundary_entropy"].item())
-    assert not ds["above_ln2"].item()
-
-
 # --- Wada ------------------------------------------------------------------------------------------------
 
 
@@ -355,6 +345,13 @@ def test_wada_merge_test__published_toy_cases():
     ds = wada_merge_test(fractal, 1)
     assert ds["beyond"].item() == 0.0
     assert ds["wada"].all()
+    labels = np.repeat([0, 1, -1, 2], 5)[:, None] * np.ones(8, dtype=int)
+    ds = wada_merge_test(labels, 50)
+    assert np.isinf(ds["hausdorff_distance"].item())
+    assert not ds["wada"].item()
+    assert ds["n_boundary"].values.tolist() == [16, 16, 0]
+    assert ds["beyond"].item() == 0.1
+    assert ds["fraction_unfinished"].item() == 0.25
 
 
 def test_wada_merge_test__newton_is_wada():
@@ -364,9 +361,6 @@ def test_wada_merge_test__newton_is_wada():
     assert 0 < ds["beyond"].values[1] < ds["beyond"].values[0] < 0.01
     assert np.all(ds["beyond_stderr"].values[:2] > 0)
     assert ds["beyond_low"].values[0] < ds["beyond"].values[0] < ds["beyond_high"].values[0]
-
-
-def test_wada_merge_test__two_boundaries_are_not_wada():
     # two of three basins finely mixed, the third apart behind a straight line
     labels = np.random.default_rng(0).integers(2, size=(60, 60))
     labels[40:] = 2
@@ -398,47 +392,17 @@ def test_wada_merge_test__agrees_with_all_pairs(metric, name, shape):
     assert ds["beyond"].item() == pytest.approx(most / labels.size)
 
 
-def test_wada_merge_test__hidden_boundary():
-    labels = np.repeat([0, 1, -1, 2], 5)[:, None] * np.ones(8, dtype=int)
-    ds = wada_merge_test(labels, 50)
-    assert np.isinf(ds["hausdorff_distance"].item())
-    assert not ds["wada"].item()
-    assert ds["n_boundary"].values.tolist() == [16, 16, 0]
-    assert ds["beyond"].item() == 0.1
-    assert ds["fraction_unfinished"].item() == 0.25
-
-
-def test_basin_entropy__few_boxes_have_no_error():
-    """Three labels in one box exceed ln 2, and one box proves nothing."""
-    one = np.arange(25).reshape(5, 5) % 3
-    found = basin_entropy(one, 5)
-    assert found["above_ln2"]
-    assert not found["above_ln2_surely"]
-    assert np.isnan([found[f"{name}_stderr"] for name in ("entropy", "boundary_entropy")]).all()
-    # twenty boxes, four of them on the boundary
-    four = np.zeros((100, 5), int)
-    four[:20] = np.tile(one, (4, 1))
-    found = basin_entropy(four, 5)
-    assert np.isfinite(found["entropy_stderr"])
-    assert np.isnan(found["boundary_entropy_low"])
-    assert not found["above_ln2_surely"]
-    many = basin_entropy(np.tile(one, (8, 1)), 5)
-    assert many["above_ln2_surely"]
-
-
 ONE, THREE = np.zeros((50, 50), int), [[0, 1], [2, 0]]
 
 
 @pytest.mark.parametrize(
     ("function", "arguments", "message"),
     [
-        (basin_fractions, ([0.0, 1.0],), r"float64.*integer code"),
-        (basin_fractions, (np.zeros((0, 3), int),), "no cells"),
-        (basin_fractions, (4,), "no cells"),
-        (basin_fractions, ([0, 1], {"confidence": 95}), "confidence is 95"),
-        (basin_fractions, ([0, 1], {"method": "wald"}), "'wald'"),
-        (basin_fractions, ([0, 1], {"ids": [-1]}), "also in unfinished"),
-        (basin_fractions, (xr.DataArray([0, 1], dims="x"), {"dims": ["y"]}), r"'y'.*not dims"),
+        (read_labels, ([0.0, 1.0], ()), r"float64.*integer code"),
+        (read_labels, (np.zeros((0, 3), int), ()), "no cells"),
+        (read_labels, (4, ()), "no cells"),
+        (binomial_interval, (0, 1, {"confidence": 95}), "confidence is 95"),
+        (binomial_interval, (0, 1, {"method": "wald"}), "'wald'"),
         (binomial_interval, (5, 4), "not within 0 and n"),
         (basin_entropy, (ONE, 1), "2 cells"),
         (basin_entropy, (ONE, 51), r"larger than the grid \(50, 50\)"),

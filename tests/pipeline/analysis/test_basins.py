@@ -1,15 +1,12 @@
 """Basins of a cube: numbers known on paper, and what is said of cells without an outcome."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
 
 from magpend_core.status import Status
-from pipeline.analysis.basins.basins import basins
+from pipeline.analysis.basins.analysis import basins_of, basins_table
 from pipeline.analysis.basins.numbers import basin_fractions, basin_rows
-from pipeline.analysis.basins.table import basins_table
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
@@ -57,7 +54,7 @@ def thirds(n=60):
 
 
 def test_basins__a_straight_boundary():
-    found = basins(*labelled([halves()]), box=6).isel(frequency=0)
+    found = basins_of(*labelled([halves()]), box=6).isel(frequency=0)
     # the boundary halves one column of ten boxes out of a hundred
     np.testing.assert_allclose(found["basin_entropy"], 0.1 * LN_2)
     np.testing.assert_allclose(found["boundary_basin_entropy"], LN_2)
@@ -71,21 +68,18 @@ def test_basins__a_straight_boundary():
     assert (found["n_periods"] == 7).all()
     assert found["uncertain"].dims == ("epsilon",)
     assert found.attrs["not_computed"] == ""
-
-
-def test_basins__wada_test_of_parallel_strips():
-    found = basins(*labelled([thirds(), halves()]), radius=20)
+    found = basins_of(*labelled([thirds(), halves()]), radius=20)
     # the boundary of the first strip is 20 cells from that of the last
     assert found["wada_distance"].values[0] == 20
     assert found["wada"].values.tolist() == [1, -1]
-    assert basins(*labelled([thirds()]), radius=19)["wada"].values.tolist() == [0]
+    assert basins_of(*labelled([thirds()]), radius=19)["wada"].values.tolist() == [0]
 
 
 def test_basins__cells_without_an_outcome():
     grid, status = halves(20, 10), np.full((20, 20), Status.PERIODIC)
     for row, code in enumerate((Status.PENDING, Status.BOUNDED, Status.STEP_LIMIT, Status.DIVERGED)):
         grid[row, :5], status[row, :5] = -1, code
-    found = basins(*labelled([grid], [status]), interval="clopper-pearson").isel(frequency=0)
+    found = basins_of(*labelled([grid], [status]), interval="clopper-pearson").isel(frequency=0)
     counts = [int(found[name]) for name in ("n_pending", "n_not_settled", "n_failed", "n_unfinished")]
     assert counts == [5, 5, 5, 15]
     assert found["attractor"].values.tolist() == [-2, 0, 1]
@@ -98,12 +92,9 @@ def test_basins__cells_without_an_outcome():
     assert basins_table(found).lines[-1] == (
         "380 of 400 cells end on attractors; 5 diverged, 5 pending, 5 not settled, 5 that could not be integrated"
     )
-
-
-def test_basins__a_point_without_any_outcome():
     empty = np.full((20, 20), -1)
     status = np.stack([np.full((20, 20), Status.PERIODIC), np.full((20, 20), Status.PENDING)])
-    found = basins(*labelled([halves(20, 8), empty], status))
+    found = basins_of(*labelled([halves(20, 8), empty], status))
     assert np.isfinite(found["basin_entropy"].values).tolist() == [True, False]
     assert found["n_sets"].values.tolist() == [2, 0]
     assert np.isnan(dense(found)["low"].values[1]).all()
@@ -125,17 +116,14 @@ def test_basin_rows__agree_with_fractions_of_all_labels():
 def test_basins__starts_that_are_no_regular_grid():
     cube, ids = labelled([halves(20)])
     uneven = np.arange(20.0) ** 2
-    found = basins(cube.assign_coords(psi1_0=uneven), ids.assign_coords(psi1_0=uneven))
+    found = basins_of(cube.assign_coords(psi1_0=uneven), ids.assign_coords(psi1_0=uneven))
     assert found.attrs["not_computed"] == "boundaries: psi1_0 is not evenly spaced"
     assert "basin_entropy" not in found
     sample = [x.isel(psi2_0=0).rename(psi1_0="initial_condition") for x in (cube, ids)]
-    found = basins(*sample)
+    found = basins_of(*sample)
     assert found.attrs["not_computed"] == "boundaries: the starts are no grid"
     assert found["fraction"].dims == ("set",)
-
-
-def test_basins__a_grid_too_small_for_the_boxes():
-    found = basins(*labelled([halves(20, 8)]), box=21)
+    found = basins_of(*labelled([halves(20, 8)]), box=21)
     assert "box (21, 21) is larger than the grid (20, 20)" in found.attrs["not_computed"]
     assert np.isnan(found["basin_entropy"]).all()
     assert np.isfinite(found["uncertainty_exponent"]).all()
@@ -146,7 +134,7 @@ def test_basins__a_grid_too_small_for_the_boxes():
 )
 def test_basins__bad_options(options):
     with pytest.raises(ValueError, match=next(iter(options))):
-        basins(*labelled([halves(20)]), **options)
+        basins_of(*labelled([halves(20)]), **options)
 
 
 def test_derive_basins__refuses_before_it_identifies(made):

@@ -1,28 +1,28 @@
 """Branches of periodic orbits, against exact solutions and scipy's integrators."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from magpend_core import load_preset, run_branches
+from magpend_core import load_preset
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
+from pipeline.analysis.branches.analysis import table_of, windows_of
 from pipeline.analysis.branches.arclength import Point, Settings
 from pipeline.analysis.branches.bifurcations import Bifurcation, counts_of, multipliers_of, n_unstable, tell_apart
-from pipeline.analysis.branches.crossings import cross
 from pipeline.analysis.branches.curves import continue_curves
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, cross, explore
 from pipeline.analysis.branches.following import Branch, first_point
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.lockstep import Query, run_alone, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem, Value, doubling_test, fold_test, torus_test
-from tests.core.maps import stroboscopic_map
+from pipeline.analysis.branches.starting_orbits import orbits_near
+from tests.core.cells import run_cells, scipy_end, stroboscopic_map
 
 DUFFING, VAN_DER_POL = load_model("duffing").system, load_model("forced-van-der-pol").system
 
@@ -53,7 +53,7 @@ def flow(state, frequency, parameters, share=1.0):
         return [v, force, *m[1], *(-stiffness * m[0] - friction * m[1])]
 
     start = [*state, 1.0, 0.0, 0.0, 1.0]
-    end = solve_ivp(rates, (0.0, share / frequency), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    end = scipy_end(rates, start, share / frequency)
     return end[:2], end[2:].reshape(2, 2)
 
 
@@ -66,7 +66,7 @@ def settled(state, frequency, parameters, n_periods=60):
         force = amplitude * np.cos(2.0 * np.pi * frequency * t)
         return [z[1], force - (damping + nonlinear * z[0] * z[0]) * z[1] - linear * z[0] - cubic * z[0] ** 3]
 
-    return solve_ivp(rates, (0.0, n_periods / frequency), state, rtol=1e-8, atol=1e-8).y[:, -1]
+    return scipy_end(rates, state, n_periods / frequency, 1e-8)
 
 
 def recomputed(bifurcation, orbits, test, parameters_at):
@@ -126,6 +126,12 @@ def test_explore__folds_of_duffing(resonance):
         assert abs(fold.critical_multiplier - 1.0) < 1e-6
         there = recomputed(fold, orbits, fold_test, lambda f: (f, orbits.parameters))
         assert orbits.values(fold.point.u)[0] == pytest.approx(there, abs=1e-8)
+    # Liouville: the flow contracts areas by exp(-damping T), on stable and unstable orbits
+    _, branch = resonance
+    found = [np.linalg.det(p.value.monodromy) for p in branch.points]
+    np.testing.assert_allclose(found, np.exp(-0.1 / branch.values), rtol=1e-9)
+    assert {n_unstable(p) for p in branch.points} == {0, 1}
+    assert max(p.residual for p in branch.points) < 1e-10
 
 
 @pytest.mark.slow
@@ -140,15 +146,6 @@ def test_explore__starts_on_one_branch(resonance):
     starts = [Start(orbits, orbits.state(p.u), middle) for p in points]
     assert len({round(float(s.state[0]), 3) for s in starts}) == 3
     assert len(explore(starts, Scope(0.1, 0.4, settings=Settings(longest_step=0.03)))) == 1
-
-
-def test_explore__determinant(resonance):
-    """Liouville: the flow contracts areas by exp(-damping T), on stable and unstable orbits."""
-    _, branch = resonance
-    found = [np.linalg.det(p.value.monodromy) for p in branch.points]
-    np.testing.assert_allclose(found, np.exp(-0.1 / branch.values), rtol=1e-9)
-    assert {n_unstable(p) for p in branch.points} == {0, 1}
-    assert max(p.residual for p in branch.points) < 1e-10
 
 
 def test_dataset_of__resonance(resonance):
@@ -315,7 +312,7 @@ def test_explore__rotation():
         force = parameters["A"] * np.cos(2.0 * np.pi * frequency * t) + parameters["bias"]
         return [z[1], force - parameters["d"] * z[1] - parameters["w0"] ** 2 * np.sin(z[0])]
 
-    end = solve_ivp(rates, (0.0, 80 / frequency), [0.0, 2.0], rtol=1e-8, atol=1e-8).y[:, -1]
+    end = scipy_end(rates, [0.0, 2.0], 80 / frequency, 1e-8)
     end[0] = np.remainder(end[0], 2.0 * np.pi)
     orbits = family(frequency, model.load(**parameters).pack(), "A", 1.0, system=model.system)
     (branch,) = explore([Start(orbits, end, 1.0)], Scope(0.05, 1.2, max_period=1))
@@ -325,7 +322,7 @@ def test_explore__rotation():
     assert ds["rotation"].values.tolist() == [[1.0]]
     parameters["A"] = float(branch.values[7])
     state = orbits.state(branch.points[7].u)
-    image = solve_ivp(rates, (0.0, 1 / frequency), state, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    image = scipy_end(rates, state, 1 / frequency)
     np.testing.assert_allclose(image - state, [2.0 * np.pi, 0.0], atol=1e-9)
 
 
@@ -442,10 +439,7 @@ def test_watch__neutral_saddle():
         assert torus_test(matrix) == pytest.approx(0.0)
         found.append(Bifurcation("neimark_sacker", point_of(matrix), 0.0, 1, 1, True))
     assert tell_apart(found, found[0].point) == found[1:]
-
-
-def test_branch__counts_are_those_of_its_points():
-    """Rounding decides the counts within a bracket, and at points beside it; the points farther away are certain."""
+    # Rounding decides the counts within a bracket, and at points beside it; the points farther away are certain
     points = [point_of(np.diag([mu, 0.1])) for mu in (0.9, 0.97, 1.0 + 1e-9, 1.03, 1.1)]
     (one,) = ones = [Bifurcation("branch_point", points[2], 0.0, 0, 0, True, after=2)]
     branch = Branch(family(1.0, [0.2, 0.4], "frequency", 1.0), points, ones, ("bound", "bound"))
@@ -502,6 +496,19 @@ def test_explore__right_family(right_family):
     assert (abrupt.criticality, halving.criticality) == ("subcritical", "supercritical")
     assert abrupt.child is halving.child is double
     assert double.ends == ("start", "period_halving")
+    # The multipliers next to a located doubling move on smoothly: friction's corner leaves no trace here
+    _, orbits, (single, _) = right_family
+    halving = only(single, "period_doubling")[1]
+    at = orbits.values(halving.point.u)[0]
+    tests = []
+    for offset in (-2e-4, -1e-4, 1e-4, 2e-4):
+        u = halving.point.u + offset / halving.point.tangent[-1] * halving.point.tangent
+        u[-1] = at + offset
+        tests.append(doubling_test(run_alone(first_point(OrbitProblem(orbits), u, Settings())).value.monodromy))
+    left, right = tests[1] - tests[0], tests[3] - tests[2]
+    # the slope changes by its own derivative only: with a corner, the two would differ at any offset
+    assert left == pytest.approx(right, rel=1e-2)
+    assert tests[1] * tests[2] < 0.0
 
 
 @pytest.mark.slow
@@ -518,14 +525,10 @@ def test_explore__brute_force_agrees(right_family):
     ]
     orbits = [ds["section"].values[i, j, : branches[i].family.period] for i, j in chosen]
     n = len(chosen)
-    result = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)),
-        np.array([[branches[i].values[j]] for i, j in chosen]),
-        np.array([orbit[0] for orbit in orbits]) + [1e-3, -1e-3, 1e-2, 1e-2],
-        **{"n_transient": 1500, "n_keep": 4, "rtol": 1e-9, "atol": 1e-9},
-        stop_when_closed=True,
-        closure_tolerance=1e-7,
-    )
+    values = [branches[i].values[j] for i, j in chosen]
+    starts = np.array([orbit[0] for orbit in orbits]) + [1e-3, -1e-3, 1e-2, 1e-2]
+    options = {"n_transient": 1500, "n_keep": 4, "stop_when_closed": True, "closure_tolerance": 1e-7}
+    result = run_cells(PENDULUM_FITTED, parameters.pack(), values, starts, rtol=1e-9, **options)
     assert result.orbit_period[:, 0].tolist() == [branches[i].family.period for i, _ in chosen]
     for orbit, sections in zip(orbits, result.section[:, 0], strict=True):
         for section in sections:
@@ -533,19 +536,3 @@ def test_explore__brute_force_agrees(right_family):
     assert {i for i, _ in chosen} == {0, 1}
     assert n > 15
     assert set(np.unique(ds["side"].values[:, 0])) == {Side.RIGHT}
-
-
-def test_locate__at_a_velocity_reversal(right_family):
-    """The multipliers next to a located doubling move on smoothly: friction's corner leaves no trace here."""
-    _, orbits, (single, _) = right_family
-    halving = only(single, "period_doubling")[1]
-    at = orbits.values(halving.point.u)[0]
-    tests = []
-    for offset in (-2e-4, -1e-4, 1e-4, 2e-4):
-        u = halving.point.u + offset / halving.point.tangent[-1] * halving.point.tangent
-        u[-1] = at + offset
-        tests.append(doubling_test(run_alone(first_point(OrbitProblem(orbits), u, Settings())).value.monodromy))
-    left, right = tests[1] - tests[0], tests[3] - tests[2]
-    # the slope changes by its own derivative only: with a corner, the two would differ at any offset
-    assert left == pytest.approx(right, rel=1e-2)
-    assert tests[1] * tests[2] < 0.0

@@ -1,15 +1,16 @@
 """Branches of Duffing oscillators, a model without angles: against harmonic balance and symmetry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, curves_dataset, curves_from, dataset_of, explore
+from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Settings
+from pipeline.analysis.branches.curves import curves_dataset, curves_from
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.table import curves_table
 
 pytestmark = pytest.mark.slow
 

@@ -1,35 +1,27 @@
 """Branches of limit cycles of flows, against what is known of them and an independent shooting method."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.branches import (
-    Scope,
-    Start,
-    curves_dataset,
-    curves_from,
-    dataset_of,
-    explore,
-    table_of,
-    windows_of,
-)
+from pipeline.analysis.branches.analysis import branches_table, table_of, windows_of
+from pipeline.analysis.branches.curves import curves_dataset, curves_from
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.starting_orbits import family_of
 from pipeline.analysis.branches.stuck import grows_without_bound
-from pipeline.analysis.branches.table import branches_table
-from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow
+from tests.core.cells import scipy_end
+from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow, table
 
 pytestmark = pytest.mark.slow
 
 
-def followed(table, of, state, parameter, low, high, *, max_period=1, level=0.0, **values):
+def followed(equations, of, state, parameter, low, high, *, max_period=1, level=0.0, **values):
     """Branches from a limit cycle near a state."""
-    parameters = sectioned(flow(table), Crossing(of, level, longest=50.0)).load(**values)
+    parameters = sectioned(flow(equations), Crossing(of, level, longest=50.0)).load(**values)
     model = parameters.model
     family = family_of(model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low)
     start = Start(family, np.array(state, float), parameters[parameter])
@@ -57,9 +49,15 @@ def test_explore__fold_of_cycles():
     good = np.isfinite(own)
     np.testing.assert_allclose(own[good], known[good], atol=1e-8)
     np.testing.assert_allclose(ds["period_s"].values[0][good], np.pi, rtol=1e-9)
+    # The fold stays at mu = -1/4 whatever the angular velocity, which changes the period alone
+    parameters = sectioned(flow(BAUTIN), Crossing("y", longest=50.0)).load()
+    found = curves_from(ds, parameters, "omega", ((-0.4, 0.2), (1.5, 2.5)), 1)
+    curves = curves_dataset(found, "mu", "omega", parameters.model)
+    assert curves.sizes["curve"] == 1
+    np.testing.assert_allclose(curves["first"].values, -0.25, atol=1e-8)
+    assert float(curves["second"].max() - curves["second"].min()) > 0.9
 
 
-@pytest.mark.slow
 def test_explore__torus():
     """The second oscillator's growth rate passes 0: the pair exp((mu +- 0.7 i) pi) leaves the circle."""
     ds = followed(PAIR, "y", [1.0, 0.0, 0.0, 0.0], "mu", -0.2, 0.2, mu=-0.1)
@@ -71,12 +69,12 @@ def test_explore__torus():
     assert (row["unstable_below"], row["unstable_above"]) == ("0", "2")
 
 
-HOMOCLINIC = {
-    "name": "homoclinic",
-    "states": {"x": {"escape": 10.0}, "y": {"escape": 10.0}},
-    "parameters": {"alpha": 0.05},
-    "equations": {"x": "-x + 2*y + x**2", "y": "(2 - alpha)*x - y - 3*x**2 + 1.5*x*y"},
-}
+HOMOCLINIC = table(
+    "homoclinic",
+    {"x": "-x + 2*y + x**2", "y": "(2 - alpha)*x - y - 3*x**2 + 1.5*x*y"},
+    {"alpha": 0.05},
+    states={"x": {"escape": 10.0}, "y": {"escape": 10.0}},
+)
 """Sandstede (1997): at alpha = 0 an orbit leaves the saddle 0, whose eigenvalues are 1 and -3, and comes
 back: y**2 = x**2 - x**3 is invariant."""
 
@@ -127,13 +125,12 @@ def shot(c, guess):
 
     def end(y, z, time):
         start = np.concatenate([[0.0, y, z], np.eye(3).ravel()])
-        return solve_ivp(rates, (0.0, time), start, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+        return scipy_end(rates, start, time, 1e-11)
 
     y, z, time = fsolve(lambda u: end(*u)[:3] - [0.0, u[0], u[1]], guess, xtol=1e-11)
     return time, np.linalg.eigvals(end(y, z, time)[3:].reshape(3, 3))
 
 
-@pytest.mark.slow
 def test_explore__roessler_doublings():
     ds = followed(ROSSLER, "x", [0.0, -4.35, 0.07], "c", 2.4, 4.0, max_period=4, c=2.5)
     rows = [row for row in table_of(ds) if row["type"] == "period_doubling"]
@@ -150,14 +147,3 @@ def test_explore__roessler_doublings():
         assert np.abs(multipliers - 1.0).min() < 1e-5
         assert np.abs(multipliers + 1.0).min() < 1e-4
     assert [w["period"] for w in windows_of(ds)][:2] == [1, 2]
-
-
-def test_curves_from__fold_of_cycles():
-    """The fold stays at mu = -1/4 whatever the angular velocity, which changes the period alone."""
-    parameters = sectioned(flow(BAUTIN), Crossing("y", longest=50.0)).load()
-    ds = followed(BAUTIN, "y", [1.0, 0.0], "mu", -0.4, 0.2, mu=0.1)
-    found = curves_from(ds, parameters, "omega", ((-0.4, 0.2), (1.5, 2.5)), 1)
-    curves = curves_dataset(found, "mu", "omega", parameters.model)
-    assert curves.sizes["curve"] == 1
-    np.testing.assert_allclose(curves["first"].values, -0.25, atol=1e-8)
-    assert float(curves["second"].max() - curves["second"].min()) > 0.9

@@ -1,16 +1,14 @@
 """Branches and curves of a run: what is asked for, what is refused, what is left out, what is said."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.branches.analysis import branches_table, curves_table
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
-from pipeline.analysis.branches.table import branches_table, curves_table
 from pipeline.analysis.ragged import dense
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
 from pipeline.products.branches import BranchOptions
 from pipeline.products.registry import ANALYSES, FIGURES
@@ -19,27 +17,16 @@ from pipeline.runs.derive import AnalysedRun, derive, prepared
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.dense_sets import rows_of
 
-SPEC = """
-kind = "sweep"
-model = "duffing"
-[parameters]
-preset = "twin-well"
-frequency_hz = 0.1909859317
-[parameters.overrides]
-damping = 0.3
-[axes]
-amplitude = { values = [0.25, 0.275, 0.289, 0.5] }
-[initial_conditions]
-kind = "list"
-points = [[1.2, 0.0], [-1.2, 0.0]]
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 300
-n_keep = 200
-"""
+from .cubes import sweep
 
-
+SPEC = sweep(
+    "duffing",
+    [[1.2, 0.0], [-1.2, 0.0]],
+    axes={"amplitude": {"values": [0.25, 0.275, 0.289, 0.5]}},
+    parameters={"preset": "twin-well", "overrides": {"damping": 0.3}},
+    frequency_hz=0.1909859317,
+    lengths=(300, 200),
+)
 ALONG = {"parameter": "amplitude", "low": 0.24, "high": 0.3}
 SHORT = {**ALONG, "max_period": 2}
 
@@ -83,12 +70,21 @@ def test_branches__all_periods_or_a_line(directory):
     assert branches_table(again).lines == branches_table(short).lines
 
 
-def test_branches__none_to_begin_with(directory):
+def test_branches__none_to_begin_with(directory, main, tmp_path):
     ds = derive(directory, "branches", {"parameter": "amplitude", "low": 0.4, "high": 0.6})
     assert ds.sizes["branch"] == 0
     lines = branches_table(ds).lines
     assert lines[0].startswith("no branch")
     assert any("outside of amplitude 0.4 to 0.6" in line for line in lines)
+    # With the reason, and without a file
+    words = ("--parameter", "amplitude", "--from", 0.4, "--to", 0.6)
+    code, out, err = main("analyse", "branches", directory, *words, "--csv", "found.csv")
+    assert code == Exit.REFUSED
+    assert out == ""
+    assert "no branch along amplitude: there is no closed orbit to begin with" in err
+    assert "2 of 3: outside of amplitude 0.4 to 0.6" in err
+    assert "1 of 3: a set that does not close" in err
+    assert not (tmp_path / "found.csv").exists()
 
 
 @pytest.mark.slow
@@ -176,18 +172,6 @@ def test_branches__of_several_axes_say_which(made, interval):
     assert "run sweeps frequency_hz, q; say which of them to follow: " in sentence
     assert "--parameter=frequency_hz or --parameter=q" in sentence
     assert not (made.info.directory / "derived").exists()
-
-
-def test_branches__an_empty_table_is_refused(directory, main, tmp_path):
-    """With the reason, and without a file."""
-    words = ("--parameter", "amplitude", "--from", 0.4, "--to", 0.6)
-    code, out, err = main("analyse", "branches", directory, *words, "--csv", "found.csv")
-    assert code == Exit.REFUSED
-    assert out == ""
-    assert "no branch along amplitude: there is no closed orbit to begin with" in err
-    assert "2 of 3: outside of amplitude 0.4 to 0.6" in err
-    assert "1 of 3: a set that does not close" in err
-    assert not (tmp_path / "found.csv").exists()
 
 
 @pytest.mark.slow

@@ -1,15 +1,13 @@
 """Guesses of closed orbits: each orbit is polished once, with its least period."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
 from pipeline.analysis.attractors.finding import closed_orbits
 from pipeline.analysis.attractors.finding.closed_orbits import polish
 from pipeline.analysis.sets import Geometry
+from tests.core.cells import scipy_end
 
 pytestmark = pytest.mark.slow
 
@@ -26,22 +24,13 @@ def settled(parameters):
     def rates(t, y):
         return [y[1], -0.3 * y[1] + y[0] - y[0] ** 3 + parameters["amplitude"] * np.cos(OMEGA * t)]
 
-    end = 400 * 2.0 * np.pi / OMEGA
-    return solve_ivp(rates, (0.0, end), [1.2, 0.0], method="DOP853", rtol=1e-10, atol=1e-10).y[:, -1]
+    return scipy_end(rates, [1.2, 0.0], 400 * 2.0 * np.pi / OMEGA, 1e-10)
 
 
 def polished(parameters, points, periods, known=None):
     n, system = len(points), DUFFING.system
-    return polish(
-        np.tile(parameters.pack(), (n, 1)),
-        np.full(n, FREQUENCY),
-        np.array(points),
-        np.array(periods),
-        geometry=Geometry.of(system),
-        system=system,
-        tolerance=1e-10,
-        known=known,
-    )
+    guesses = np.tile(parameters.pack(), (n, 1)), np.full(n, FREQUENCY), np.array(points), np.array(periods)
+    return polish(*guesses, geometry=Geometry.of(system), system=system, tolerance=1e-10, known=known)
 
 
 def test_polish__guesses_of_several_periods_are_one_orbit(monkeypatch):

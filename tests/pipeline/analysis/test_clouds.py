@@ -1,7 +1,5 @@
 """Whether samples of section points show one set: chaotic maps, tori and orbits, on few and many points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -36,16 +34,27 @@ def test_mixing__two_trajectories_on_one_chaotic_set(n):
     assert np.mean(shares) == pytest.approx(0.5, abs=0.1)
 
 
-def test_mixing__a_shift_by_a_hundredth_of_the_size_is_another_set():
+def test_mixing__of_circles_shifts_orbits_and_pieces():
+    assert mixing(circle(512, 0.0), circle(512, 0.3), PLANE) >= SAME
+    assert mixing(circle(512, 0.0), circle(512, 0.3, radius=1.1), PLANE) < OTHER
     assert mixing(henon(2048, 1), henon(2048, 2, shift=[0.0, 5.0]), PLANE) == 0.0
     # 0.01 against a width of 2.5: seen once the points are denser than that
     near = mixing(henon(4096, 1), henon(4096, 2, shift=[0.0, 0.01]), PLANE)
     assert near < mixing(henon(64, 1), henon(64, 2, shift=[0.0, 0.01]), PLANE)
+    # Their distances are those of the closing, and say nothing below the closure tolerance
+    orbit = np.tile(np.array([[0.0, 1.0], [2.0, 3.0]]), (40, 1))
+    late, early = orbit + 1e-9, orbit + 1e-6
+    assert mixing(late, early, PLANE, least=1e-5) == pytest.approx(0.5)
+    assert mixing(late, orbit + 0.1, PLANE, least=1e-5) < OTHER
+    # A chaotic set of two pieces: every second point of a sample lies in one of them
 
+    def pieces(seed):
+        path = henon(1024, seed)
+        return path + 5.0 * (np.arange(1024) % 2)[:, None]
 
-def test_mixing__circles():
-    assert mixing(circle(512, 0.0), circle(512, 0.3), PLANE) >= SAME
-    assert mixing(circle(512, 0.0), circle(512, 0.3, radius=1.1), PLANE) < OTHER
+    assert mixing(pieces(1), pieces(2), PLANE) >= 0.4
+    cloud = Cloud.of([pieces(3)], PLANE, 1e-5)
+    assert cloud.spacing < 0.2
 
 
 @pytest.mark.parametrize("enough", [OTHER, SAME])
@@ -59,33 +68,10 @@ def test_mixing__an_early_end_decides_alike(enough, gap):
         assert early == whole or early >= enough
 
 
-def test_mixing__cells_that_close_on_one_orbit():
-    """Their distances are those of the closing, and say nothing below the closure tolerance."""
-    orbit = np.tile(np.array([[0.0, 1.0], [2.0, 3.0]]), (40, 1))
-    late, early = orbit + 1e-9, orbit + 1e-6
-    assert mixing(late, early, PLANE, least=1e-5) == pytest.approx(0.5)
-    assert mixing(late, orbit + 0.1, PLANE, least=1e-5) < OTHER
-
-
-def test_mixing__two_pieces_that_are_visited_in_turn():
-    """A chaotic set of two pieces: every second point of a sample lies in one of them."""
-
-    def pieces(seed):
-        path = henon(1024, seed)
-        return path + 5.0 * (np.arange(1024) % 2)[:, None]
-
-    assert mixing(pieces(1), pieces(2), PLANE) >= 0.4
-    cloud = Cloud.of([pieces(3)], PLANE, 1e-5)
-    assert cloud.spacing < 0.2
-
-
 def test_group__a_cell_that_is_near_two_joins_them():
     number, is_sure = group([henon(512, 1), circle(512, 0.0) + 5.0, henon(512, 2)], PLANE)
     assert number.tolist() == [0, 1, 0]
     assert is_sure
-
-
-def test_is_stationary__drift_is_not():
     assert is_stationary(henon(512, 3), PLANE)
     assert is_stationary(circle(512, 0.0), PLANE)
     creeping = np.stack([1.0 / np.sqrt(np.arange(1, 513)), np.zeros(512)], axis=1)

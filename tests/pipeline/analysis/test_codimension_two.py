@@ -1,70 +1,58 @@
 """Points of codimension two on bifurcation curves, against closed forms."""
 
-from __future__ import annotations
-
-import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, codimension_two, curves_dataset, explore
-from pipeline.analysis.branches.curves import continue_curves
+from pipeline.analysis.branches import codimension_two
+from pipeline.analysis.branches.analysis import curves_table
+from pipeline.analysis.branches.curves import continue_curves, curves_dataset
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.table import curves_table
+from tests.core.flows import table
 
 # z' = (1 + i w0) z - |z|^2 z + F exp(i W t) for z = x + i y
-STUART_LANDAU = """
-name = "stuart_landau"
-[states]
-x = {}
-y = {}
-[parameters]
-w0 = 1.3
-F = 0.2
-[equations]
-x = "x - w0*y - (x^2 + y^2)*x + F*cos(2*pi*f*t)"
-y = "w0*x + y - (x^2 + y^2)*y + F*sin(2*pi*f*t)"
-"""
+STUART_LANDAU = load_model(
+    table(
+        "stuart_landau",
+        {"x": "x - w0*y - (x^2 + y^2)*x + F*cos(2*pi*f*t)", "y": "w0*x + y - (x^2 + y^2)*y + F*sin(2*pi*f*t)"},
+        {"w0": 1.3, "F": 0.2},
+    )
+)
 
 # three oscillators that do not feel each other: u in a frame that turns by half a turn per period, so that its
 # multiplier is -exp(mu T); the radius of (p, q); and z with a fold
-UNCOUPLED = """
-name = "uncoupled"
-[states]
-x = {}
-y = {}
-p = {}
-q = {}
-z = {}
-[parameters]
-mu = -0.1
-a = -1.0
-nu = -0.1
-b = -1.0
-m = 0.3
-[define]
-c = "cos(pi*f*t)"
-s = "sin(pi*f*t)"
-u = "x*c + y*s"
-v = "y*c - x*s"
-growth = "mu + a*u^2 - u^4"
-radius = "nu + b*(p^2 + q^2) - (p^2 + q^2)^2"
-[equations]
-x = "growth*u*c + v*s - pi*f*y"
-y = "growth*u*s - v*c + pi*f*x"
-p = "radius*p - 1.7*q"
-q = "1.7*p + radius*q"
-z = "m - z^2"
-"""
+UNCOUPLED = load_model(
+    table(
+        "uncoupled",
+        {
+            "x": "growth*u*c + v*s - pi*f*y",
+            "y": "growth*u*s - v*c + pi*f*x",
+            "p": "radius*p - 1.7*q",
+            "q": "1.7*p + radius*q",
+            "z": "m - z^2",
+        },
+        {"mu": -0.1, "a": -1.0, "nu": -0.1, "b": -1.0, "m": 0.3},
+        define={
+            "c": "cos(pi*f*t)",
+            "s": "sin(pi*f*t)",
+            "u": "x*c + y*s",
+            "v": "y*c - x*s",
+            "growth": "mu + a*u^2 - u^4",
+            "radius": "nu + b*(p^2 + q^2) - (p^2 + q^2)^2",
+        },
+    )
+)
 
 FREQUENCY = 0.5
 
 
 def curves_through(kind, state, free, values, bounds, max_period=1, **parameters):
     """Follow the curve of a bifurcation of the uncoupled oscillators."""
-    model = load_model(tomllib.loads(UNCOUPLED))
+    model = UNCOUPLED
     scales = tuple(high - low for low, high in bounds)
     family = Family(model.system, 1, FREQUENCY, model.load(**parameters).pack(), free, scales)
     start = family.unknowns(np.array(state, float), values)
@@ -82,7 +70,7 @@ def located(curves):
 @pytest.fixture(scope="module")
 def stuart_landau():
     """All curves of the forced Stuart-Landau oscillator, from the folds along F at w0 - W = 0.3."""
-    model, sigma, force = load_model(tomllib.loads(STUART_LANDAU)), 0.3, 1.2
+    model, sigma, force = STUART_LANDAU, 0.3, 1.2
     frequency = 1.0 / (2.0 * np.pi)
     rho = max(r.real for r in np.roots([1.0, -2.0, 1.0 + sigma**2, -(force**2)]) if abs(r.imag) < 1e-9)
     z = force / (rho - 1.0 - 1j * sigma)
@@ -126,25 +114,19 @@ def test_stuart_landau__points(stuart_landau):
     for one, other in zip(sorted(found), sorted(expected), strict=True):
         assert one[0] == other[0]
         assert one[1:] == pytest.approx(other[1:], abs=1e-7)
-
-
-def test_merged__no_chenciner_point_at_a_resonance(stuart_landau):
-    """The Neimark-Sacker curves end at R1, where the coefficient has no meaning; farther away it has."""
+    ds = curves_dataset(stuart_landau, "w0", "F", STUART_LANDAU)
+    shown = curves_table(ds)
+    points = [row for row in shown.rows if row["type"] == "cusp"]
+    assert len(points) == 2
+    assert set(points[0]) >= {"type", "w0", "F", "period", "error"}
+    assert all(0.0 <= row["error"] < 1e-6 for row in points)
+    assert any("cusp" in line for line in shown.lines)
+    # The Neimark-Sacker curves end at R1, where the coefficient has no meaning; farther away it has
     (r1, *_) = [one for curve in stuart_landau for one in curve.special if one.kind == "r1"]
     u = r1.point.u + np.array([0.0, 0.0, 1e-8, 0.0])
     beside = replace(r1, kind="chenciner", point=replace(r1.point, u=u))
     away = replace(beside, point=replace(r1.point, u=u + [0.0, 0.0, 1e-3, 0.0]))
     assert [one.kind for one in codimension_two.merged({0: [beside, r1, away]})] == ["r1", "chenciner"]
-
-
-def test_curves_table__names_the_points(stuart_landau):
-    ds = curves_dataset(stuart_landau, "w0", "F", load_model(tomllib.loads(STUART_LANDAU)))
-    table = curves_table(ds)
-    points = [row for row in table.rows if row["type"] == "cusp"]
-    assert len(points) == 2
-    assert set(points[0]) >= {"type", "w0", "F", "period", "error"}
-    assert all(0.0 <= row["error"] < 1e-6 for row in points)
-    assert any("cusp" in line for line in table.lines)
 
 
 @pytest.mark.slow
@@ -182,13 +164,24 @@ def test_generalised_doubling__and_the_folds_that_spring_from_it():
 
 
 @pytest.mark.slow
-def test_chenciner():
+def test_chenciner(monkeypatch):
     """r' = r (nu + b r^2 - r^4)."""
-    bounds = ((-0.5, 0.5), (-1.0, 1.0))
-    curves = curves_through("neimark_sacker", [0, 0, 0, 0, np.sqrt(0.3)], ("nu", "b"), [0.0, -0.4], bounds)
+    given = ("neimark_sacker", [0, 0, 0, 0, np.sqrt(0.3)], ("nu", "b"), [0.0, -0.4], ((-0.5, 0.5), (-1.0, 1.0)))
+    curves = curves_through(*given)
     ((kind, value),) = located(curves)
     assert kind == "chenciner"
     np.testing.assert_allclose(value, 0.0, atol=1e-7)
+    # A sign change without a located zero is told, not dropped
+
+    def nothing(*words):
+        return None
+        yield
+
+    monkeypatch.setattr(codimension_two, "find_root", nothing)
+    curves = curves_through(*given)
+    ds = curves_dataset(curves, "nu", "b", UNCOUPLED)
+    assert ds["n_missed"].values.tolist() == [1]
+    assert any("1 sign change of test functions could not be located" in line for line in curves_table(ds).lines)
 
 
 @pytest.mark.slow
@@ -209,19 +202,3 @@ def test_two_bifurcations_at_once(kind, free, bifurcations):
     assert {name for name, _ in located(curves)} == {kind}
     for _, value in located(curves):
         np.testing.assert_allclose(value, 0.0, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_continue_curves__counts_what_it_cannot_locate(monkeypatch):
-    """A sign change without a located zero is told, not dropped."""
-
-    def nothing(*words):
-        return None
-        yield
-
-    monkeypatch.setattr(codimension_two, "find_root", nothing)
-    bounds = ((-0.5, 0.5), (-1.0, 1.0))
-    curves = curves_through("neimark_sacker", [0, 0, 0, 0, np.sqrt(0.3)], ("nu", "b"), [0.0, -0.4], bounds)
-    ds = curves_dataset(curves, "nu", "b", load_model(tomllib.loads(UNCOUPLED)))
-    assert ds["n_missed"].values.tolist() == [1]
-    assert any("1 sign change of test functions could not be located" in line for line in curves_table(ds).lines)

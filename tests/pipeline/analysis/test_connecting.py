@@ -1,24 +1,21 @@
 """Orbits connected by continuation, and the ids that follow from it."""
 
-from __future__ import annotations
-
-import tomllib
-
 import numpy as np
 import pytest
 import xarray as xr
 
 from magpend_core import trajectory
 from magpend_core.models import load_model
-from magpend_core.orbits import polish_orbits
-from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.matching.connections import grouped
-from pipeline.analysis.attractors.matching.matching import BASES
+from pipeline.analysis.attractors.matching import BASES, grouped
 from pipeline.analysis.branches import connecting
 from pipeline.analysis.branches.connecting import Web, connect
 from pipeline.analysis.branches.sheets import BORDER, ENDED, LINKED, Axis, Grid
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
+from tests.core.cells import polish
+from tests.core.flows import table
 from tests.pipeline.analysis.dense_sets import match
+
+from .cubes import attributes_of
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.2 / (2.0 * np.pi)
@@ -29,15 +26,10 @@ HARDENING = DUFFING.load("hardening")
 
 def closed(parameters, frequency, state, period):
     """Section points of the orbit near a state, none if Newton's method fails."""
-    system = parameters.model.system
-    packed, f = parameters.pack()[None], np.array([frequency])
-    found = polish_orbits(packed, f, np.array([state]), np.array([period]), system=system)
+    found = polish(parameters, [state], period, frequency)
     assert found.converged[0]
     assert found.orbit_period[0] == period
-    images = run_branches(
-        packed[:, None], f[:, None], found.section, n_transient=0, n_keep=period, rtol=1e-12, atol=1e-12, system=system
-    ).section[0, 0]
-    return np.roll(images, 1, axis=0)
+    return found.points[0, :period]
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +71,7 @@ def test_connect__through_the_unstable_part(wells):
     found = line(*orbits)
     assert sorted(found.links.tolist()) == [[0, 2, 0], [1, 3, 0]]
     assert found.ways[:, 0].tolist() == 2 * [[LINKED, BORDER]] + 2 * [[BORDER, LINKED]]
-
-
-def test_connect__doublings(wells):
-    """From the orbit of period 4 down to that of period 2, and from there to the single one."""
+    # From the orbit of period 4 down to that of period 2, and from there to the single one
     orbits = [(0, 0.26, wells(1, 0.26)), (1, 0.28, wells(2, 0.28)), (2, 0.29, wells(4, 0.29))]
     found = line(*orbits)
     assert sorted(link for link in found.links.tolist() if max(link) < 3) == [[1, 0, 1], [2, 1, 1]]
@@ -129,12 +118,7 @@ def test_grouped__no_two_of_one_place_together():
 
 # ---- two parameters ----------------------------------------------------------------------------
 
-CUSP = """
-name = "cusp"
-states = { x = {}, y = {} }
-parameters = { a = 0.0, b = 0.0 }
-equations = { x = "a + b*x - x^3", y = "-y + cos(2*pi*f*t)" }
-"""
+CUSP = load_model(table("cusp", {"x": "a + b*x - x^3", "y": "-y + cos(2*pi*f*t)"}, {"a": 0.0, "b": 0.0}))
 """Two sheets and their fold over a and b, with a cusp at 0, beside a damped state that the drive moves."""
 
 
@@ -143,7 +127,7 @@ Y = 1.0 / (1.0 + 4.0 * np.pi**2)
 
 def cusp(places):
     """Grid over a and b, and the stable orbits at some of its points: places and states."""
-    system = load_model(tomllib.loads(CUSP)).system
+    system = CUSP.system
     a, b = np.linspace(-0.6, 0.6, 13), np.linspace(-0.4, 1.2, 9)
     columns = [system.parameter_names.index(name) for name in "ab"]
     packed = np.zeros((117, len(system.parameter_names)))
@@ -178,7 +162,7 @@ def test_connect__a_sheet_around_a_cusp():
 # ---- ids ---------------------------------------------------------------------------------------
 
 
-def appearances(axis, values, *points, model="duffing", parameters=TWIN_WELL, sides=None):
+def appearances(axis, values, *points, parameters=TWIN_WELL, sides=None):
     """Dataset as of `identify`: per value a list of orbits."""
     rows = max(len(p) for p in points)
     n_states = parameters.model.system.n_states
@@ -190,7 +174,6 @@ def appearances(axis, values, *points, model="duffing", parameters=TWIN_WELL, si
     dims = (axis, "attractor")
     present = (period > 0).astype(np.int8)
     n_angles = len(parameters.model.angles)
-    text = "\n".join(f"{n} = {v!r}" for n, v in parameters.items())
     ds = xr.Dataset(
         {
             "kind": (dims, PERIODIC_ORBIT * present),
@@ -201,7 +184,7 @@ def appearances(axis, values, *points, model="duffing", parameters=TWIN_WELL, si
             "attractor_id": ((axis, "initial_condition"), np.where(present, np.arange(rows), -1).astype(np.int32)),
         },
         coords={axis: list(values)},
-        attrs={"model": model, "parameters": text},
+        attrs=attributes_of(parameters),
     )
     if sides is not None:
         ds["side"] = (dims, np.asarray(sides, np.int8))
@@ -214,16 +197,13 @@ def told(ds):
     return [[(int(i), BASES[b]) for i, b in zip(ids, basis, strict=True) if b] for basis in ds["match_basis"].values]
 
 
+@pytest.mark.slow
 def test_match__ids_rest_on_followed_branches(wells):
     """However far apart: the unstable part of a branch and a doubling connect, distance never did."""
     ds = appearances("amplitude", [0.2, 0.28, 0.3], [wells(1, 0.2)], [wells(2, 0.28)], [wells(1, 0.3)])
     assert told(match(ds, threshold=1e-9)) == [[(0, "first_appearance")], [(0, "doubling")], [(0, "branch")]]
     assert match(ds, threshold=1e-9, connect=False).sizes["attractor"] == 3
-
-
-@pytest.mark.slow
-def test_match__coexisting_attractors_have_different_ids(wells):
-    """The single orbit is listed beside the doubled one: the doubled one is another attractor then."""
+    # The single orbit is listed beside the doubled one: the doubled one is another attractor then
     ds = appearances("amplitude", [0.26, 0.28], [wells(1, 0.26)], [wells(1, 0.28), wells(2, 0.28)])
     named = match(ds)
     assert told(named) == [[(0, "first_appearance")], [(0, "branch"), (1, "first_appearance")]]
@@ -255,9 +235,7 @@ def test_match__one_sided_motions_through_the_chaotic_band():
     """Period 1 is unstable from 2.372 to 2.499 Hz on the right, from 2.386 to 2.506 on the left."""
     parameters = load_model("pendulum").load()
     points = [[RIGHT[f], LEFT[f]] if f in LEFT else [RIGHT[f]] for f in RIGHT]
-    ds = appearances(
-        "frequency", list(RIGHT), *points, model="pendulum", parameters=parameters, sides=[[2, 1], [2, 0], [2, 1]]
-    )
+    ds = appearances("frequency", list(RIGHT), *points, parameters=parameters, sides=[[2, 1], [2, 0], [2, 1]])
     named = match(ds, threshold=1e-9)
     periods, sides = named["orbit_period"].values, named["side"].values
     assert sorted(zip(sides[0].tolist(), periods.T.tolist(), strict=True)) == [(1, [1, 0, 1]), (2, [1, 2, 1])]

@@ -1,10 +1,7 @@
 """Search of all periodic orbits at a parameter point, against scipy, published orbits and the sum of the indices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
@@ -16,6 +13,7 @@ from pipeline.analysis.branches.deflation import (
     index_sums,
     search_orbits,
 )
+from tests.core.cells import scipy_end
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.0 / (2.0 * np.pi)
@@ -44,9 +42,12 @@ def test_search_orbits__each_is_an_orbit_and_is_found_once(everything):
     for one in everything:
         assert not any(np.abs(one.points[0] - point).max() < 1e-5 for point in seen)
         for here, there in zip(one.points, np.roll(one.points, -1, axis=0), strict=True):
-            end = solve_ivp(rates, (0.0, 2.0 * np.pi), here, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-            np.testing.assert_allclose(end, there, atol=1e-8)
+            np.testing.assert_allclose(scipy_end(rates, here, 2.0 * np.pi), there, atol=1e-8)
             seen.append(here)
+    plain = found_of(0, n=60)
+    more = found_of(6, n=60)
+    assert len(more) > len(plain)
+    assert any(one.search_round > 0 and one.n_hits == 0 for one in more)
 
 
 def test_search_orbits__has_the_edge_orbit(everything):
@@ -55,10 +56,7 @@ def test_search_orbits__has_the_edge_orbit(everything):
     edge = everything[int(np.argmin(away))]
     assert min(away) < 1e-9
     np.testing.assert_allclose(edge.multipliers, [324.501702, 0.00120079844], rtol=1e-6)
-
-
-def test_search_orbits__the_indices_add_up(everything):
-    """To 1 in the plane, only if no orbit is missing."""
+    # To 1 in the plane, only if no orbit is missing
     assert index_sums(everything, 1) == {1: 1}
     saddle = next(one for one in everything if one.index() == -1)
     assert index_sums([one for one in everything if one is not saddle], 1) == {1: 2}
@@ -66,14 +64,6 @@ def test_search_orbits__the_indices_add_up(everything):
     turning = next(one for one in everything if one.multipliers[0].real < -1.0)
     assert (turning.index(), turning.index(2)) == (1, -1)
     assert coverage(everything) > 0.95
-
-
-@pytest.mark.slow
-def test_search_orbits__deflation_finds_more(everything):
-    plain = found_of(0, n=60)
-    more = found_of(6, n=60)
-    assert len(more) > len(plain)
-    assert any(one.search_round > 0 and one.n_hits == 0 for one in more)
 
 
 def test_stretch__is_newtons_method_for_the_deflated_function():
@@ -96,15 +86,12 @@ def test_stretch__is_newtons_method_for_the_deflated_function():
     np.testing.assert_allclose(factor[0] * step, expected, rtol=1e-6)
 
 
-def test_coverage__counts_orbits_met_once():
+def test_coverage_and_expected_index__on_paper():
     def one(n_hits):
         return FoundOrbit(np.zeros((1, 2)), np.eye(2), n_hits, 0)
 
     assert coverage([one(6), one(3), one(1)]) == pytest.approx(0.9)
     assert np.isnan(coverage([]))
-
-
-def test_expected_index():
-    """1 in the plane; 0 where an angle goes round, since the Euler characteristic of a circle is 0."""
+    # 1 in the plane; 0 where an angle goes round, since the Euler characteristic of a circle is 0
     assert expected_index(DUFFING.system) == 1
     assert expected_index(PENDULUM_FITTED) == 0

@@ -1,9 +1,5 @@
 """Branches of equilibria of flows: folds, branch points, Hopf points, and the cycles that leave them."""
 
-from __future__ import annotations
-
-import tomllib
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -12,35 +8,23 @@ from scipy.optimize import fsolve
 from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.branches import Scope, Start, dataset_of, explore
+from pipeline.analysis.branches.analysis import branches_table
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.bifurcations import n_unstable
-from pipeline.analysis.branches.equilibria import EquilibriumProblem
-from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.table import branches_table
+from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.problems import EquilibriumProblem, Family
+from tests.core.cells import scipy_end
+from tests.core.flows import model_of, table
+from tests.core.models.test_library import EQUATIONS
 
-BRUSSELATOR = """
-name = "brusselator"
-[states]
-x = { unit = "1" }
-y = { unit = "1" }
-[parameters]
-a = 1.2
-b = 2.0
-[equations]
-x = "a + x^2*y - (b + 1)*x"
-y = "b*x - x^2*y"
-"""
-
-CUBIC = """
-name = "cubic"
-[states]
-x = { unit = "1" }
-[parameters]
-m = 0.0
-[equations]
-x = "m + 3*x - x^3"
-"""
+BRUSSELATOR = table(
+    "brusselator",
+    {"x": "a + x^2*y - (b + 1)*x", "y": "b*x - x^2*y"},
+    {"a": 1.2, "b": 2.0},
+    states={"x": {"scale": 2.0}, "y": {"scale": 0.5}},
+)
 
 
 def branches_of(model, parameter, interval, state, value, section=None, step=5e-3, **overrides):
@@ -48,13 +32,9 @@ def branches_of(model, parameter, interval, state, value, section=None, step=5e-
     seen = model if section is None else sectioned(model, section)
     parameters = seen.load(**overrides)
     low, high = interval
-    family = Family(
-        seen.system, 0, 1.0 / (section.longest if section else 1.0), parameters.pack(), (parameter,), (high - low,)
-    )
-    found = explore(
-        [Start(family, np.array(state, float), value)], Scope(low, high, 2, settings=Settings(longest_step=step))
-    )
-    return found, parameters
+    rate, scope = section.frequency_hz if section else 1.0, Scope(low, high, 2, settings=Settings(longest_step=step))
+    family = Family(seen.system, 0, rate, parameters.pack(), (parameter,), (high - low,))
+    return explore([Start(family, np.array(state, float), value)], scope), parameters
 
 
 def only(branch, kind):
@@ -65,7 +45,7 @@ def only(branch, kind):
 @pytest.mark.slow
 def test_equilibria__folds_of_a_cubic():
     """m = x^3 - 3 x: folds at x = -1 and 1, m = 2 and -2; stable, unstable, stable."""
-    model = load_model(tomllib.loads(CUBIC))
+    model = model_of({"x": "m + 3*x - x^3"}, {"m": 0.0})
     (branch,), _ = branches_of(model, "m", (-4.0, 4.0), [2.1], 2.1**3 - 6.3)
     folds = sorted((branch.family.values(b.point.u)[0], branch.family.state(b.point.u)[0]) for b in branch.bifurcations)
     np.testing.assert_allclose(folds, [(-2.0, 1.0), (2.0, -1.0)], atol=1e-7)
@@ -116,10 +96,7 @@ def test_equilibria__pitchfork_of_lorenz():
 @pytest.mark.slow
 def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
     """b = 1 + a^2, w = a, supercritical; amplitudes by the coefficient and by scipy."""
-    a, table, scales = 1.2, tomllib.loads(BRUSSELATOR), (2.0, 0.5)
-    for state, scale in zip(table["states"].values(), scales, strict=True):
-        state["scale"] = scale
-    model = load_model(table)
+    a, model = 1.2, load_model(BRUSSELATOR)
     section = Crossing("x", a, "up", 100.0)
     found, parameters = branches_of(model, "b", (1.5, 3.5), [a, 2.0 / a], 2.0, section)
     hopf, b = only(found[0], "hopf")
@@ -136,9 +113,9 @@ def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
         x, y = z
         return [a + x * x * y - (b + near + 1.0) * x, (b + near) * x - x * x * y]
 
-    settled = solve_ivp(rates, (0.0, 6e3), [a + 0.08, (b + near) / a], method="DOP853", rtol=1e-9, atol=1e-11).y[:, -1]
+    settled = scipy_end(rates, [a + 0.08, (b + near) / a], 6e3, 1e-9)
     last = solve_ivp(rates, (0.0, 12.0), settled, method="DOP853", rtol=1e-10, atol=1e-12, max_step=0.01).y
-    assert 2.0 * radius * abs(vector[0]) * scales[0] == pytest.approx(0.5 * np.ptp(last[0]), rel=0.01)
+    assert 2.0 * radius * abs(vector[0]) * 2.0 == pytest.approx(0.5 * np.ptp(last[0]), rel=0.01)
     cycles = hopf.child
     assert cycles is not None
     assert cycles.family.parameters[-1] == pytest.approx(a)
@@ -161,43 +138,6 @@ def test_equilibrium_problem__derivative():
     np.testing.assert_allclose(value.derivative, np.transpose(by_differences), atol=1e-7)
 
 
-FLUTTER = {"b": 0.15, "a": -0.5, "rho": 1.204, "mw": 5.3, "mT": 16.9, "c1": 0.165, "c2": 0.0455, "c3": 0.335, "c4": 0.3}
-RIG = {"Ia": 0.1724, "ca": 0.5628, "ch": 14.5756, "ka": 54.1162, "k2": 751.6, "k3": 5006.7, "kh": 3529.4, "xa": 0.24}
-
-
-def flutter_matrices():
-    """Inverse mass matrix, and damping and stiffness matrices by powers of U (Lee, Barton and Renson's rig)."""
-    p = type("P", (), FLUTTER | RIG)
-    pi, s = np.pi, 1.0 - p.c1 - p.c3
-    mass = np.array(
-        [
-            [p.mT + pi * p.rho * p.b**2, p.mw * p.xa * p.b - p.a * pi * p.rho * p.b**3, 0.0],
-            [p.mw * p.xa * p.b - p.a * pi * p.rho * p.b**3, p.Ia + pi * (0.125 + p.a**2) * p.rho * p.b**4, 0.0],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    half, lag = p.a + 0.5, p.c1 * p.c2 + p.c3 * p.c4
-    # coefficients of 1, U, U^2, U^3
-    damping, stiffness = np.zeros((4, 3, 3)), np.zeros((4, 3, 3))
-    damping[0, 0, 0], damping[0, 1, 1] = p.ch, p.ca
-    damping[0, 2, 0], damping[0, 2, 1] = -1.0 / p.b, p.a - 0.5
-    damping[1, 0, 0] = 2.0 * pi * p.rho * p.b * s
-    damping[1, 0, 1] = (1.0 + s * (1.0 - 2.0 * p.a)) * pi * p.rho * p.b**2
-    damping[1, 1, 0] = -2.0 * pi * half * p.rho * p.b**2 * s
-    damping[1, 1, 1] = (0.5 - p.a) * (1.0 - s * (1.0 + 2.0 * p.a)) * pi * p.rho * p.b**3
-    damping[1, 2, 2] = (p.c2 + p.c4) / p.b
-    damping[2, 0, 2] = 2.0 * pi * p.rho * p.b * lag
-    damping[2, 1, 2] = -2.0 * pi * p.rho * p.b**2 * half * lag
-    stiffness[0, 0, 0], stiffness[0, 1, 1] = p.kh, p.ka
-    stiffness[1, 2, 1] = -1.0 / p.b
-    stiffness[2, 0, 1] = 2.0 * pi * p.rho * p.b * s
-    stiffness[2, 1, 1] = -2.0 * pi * half * p.rho * s * p.b**2
-    stiffness[2, 2, 2] = p.c2 * p.c4 / p.b**2
-    stiffness[3, 0, 2] = 2.0 * pi * p.rho * p.c2 * p.c4 * (p.c1 + p.c3)
-    stiffness[3, 1, 2] = -2.0 * pi * p.rho * p.b * half * p.c2 * p.c4 * (p.c1 + p.c3)
-    return np.linalg.inv(mass), damping, stiffness
-
-
 @pytest.mark.slow
 def test_equilibria__flutter_rig():
     """Hopf point and fold of the cycles as own shooting with DOP853 found them (Lee, Barton and Renson's model)."""
@@ -217,19 +157,13 @@ def test_equilibria__flutter_rig():
 
 
 def shooting(family, point):
-    """Find the same cycle from the matrices by scipy: its state where heave rises through 0, and its period."""
-    inverse, damping, stiffness = flutter_matrices()
-    powers = float(family.values(point.u)[0]) ** np.arange(4)
-    d, k = np.tensordot(powers, damping, 1), np.tensordot(powers, stiffness, 1)
-
-    def rates(t, z):
-        spring = np.array([0.0, RIG["k2"] * z[1] ** 2 + RIG["k3"] * z[1] ** 3, 0.0])
-        return np.concatenate([z[3:], -inverse @ (d @ z[3:] + k @ z[:3] + spring)])
+    """The same cycle by scipy and the rates of test_library: state where heave rises through 0, and period."""
+    rates, published = EQUATIONS["flutter"]
+    own = {**published, "U": float(family.values(point.u)[0])}
 
     def mismatch(unknowns):
         start = np.array([0.0, *unknowns[:5]])
-        end = solve_ivp(rates, (0.0, unknowns[5]), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-        return end - start
+        return scipy_end(lambda t, z: rates(t, z, own), start, unknowns[5]) - start
 
     guess = np.array([*family.state(point.u)[1:], point.value.seconds]) * (1.0 + 1e-4)
     found, _, good, _ = fsolve(mismatch, guess, xtol=1e-13, full_output=True)

@@ -1,103 +1,22 @@
 """Cells that are extended: maps whose attractors, repellers and lifetimes are known on paper."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from magpend_core.status import Status
-from pipeline.analysis.attractors.describing.labelling import (
-    _label_courses,
-    _Labels,
-    _preserves_volume,
-    _representatives,
-)
-from pipeline.analysis.attractors.extension.extending import Outcome, _Extension, extend
+from pipeline.analysis.attractors.extension.extending import Outcome, _Extension
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
-from pipeline.analysis.attractors.finding.cell_blocks import Block
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.finding.requests import Settings
+from pipeline.analysis.attractors.labelling import _label_courses, _Labels, _preserves_volume, _representatives
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 
-from .maps import henon, slopes_of
+from .maps import FIXED, N_KEEP, MapPoint, henon, settle, slopes_of, tent
 
-N_KEEP = 20
 TENT_SLOPE = 2.05
-
-
-class MapPoint:
-    """Cells of a map in place of a parameter point."""
-
-    can_rest, is_flow, n_neutral = False, False, 0
-    at_rest = on_cycle = None
-
-    def __init__(self, step, slope, starts, seen=N_KEEP):
-        self.step, self.slope = step, slope
-        self.section = np.empty((len(starts), N_KEEP, starts.shape[1]))
-        state = starts.copy()
-        for i in range(N_KEEP):
-            state = step(state)
-            self.section[:, i] = state
-        self.n_cells, self.n_periods, self.n_states = len(starts), seen * len(starts), starts.shape[1]
-        self.rtols = []
-
-    def blocks(self):
-        n = self.n_cells
-        yield Block(slice(0, n), self.section, np.full(n, Status.BOUNDED), np.zeros(n, int), np.zeros((n, 0)))
-
-    def volumes(self, derivatives, before, after):
-        return np.linalg.slogdet(derivatives)[1]
-
-
-def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0) -> Outcome:
-    """Drive the extension of a point by its own map."""
-    n_states = point.section.shape[2]
-    geometry = Geometry((False,) * n_states, (scale,) * n_states)
-    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry)
-    work = extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, 32)
-    answer = None
-    while True:
-        try:
-            asked = work.send(answer)
-        except StopIteration as stop:
-            return stop.value
-        if isinstance(asked, Leg):
-            section, state = np.empty((len(asked.state), LEG, n_states)), asked.state.copy()
-            for i in range(LEG):
-                state = point.step(state)
-                section[:, i] = state
-            n = len(state)
-            status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
-            answer = Extended(
-                section, status, np.zeros(n, int), np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG))
-            )
-        elif isinstance(asked, Slopes):
-            point.rtols.append(asked.rtol)
-            answer = point.step(asked.point), point.slope(asked.point)
-        else:
-            assert isinstance(asked, Polish)
-            answer = [None] * len(asked.guesses.key)
-
-
-def tent(slope):
-    """Tent map on [0, 1]; what leaves through the top is drawn to 2."""
-
-    def step(x):
-        inside = slope * np.minimum(x, 1.0 - x)
-        return np.where(x <= 1.0, inside, 2.0 + 0.5 * (x - 2.0))
-
-    def derivative(x):
-        return np.where(x < 0.5, slope, -slope)[:, :, None]
-
-    return step, derivative
-
-
-FIXED = Orbit(np.array([[2.0]]), np.array([0.5 + 0j]), 1e-12, np.array([[0.5]]))
 
 
 def test_extend__escape_rate_of_the_tent_map():
@@ -124,6 +43,14 @@ def test_extend__a_chaotic_attractor_stays():
     # the sample stayed for ten times the 20 sections that were seen
     assert min(course.length for course in found.courses) >= 200
     assert not found.ran_out
+    starts = np.random.default_rng(4).uniform(0.2, 0.8, (50, 1))
+    found = settle(MapPoint(*tent(1.9), starts), budget=0.0)
+    assert found.spent == 0
+    assert {(one.kind, one.stability) for one in found.sets} == {(BOUNDED_SET, NOT_SETTLED)}
+    starts = np.random.default_rng(4).uniform(0.2, 0.8, (10, 1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = settle(MapPoint(lambda x: np.where(x < 3, x + 0.05, x**8), lambda x: x[:, :, None], starts))
+    assert {course.end for course in found.courses} == {-3}
 
 
 @pytest.mark.slow
@@ -171,9 +98,6 @@ def test_extend__a_torus_attracts():
     (one,) = found.sets
     assert (one.kind, one.stability) == (TORUS, ATTRACTS)
     assert abs(one.growth.weighted) < 1e-9
-
-
-def test_extend__a_torus_of_a_conservative_map_is_neutral():
     starts = np.random.default_rng(6).normal(size=(4, 2))
     found = settle(MapPoint(*rotation(GOLDEN, 1.0), starts))
     # each cell keeps its own radius
@@ -194,20 +118,6 @@ def test_extend__a_slow_spiral_is_not_settled():
 
     found = settle(MapPoint(step, derivative, np.array([[1.0, 0.0]])), budget=1.0)
     assert {one.stability for one in found.sets} == {NOT_SETTLED}
-
-
-def test_extend__cells_that_diverge_are_no_set():
-    starts = np.random.default_rng(4).uniform(0.2, 0.8, (10, 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = settle(MapPoint(lambda x: np.where(x < 3, x + 0.05, x**8), lambda x: x[:, :, None], starts))
-    assert {course.end for course in found.courses} == {-3}
-
-
-def test_extend__without_a_budget_nothing_is_said():
-    starts = np.random.default_rng(4).uniform(0.2, 0.8, (50, 1))
-    found = settle(MapPoint(*tent(1.9), starts), budget=0.0)
-    assert found.spent == 0
-    assert {(one.kind, one.stability) for one in found.sets} == {(BOUNDED_SET, NOT_SETTLED)}
 
 
 @pytest.mark.slow
@@ -263,10 +173,7 @@ def test_growth__exponents_of_the_henon_map():
     assert found.is_chaotic
     assert not found.preserves_volume
     assert found.volume == pytest.approx(np.log(0.3))
-
-
-def test_growth__of_directions_that_vanish():
-    """A ball that comes to rest forgets its start; nothing is divided by that."""
+    # A ball that comes to rest forgets its start; nothing is divided by that
     slopes = np.zeros((2, 64, 2, 2))
     slopes[0, ::2] = [[0.5, 0.1], [0.0, 0.2]]
     with np.errstate(divide="ignore"):

@@ -1,29 +1,16 @@
 """Conclusions about attractors that must not be drawn: rotation at rest, families that attract, sets of one cell."""
 
-from __future__ import annotations
-
-import json
-
 import numpy as np
 import pytest
-import xarray as xr
 from scipy.integrate import solve_ivp
 from scipy.spatial import cKDTree
 
-from magpend_core import run_branches
 from magpend_core.crossing import Crossing
 from magpend_core.equilibria import find_equilibria
 from magpend_core.models import load_model
-from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
-from pipeline.analysis.attractors.extension.extending import extend
-from pipeline.analysis.attractors.finding.cell_blocks import Block
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Settings, Slopes
 from pipeline.analysis.attractors.finding.stability import BY_ONE_SIDE
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.sets import Geometry
-from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     BOUNDED_SET,
@@ -35,43 +22,35 @@ from pipeline.layout.vocabulary import (
     TORUS,
     TRANSIENT,
     UNSTABLE,
-    section_attributes,
 )
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
+from tests.core.flows import table
 from tests.pipeline.analysis.dense_sets import identify
-from tests.zoo.variants import write
+from tests.pipeline.factories import quietly
+
+from .cubes import flow_cube, sweep
+from .maps import FIXED, MapPoint, settle, tent
 
 pytestmark = pytest.mark.slow
 
 CIRCLE = {"on_circle": True}
 
-UNIFORM_ANGLE = {
-    "name": "uniform_angle",
-    "states": {"r": {}, "th": CIRCLE},
-    "parameters": {"w": 1.0},
-    "equations": {"r": "r*(1-r**2)", "th": "w"},
-}
+UNIFORM_ANGLE = table("uniform_angle", {"r": "r*(1-r**2)", "th": "w"}, {"w": 1.0}, states={"th": CIRCLE})
 """Radius and angle: a limit cycle of 2 pi/w with the multiplier exp(-4 pi/w)."""
 
-IDLE_CLOCK = {
-    "name": "idle_clock",
-    "states": {"x": {}, "v": {}, "th": CIRCLE},
-    "parameters": {"w": 1.3, "c": 0.2},
-    "equations": {"x": "v", "v": "-c*v-x", "th": "w"},
-}
+IDLE_CLOCK = table("idle_clock", {"x": "v", "v": "-c*v-x", "th": "w"}, {"w": 1.3, "c": 0.2}, states={"th": CIRCLE})
 """A damped oscillator at rest beside a clock: the multipliers exp(-c pi/w) are two."""
 
 ANGLES = ("a", "b", "c")
-KURAMOTO = {
-    "name": "kuramoto",
-    "states": dict.fromkeys(ANGLES, CIRCLE),
-    "parameters": {"wa": 1.0, "wb": 1.1, "wc": 0.9, "k": 1.0},
-    "equations": {x: f"w{x}+k/3*(" + "+".join(f"sin({y}-{x})" for y in ANGLES if y != x) + ")" for x in ANGLES},
-}
+KURAMOTO = table(
+    "kuramoto",
+    {x: f"w{x}+k/3*(" + "+".join(f"sin({y}-{x})" for y in ANGLES if y != x) + ")" for x in ANGLES},
+    {"wa": 1.0, "wb": 1.1, "wc": 0.9, "k": 1.0},
+    states=dict.fromkeys(ANGLES, CIRCLE),
+)
 """Phase oscillators: locked, all turn at the mean of their frequencies."""
 
 
@@ -83,30 +62,15 @@ def oscillators(*rates):
             f"x{i}": f"x{i}*(1 - x{i}**2 - y{i}**2) - {w}*y{i}",
             f"y{i}": f"y{i}*(1 - x{i}**2 - y{i}**2) + {w}*x{i}",
         }
-    return {
-        "name": f"oscillators{len(rates)}",
-        "states": {x: {} for x in equations},
-        "parameters": {"a": 1.0},
-        "equations": equations,
-    }
+    return table(f"oscillators{len(rates)}", equations, {"a": 1.0})
 
 
 RATES = (1.0, float(np.sqrt(2.0)), float(np.sqrt(5.0) - 1.0))
 
-HELD = {
-    **oscillators(1.0),
-    "name": "held",
-    "states": {"x0": {}, "y0": {}, "s": {}},
-    "equations": {**oscillators(1.0)["equations"], "s": "0*s"},
-}
+HELD = table("held", {**oscillators(1.0)["equations"], "s": "0*s"}, {"a": 1.0})
 """A parameter written as a state: a limit cycle for each value of it."""
 
-THREE_FATES = {
-    "name": "three_fates",
-    "states": {"x": {}, "y": {}, "z": {}},
-    "parameters": {"s": 0.125},
-    "equations": {"x": "s*(y - x)", "y": "-x*z - y", "z": "x*y + 0.6*z"},
-}
+THREE_FATES = table("three_fates", {"x": "s*(y - x)", "y": "-x*z - y", "z": "x*y + 0.6*z"}, {"s": 0.125})
 """Lorenz with r = 0, b = -.6: two limit cycles, each the mirror image of the other."""
 
 
@@ -115,67 +79,22 @@ def three_fates(_, u):
     return [0.125 * (y - x), -x * z - y, x * y + 0.6 * z]
 
 
-PREY = {
-    "name": "prey",
-    "states": {"x": {}, "y": {}},
-    "parameters": {"a": 1.0},
-    "equations": {"x": "x*(a - y)", "y": "y*(x - a)"},
-}
+PREY = table("prey", {"x": "x*(a - y)", "y": "y*(x - a)"}, {"a": 1.0})
 """Lotka and Volterra: closed orbits around a centre, and a volume that is preserved in logarithms only."""
 
-PENDULUM = {
-    "name": "free_pendulum",
-    "states": {"x": CIRCLE, "v": {}},
-    "parameters": {"w": 1.0},
-    "equations": {"x": "v", "v": "-w**2*sin(x)"},
-}
+PENDULUM = table("free_pendulum", {"x": "v", "v": "-w**2*sin(x)"}, {"w": 1.0}, states={"x": CIRCLE})
 
 
-def found_of(table, starts, *, crossing=None, frequency_hz=1.0, n_transient=200, n_keep=20, values=(), **options):
+def found_of(equations, starts, **options):
     """Integrate cells of one parameter point, and find their sets."""
-    model = load_model(table)
-    model = model if crossing is None else sectioned(model, crossing)
-    parameters, n = model.load(**dict(values)), len(starts)
-    rate = frequency_hz if crossing is None else crossing.frequency_hz
-    found = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)),
-        np.full((n, 1), rate),
-        np.array(starts),
-        n_transient=n_transient,
-        n_keep=n_keep,
-        rtol=1e-9,
-        atol=1e-9,
-        system=model.system,
-    )
-    cells = "initial_condition"
-    variables = {
-        "section": ((cells, "period_index", "state"), found.section[:, 0]),
-        "status": (cells, found.status[:, 0], {"flag_values": [], "flag_meanings": ""}),
-        "orbit_period": (cells, found.orbit_period[:, 0]),
-        "turns": ((cells, "angle"), found.turns[:, 0]),
-    }
-    coords = {"state": list(model.state_names)}
-    if crossing is None:
-        coords["frequency"] = float(frequency_hz)
-    else:
-        variables["rest_state"] = ((cells, "state"), rest_states(found)[:, 0])
-    attrs = {
-        "model": json.dumps(model.reference),
-        "closure_tolerance": 1e-6,
-        "n_transient": n_transient,
-        "n_keep": n_keep,
-        **section_attributes(model.crossing),
-        "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.as_dict().items()),
-    }
-    return identify(xr.Dataset(variables, coords=coords, attrs=attrs), **options)
+    return identify(flow_cube(equations, starts, **options))
 
 
 # ---- turning is not resting --------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("table", "states", "is_rest"),
+    ("equations", "states", "is_rest"),
     [
         (UNIFORM_ANGLE, [[1.0, 0.3]], False),
         (KURAMOTO, [[0.0, 0.1, -0.1]], False),
@@ -184,17 +103,16 @@ def found_of(table, starts, *, crossing=None, frequency_hz=1.0, n_transient=200,
     ],
     ids=["clock", "locked", "line of equilibria", "degenerate"],
 )
-def test_find_equilibria__every_rate_vanishes(table, states, is_rest):
+def test_find_equilibria__every_rate_vanishes(equations, states, is_rest):
     """The Jacobian of each is singular, so that a short Newton step proves nothing."""
-    parameters = load_model(table).load()
+    parameters = load_model(equations).load()
     found = find_equilibria(parameters.model.system, np.array(states), parameters.pack(), max_iterations=100)
     assert found.converged.tolist() == [is_rest]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("strobed", [False, True])
 @pytest.mark.parametrize(
-    ("table", "starts", "of", "seconds", "multiplier"),
+    ("equations", "starts", "of", "seconds", "multiplier"),
     [
         (UNIFORM_ANGLE, [[0.5, 1.0], [1.5, 2.0], [0.2, 0.0]], "th", 2.0 * np.pi, np.exp(-4.0 * np.pi)),
         (IDLE_CLOCK, [[0.5, 1.0, 0.3], [1.5, -2.0, 1.0]], "th", 2.0 * np.pi / 1.3, np.exp(-0.2 * np.pi / 1.3)),
@@ -202,10 +120,10 @@ def test_find_equilibria__every_rate_vanishes(table, states, is_rest):
     ],
     ids=["angle", "clock", "locked"],
 )
-def test_identify__a_steady_rotation_is_a_limit_cycle(table, starts, of, seconds, multiplier, strobed):
+def test_identify__a_steady_rotation_is_a_limit_cycle(equations, starts, of, seconds, multiplier, strobed):
     """At crossings and at even times; never at rest."""
     section = {"frequency_hz": 0.37} if strobed else {"crossing": Crossing(of, 0.0, longest=50.0)}
-    found = found_of(table, starts, **section)
+    found = found_of(equations, starts, **section)
     assert found["kind"].values.tolist() == [PERIODIC_ORBIT]
     assert found["stability"].values.tolist() == [ATTRACTS]
     assert float(found["period_s"][0]) == pytest.approx(seconds, rel=1e-9)
@@ -238,7 +156,6 @@ def test_identify__a_curve_has_one_id_at_any_phase():
 # ---- a multiplier of 1 is not attraction -------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("section", [{"frequency_hz": 0.3}, {"crossing": Crossing("x0", 0.0, longest=50.0)}])
 @pytest.mark.parametrize(("rates", "n"), [((1.0, 1.0), 1), ((1.0, 1.0), 4), (RATES, 4)])
 def test_identify__oscillators_without_coupling_are_one_torus(rates, n, section):
@@ -251,26 +168,23 @@ def test_identify__oscillators_without_coupling_are_one_torus(rates, n, section)
     assert found["n_cells"].values.tolist() == [n]
 
 
-@pytest.mark.slow
 def test_identify__tori_that_turn_against_each_other_are_two():
     """The ranges of all states are equal, and so are the exponents: x**2 + y**2 = 1 in both."""
     own = oscillators(1.0, 1.0)
     turn = {"z": "z*(1 - z**2)"}
     equations = {k: v.replace("1.0*", "z*") if k in ("x0", "y0") else v for k, v in own["equations"].items()}
-    table = {**own, "name": "turning", "states": {**own["states"], "z": {}}, "equations": {**equations, **turn}}
     starts = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 5))
     starts[:, 4] = [0.4, -0.4, 0.7, -0.7]
-    found = found_of(table, starts, frequency_hz=0.3)
+    found = found_of(table("turning", {**equations, **turn}, {"a": 1.0}), starts, frequency_hz=0.3)
     assert found["kind"].values.tolist() == [TORUS] * 2
     assert found["dimension"].values.tolist() == [2] * 2
     ids = found["attractor_id"].values
     assert ids[0] == ids[2] != ids[1] == ids[3]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("strobed", [False, True])
 @pytest.mark.parametrize(
-    ("table", "of", "level", "starts"),
+    ("equations", "of", "level", "starts"),
     [
         (HELD, "x0", 0.0, [[0.5, 0.2, 0.1], [1.2, 0.3, -0.8]]),
         (PREY, "x", 1.0, [[0.4, 0.9], [1.1, 1.7], [0.9, 0.3]]),
@@ -278,10 +192,10 @@ def test_identify__tori_that_turn_against_each_other_are_two():
     ],
     ids=["parameter as a state", "prey", "pendulum"],
 )
-def test_identify__a_family_of_orbits_does_not_attract(table, of, level, starts, strobed):
+def test_identify__a_family_of_orbits_does_not_attract(equations, of, level, starts, strobed):
     """No neighbour comes nearer, and neighbours differ in amplitude."""
     section = {"frequency_hz": 0.37} if strobed else {"crossing": Crossing(of, level, longest=50.0)}
-    found = found_of(table, starts, **section)
+    found = found_of(equations, starts, **section)
     assert set(found["stability"].values.tolist()) == {NEUTRAL}
     assert TORUS not in found["kind"]
 
@@ -289,66 +203,19 @@ def test_identify__a_family_of_orbits_does_not_attract(table, of, level, starts,
 # ---- one cell proves little --------------------------------------------------------------------
 
 
-class LeakyTent:
-    """A tent map in place of a parameter point: of a uniform density a share of 2/slope stays at every step."""
-
-    can_rest, is_flow, n_neutral, n_states, n_cells = False, False, 0, 1, 1
-
-    def __init__(self, slope, start, seen):
-        self.slope, self.n_periods = slope, seen
-        self.section = np.empty((1, 20, 1))
-        state = np.array([[start]])
-        for i in range(20):
-            state = self.section[:, i] = self.step(state)
-
-    def step(self, x):
-        inside = self.slope * np.minimum(x, 1.0 - x)
-        return np.where(x <= 1.0, inside, 2.0 + 0.5 * (x - 2.0))
-
-    def blocks(self):
-        one = np.zeros(1, int)
-        yield Block(slice(0, 1), self.section, np.full(1, Status.BOUNDED), one, np.zeros((1, 0)))
-
-    def volumes(self, derivatives, before, after):
-        return np.log(np.abs(derivatives[:, 0, 0]))
-
-
-def extended(point, budget):
-    """Drive the extension of a map's only cell."""
-    geometry = Geometry((False,), (1.0 / 0.3,))
-    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, point.n_periods, None, "", geometry)
-    work = extend(point, [FIXED], np.full(1, -1), settings, budget, 24)
-    answer = None
-    while True:
-        try:
-            asked = work.send(answer)
-        except StopIteration as stop:
-            return stop.value
-        if isinstance(asked, Leg):
-            n, state = len(asked.state), asked.state
-            section = np.empty((n, LEG, 1))
-            for i in range(LEG):
-                state = section[:, i] = point.step(state)
-            status = np.full(n, Status.BOUNDED)
-            none = np.zeros(n, int)
-            answer = Extended(section, status, none, np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG)))
-        elif isinstance(asked, Slopes):
-            slopes = np.where(asked.point < 0.5, point.slope, -point.slope)
-            answer = point.step(asked.point), slopes[:, :, None]
-        else:
-            answer = [None] * len(asked.guesses.key)
-
-
-FIXED = Orbit(np.array([[2.0]]), np.array([0.5 + 0j]), 1e-12, np.array([[0.5]]))
+def extended(slope, start, seen, budget):
+    """What the extension makes of the only cell of a tent map, of which a share of 2/slope stays at every step."""
+    point = MapPoint(*tent(slope), np.array([[start]]), seen)
+    return settle(point, [FIXED], budget=budget, seen=seen, scale=1.0 / 0.3, n_sample=24)
 
 
 def long_lived(slope, least):
     """Return a start whose trajectory stays for `least` steps at least."""
+    step, _ = tent(slope)
     for start in np.random.default_rng(0).uniform(0.0, 1.0, 400):
-        point = LeakyTent(slope, start, 20)
         x = np.array([[start]])
         for _ in range(least):
-            x = point.step(x)
+            x = step(x)
         if x[0, 0] <= 1.0:
             return start
     raise AssertionError("no start stays")
@@ -357,18 +224,17 @@ def long_lived(slope, least):
 def test_extend__one_long_life_is_no_attraction():
     """The cell stays for six mean lifetimes of 401, longer than the bound asks; its neighbours do not."""
     slope = 2.005
-    found = extended(LeakyTent(slope, long_lived(slope, 1600), 100), 1.0)
+    found = extended(slope, long_lived(slope, 1600), 100, 1.0)
     (one,) = [one for one in found.sets if one.n_sampled]
     assert one.stability == TRANSIENT
     assert one.n_left >= 4
 
 
-@pytest.mark.slow
 def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
     """They stay for ten times the run, each; a tenth of the budget shows too little, more of it more."""
     least = [0.0, 0.0, 0.0]
     for i, budget in enumerate((0.1, 1.0, 2.0)):
-        found = extended(LeakyTent(1.9, 0.3, 2000), budget)
+        found = extended(1.9, 0.3, 2000, budget)
         (one,) = found.sets
         assert one.kind == CHAOTIC_SET or budget < 1.0
         assert one.stability == (NOT_SETTLED if budget < 1.0 else ATTRACTS)
@@ -381,6 +247,13 @@ def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
 
 # ---- every analysis ends in a table or in a sentence -------------------------------------------
 
+
+def run_of(model, starts, folder, **more):
+    """Run cells of a model for 66 s, and return the run directory."""
+    quietly(sweep(model, starts, frequency_hz=1.0, lengths=(50, 16), **more), folder / "run")
+    return folder / "run"
+
+
 CORNERS = {
     "approached for ever": ({"x": {}}, {"x": "-x**2"}, [[1.0]]),
     "all diverged": ({"x": {"escape": 5.0}}, {"x": "a*x + cos(phase)"}, [[4.0], [3.0]]),
@@ -390,25 +263,16 @@ CORNERS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("axes", [{}, {"axes": {"a": {"values": [0.5, 1.0]}}}], ids=["point", "sweep"])
 @pytest.mark.parametrize("name", CORNERS)
 def test_derive__every_analysis_of_a_corner_case(name, axes, tmp_path):
     """One state, one cell, no closed cell, all diverged, all at rest."""
     states, equations, starts = CORNERS[name]
-    spec = {
-        **axes,
-        "kind": "sweep",
-        "model": {"name": "corner", "states": states, "parameters": {"a": 1.0}, "equations": equations},
-        "parameters": {"frequency_hz": 1.0},
-        "initial_conditions": {"kind": "list", "points": starts},
-        "integration": {"n_transient": 50, "n_keep": 16},
-    }
-    run(write(spec, tmp_path), tmp_path / "run", workers=0, echo=lambda _: None)
+    directory = run_of(table("corner", equations, {"a": 1.0}, states=states), starts, tmp_path, **axes)
     shown = []
     for analysis in ANALYSES:
         try:
-            found = derive(tmp_path / "run", analysis)
+            found = derive(directory, analysis)
         except SpecError:  # a sentence: the analysis needs an option, or another kind of run
             continue
         if ANALYSES[analysis].table:
@@ -422,20 +286,8 @@ def test_derive__every_analysis_of_a_corner_case(name, axes, tmp_path):
 
 def found_at(equations, starts, folder):
     """Return kind, stability and evidence of each set, and the set of each cell, after 66 s."""
-    spec = {
-        "kind": "sweep",
-        "model": {
-            "name": "point",
-            "states": {name: {"escape": 10.0} for name in equations},
-            "parameters": {"a": 1.0},
-            "equations": equations,
-        },
-        "parameters": {"frequency_hz": 1.0},
-        "initial_conditions": {"kind": "list", "points": starts},
-        "integration": {"n_transient": 50, "n_keep": 16},
-    }
-    run(write(spec, folder), folder / "run", workers=0, echo=lambda _: None)
-    found = dense(derive(folder / "run", "attractors"), points=True)
+    model = table("point", equations, {"a": 1.0}, states={name: {"escape": 10.0} for name in equations})
+    found = dense(derive(run_of(model, starts, folder), "attractors"), points=True)
     sets = zip(*(found[name].values.tolist() for name in ("kind", "stability", "evidence")), strict=True)
     return list(sets), found["attractor_id"].values.tolist()
 

@@ -55,35 +55,7 @@ def test_zero_one_test__logistic_windows_and_chaos():
     assert abs(found["zero_one_half"].values - k).max() < 0.06
     assert (found["zero_one_low"] <= found["zero_one"]).all()
     assert (found["zero_one"] <= found["zero_one_high"]).all()
-
-
-def test_zero_one_test__circle_henon_point_and_failed_cells():
-    quasi = zero_one_test(cube(circle(1000)), geometry=CIRCLE)
-    assert abs(quasi["zero_one"].item()) < 0.02
-    section = henon(4, 400)
-    # a point, but for the noise of an integration
-    section[1] = [0.3, 0.2] + 1e-8 * np.random.default_rng(0).normal(size=section[1].shape)
-    section[2] = np.nan
-    status = [Status.BOUNDED, Status.PERIODIC, Status.DIVERGED, Status.PENDING]
-    found = zero_one_test(cube(section, status), geometry=PLANE)
-    assert found["zero_one"].values[:2] == pytest.approx([1.0, 0.0], abs=0.01)
-    for name in found:
-        assert np.isnan(found[name].values[2:]).all(), name
-    assert found["oversampling"].values[1] == 0.0
-
-
-def test_zero_one_test__no_angle_jumps():
-    """A small quasi-periodic motion about pi is regular though its angle changes sign all the time."""
-    angle = np.pi + 0.2 * np.cos(GOLDEN * np.arange(600))
-    wrapped = angle - 2.0 * np.pi * np.ceil((angle - np.pi) / (2.0 * np.pi))
-    assert np.ptp(wrapped) > 6.0
-    found = zero_one_test(cube(wrapped[None, :, None]), geometry=CIRCLE)
-    assert abs(found["zero_one"].item()) < 0.02
-    assert found["oversampling"].item() < 3.0
-
-
-def test_zero_one_test__is_the_published_formula():
-    """Gottwald and Melbourne's Eqs. with loops, and their oscillating term instead of our centring."""
+    # Gottwald and Melbourne's Eqs. with loops, and their oscillating term instead of our centring
     phi = logistic([3.65], 400)[0, :, 0]
     n, n_cut = len(phi), len(phi) // 10
     rates = []
@@ -104,12 +76,26 @@ def test_zero_one_test__is_the_published_formula():
     assert found["zero_one_high"].item() == pytest.approx(high, abs=0.03)
 
 
-def test_zero_one_test__error_covers_other_frequencies():
-    ds = cube(logistic([3.6], 400))
-    tests = [zero_one_test(ds, n_frequencies=40, seed=seed, geometry=LINE) for seed in range(40)]
-    scatter = np.std([t["zero_one"].item() for t in tests], ddof=1)
-    stated = np.mean([t["zero_one_stderr"].item() for t in tests])
-    assert 0.6 < stated / scatter < 1.7
+def test_zero_one_test__circle_henon_point_and_failed_cells():
+    quasi = zero_one_test(cube(circle(1000)), geometry=CIRCLE)
+    assert abs(quasi["zero_one"].item()) < 0.02
+    section = henon(4, 400)
+    # a point, but for the noise of an integration
+    section[1] = [0.3, 0.2] + 1e-8 * np.random.default_rng(0).normal(size=section[1].shape)
+    section[2] = np.nan
+    status = [Status.BOUNDED, Status.PERIODIC, Status.DIVERGED, Status.PENDING]
+    found = zero_one_test(cube(section, status), geometry=PLANE)
+    assert found["zero_one"].values[:2] == pytest.approx([1.0, 0.0], abs=0.01)
+    for name in found:
+        assert np.isnan(found[name].values[2:]).all(), name
+    assert found["oversampling"].values[1] == 0.0
+    # A small quasi-periodic motion about pi is regular though its angle changes sign all the time
+    angle = np.pi + 0.2 * np.cos(GOLDEN * np.arange(600))
+    wrapped = angle - 2.0 * np.pi * np.ceil((angle - np.pi) / (2.0 * np.pi))
+    assert np.ptp(wrapped) > 6.0
+    found = zero_one_test(cube(wrapped[None, :, None]), geometry=CIRCLE)
+    assert abs(found["zero_one"].item()) < 0.02
+    assert found["oversampling"].item() < 3.0
 
 
 def test_zero_one_test__oversampling_hides_chaos_and_is_flagged():
@@ -121,6 +107,11 @@ def test_zero_one_test__oversampling_hides_chaos_and_is_flagged():
     assert flagged["oversampling"].item() > 10.0
     coarse = cube(np.tile(henon(1, 8000)[:, :, :1], 1))
     assert zero_one_test(coarse, stride=10, geometry=LINE)["zero_one"].item() > 0.98
+    ds = cube(logistic([3.6], 400))
+    tests = [zero_one_test(ds, n_frequencies=40, seed=seed, geometry=LINE) for seed in range(40)]
+    scatter = np.std([t["zero_one"].item() for t in tests], ddof=1)
+    stated = np.mean([t["zero_one_stderr"].item() for t in tests])
+    assert 0.6 < stated / scatter < 1.7
 
 
 def test_zero_one_test__does_not_depend_on_neighbours_or_blocks(monkeypatch):
@@ -151,6 +142,12 @@ def test_zero_one_test__bad_input(options, message):
 # ---- Kaplan-Yorke dimension --------------------------------------------------------------------
 
 
+def kaplan_yorke(*rows, **more):
+    """Dimensions of spectra."""
+    options = {k: more.pop(k) for k in ("flow", "zero") if k in more}
+    return kaplan_yorke_dimension(spectra(*rows, **more), **options)["kaplan_yorke_dimension"].values
+
+
 def spectra(*rows, stderr=None, n_states=None):
     ds = xr.Dataset({"lyapunov": (("cell", "exponent"), np.array(rows, float))})
     if stderr is not None:
@@ -170,38 +167,26 @@ def test_kaplan_yorke_dimension__known_values_and_edges():
         (0.3, 0.1),
         (np.nan, -1.0),
     ]
-    found = kaplan_yorke_dimension(spectra(*rows))["kaplan_yorke_dimension"].values
+    found = kaplan_yorke(*rows)
     expected = [1.2583, 1.2583, 1 + 0.158 / 0.358, 0.0, 1.0, 2.0, 2.0, np.nan]
     assert found == pytest.approx(expected, abs=1e-4, nan_ok=True)
-
-
-def test_kaplan_yorke_dimension__flow():
-    """The zero of a flow is left out, wherever noise has put it: Rossler, Lorenz, a limit cycle, rest."""
+    # The zero of a flow is left out, wherever noise has put it: Rossler, Lorenz, a limit cycle, rest
     rows = [(0.0714, 2e-5, -5.3943), (0.9056, -1e-4, -14.5723), (3e-6, -0.2, -0.3), (-0.1, -0.2, -0.3)]
-    found = kaplan_yorke_dimension(spectra(*rows), flow=True)["kaplan_yorke_dimension"].values
+    found = kaplan_yorke(*rows, flow=True)
     # Sprott (2003): 2.0132 and 2.062 for the attractors, one more than for their sections
     assert found == pytest.approx([1.0132, 1.0621, 0.0, 0.0], abs=1e-4)
-
-
-def test_kaplan_yorke_dimension__more_exponents():
     # j = 2 of 4, and a sum that is 0 at j = 2; the unit cancels
     rows = np.array([(0.5, 0.1, -0.9, -4.0), (0.5, -0.5, -1.0, -2.0), (0.2, -0.1, -0.05, -3.0)])
     expected = [2 + 0.6 / 0.9, 2.0, 3 + 0.05 / 3.0]
     for unit in (1.0, 2.0 * np.pi):
-        found = kaplan_yorke_dimension(spectra(*(unit * rows)))["kaplan_yorke_dimension"].values
+        found = kaplan_yorke(*(unit * rows))
         assert found == pytest.approx(expected, abs=1e-12)
-
-
-def test_kaplan_yorke_dimension__zero_and_partial_spectra():
     quasi = spectra((-1e-6, -0.4))
     assert kaplan_yorke_dimension(quasi)["kaplan_yorke_dimension"].item() == 0.0
     assert kaplan_yorke_dimension(quasi, zero=1e-4)["kaplan_yorke_dimension"].item() == 1.0
     # the largest alone: a negative one settles it, a positive one does not
-    part = kaplan_yorke_dimension(spectra((0.3,), (-0.3,), n_states=4))["kaplan_yorke_dimension"].values
+    part = kaplan_yorke((0.3,), (-0.3,), n_states=4)
     assert part == pytest.approx([np.nan, 0.0], nan_ok=True)
-
-
-def test_kaplan_yorke_dimension__flagged_cells_are_not_known():
     ds = spectra((0.3, -0.6), (0.3, -0.6), (-0.3, -0.6))
     ds["lyapunov_flag"] = "cell", np.array([LyapunovFlag.GOOD, LyapunovFlag.UNRESOLVED, LyapunovFlag.FAILED])
     found = kaplan_yorke_dimension(ds)["kaplan_yorke_dimension"].values
@@ -212,7 +197,7 @@ def test_kaplan_yorke_dimension__errors_are_carried_over():
     rates, errors = np.array([0.5, 0.1, -0.9, -4.0]), np.array([0.01, 0.02, 0.03, 0.5])
     found = kaplan_yorke_dimension(spectra(rates, stderr=[errors]))
     drawn = rates + errors * np.random.default_rng(1).normal(size=(4000, 4)) * 0.3
-    scatter = kaplan_yorke_dimension(spectra(*drawn))["kaplan_yorke_dimension"].values.std() / 0.3
+    scatter = kaplan_yorke(*drawn).std() / 0.3
     assert found["kaplan_yorke_dimension_stderr"].item() == pytest.approx(scatter, rel=0.05)
     assert np.isnan(kaplan_yorke_dimension(spectra(rates))["kaplan_yorke_dimension_stderr"].item())
     sure = kaplan_yorke_dimension(spectra((-0.1, -0.2), stderr=[(0.01, 0.01)]))
@@ -247,10 +232,6 @@ def test_correlation_dimension__henon():
     )
     x, y = (found[f"log_{k}"].values[inside.values] for k in ("radius", "correlation_sum"))
     assert np.polyfit(x, y, 1)[0] == pytest.approx(found["correlation_dimension"].item(), abs=1e-9)
-
-
-@pytest.mark.slow
-def test_correlation_dimension__circle_torus_and_square():
     ring = correlation_dimension(cube(circle(4000)), geometry=CIRCLE)
     assert ring["correlation_dimension"].item() == pytest.approx(1.0, abs=0.03)
     n = np.arange(6000)
@@ -299,7 +280,7 @@ def test_correlation_dimension__closed_orbits_points_and_failed_cells():
 
 
 @pytest.mark.slow
-def test_correlation_dimension__pooled_cells_and_sample_bound():
+def test_correlation_dimension__pooled_bound_and_scaled_and_its_error():
     pooled = correlation_dimension(cube(henon(60, 50)), pool=["initial_condition"], geometry=PLANE)
     assert pooled["correlation_dimension"].item() == pytest.approx(1.21, abs=0.05)
     assert pooled["n_points"].item() == 3000
@@ -308,22 +289,14 @@ def test_correlation_dimension__pooled_cells_and_sample_bound():
     xr.testing.assert_identical(bound.drop_attrs(), last.drop_attrs())
     many = correlation_dimension(cube(henon(300, 2)), pool=["initial_condition"], n_max=100, geometry=PLANE)
     assert many["n_points"].item() == 100
-
-
-@pytest.mark.slow
-def test_correlation_dimension__error_is_the_scatter():
-    found = correlation_dimension(cube(henon(16, 2000)), geometry=PLANE)
-    scatter = found["correlation_dimension"].values.std(ddof=1)
-    stated = found["correlation_dimension_stderr"].values.mean()
-    assert 0.5 < stated / scatter < 2.0
-
-
-@pytest.mark.slow
-def test_correlation_dimension__scales_of_the_states_do_not_matter():
     section = henon(1, 1500)
     plain = correlation_dimension(cube(section), geometry=PLANE)
     scaled = correlation_dimension(cube(section * [1.0, 10.0]), geometry=Geometry((False, False), (1.0, 10.0)))
     assert scaled["correlation_dimension"].item() == pytest.approx(plain["correlation_dimension"].item(), abs=1e-6)
+    found = correlation_dimension(cube(henon(16, 2000)), geometry=PLANE)
+    scatter = found["correlation_dimension"].values.std(ddof=1)
+    stated = found["correlation_dimension_stderr"].values.mean()
+    assert 0.5 < stated / scatter < 2.0
 
 
 @pytest.mark.parametrize(

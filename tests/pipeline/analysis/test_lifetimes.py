@@ -1,12 +1,10 @@
 """Intervals of lifetimes: published values, and how often they cover the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.intervals import lifetime_interval
 
 # ---- intervals ---------------------------------------------------------------------------------
 

@@ -7,9 +7,9 @@ from matplotlib.collections import PolyCollection
 from magpend_core import Status, load_preset, lyapunov_exponents
 from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
 from pipeline.plots import plot_lyapunov, plot_lyapunov_map
-from tests.core.maps import stroboscopic_map
+from tests.core.cells import stroboscopic_map
 
-from .cubes import exponents_cube
+from .cubes import artists, exponents_cube
 from .maps import henon, slopes_of
 
 FREQUENCY = np.array([1.0, 2.0, 4.0])
@@ -20,18 +20,26 @@ def cube():
     return exponents_cube([[1.0, 0.2], [0.01, -0.3], [0.9, 0.8]], frequency=FREQUENCY, initial_condition=[0, 1])
 
 
-def test_summarise__per_period_is_per_time_over_frequency(cube):
+def test_summarise__per_period_running_drift_and_audit(cube):
     found = summarise(cube)
     assert found.lyapunov_per_period.dims == cube.lyapunov.dims
     assert found.lyapunov_per_period.values[:, 0, 0] == pytest.approx([1.0, 0.005, 0.225])
     assert found.lyapunov_per_period_stderr.values[:, 0, 0] == pytest.approx([0.02, 0.01, 0.005])
-
-
-def test_summarise__running_means_end_at_the_mean(cube):
     running = summarise(cube).lyapunov_running
     assert running.isel(block=-1).values == pytest.approx(cube.lyapunov.values)
     assert running.values[0, 0, 0, 0] == pytest.approx(1.05)
     assert running.values[0, 0, 2, 0] == pytest.approx(1.0 + 0.05 / 3)
+    blocks = cube["lyapunov_blocks"].copy()
+    blocks[0, 0, 4:, 0] -= 1.2
+    found = summarise(cube.assign(lyapunov_blocks=blocks))
+    assert found.drift.values[0, 0] == pytest.approx(-1.2)
+    # blocks scatter by 0.05, four on either side: sample variance 0.0025 * 4/3
+    assert found.drift_sigma.values[0, 0] == pytest.approx(-1.2 / np.sqrt(2 * 0.0025 * 4 / 3 / 4))
+    assert abs(found.drift_sigma.values[1, 0]) < 1e-9
+    assert summarise(cube).audit.values == pytest.approx(-0.001)
+    assert np.isnan(summarise(cube.isel(exponent=slice(2))).audit).all()
+    with pytest.raises(ValueError, match=r"no Lyapunov exponents; run it with \[products\]"):
+        summarise(cube.drop_vars("lyapunov"))
 
 
 def test_summarise__motion(cube):
@@ -51,26 +59,6 @@ def test_summarise__motion(cube):
     assert summarise(cube.isel(exponent=slice(1))).motion.values[0, 0] == Motion.CHAOTIC
     cube["lyapunov_flag"][0, 0] = 3  # only the first exponent is resolved
     assert summarise(cube).motion.values[0, 0] == Motion.CHAOTIC
-
-
-def test_summarise__a_transient_drifts(cube):
-    blocks = cube["lyapunov_blocks"].copy()
-    blocks[0, 0, 4:, 0] -= 1.2
-    found = summarise(cube.assign(lyapunov_blocks=blocks))
-    assert found.drift.values[0, 0] == pytest.approx(-1.2)
-    # blocks scatter by 0.05, four on either side: sample variance 0.0025 * 4/3
-    assert found.drift_sigma.values[0, 0] == pytest.approx(-1.2 / np.sqrt(2 * 0.0025 * 4 / 3 / 4))
-    assert abs(found.drift_sigma.values[1, 0]) < 1e-9
-
-
-def test_summarise__audit(cube):
-    assert summarise(cube).audit.values == pytest.approx(-0.001)
-    assert np.isnan(summarise(cube.isel(exponent=slice(2))).audit).all()
-
-
-def test_summarise__a_cube_without_exponents_is_refused(cube):
-    with pytest.raises(ValueError, match=r"no Lyapunov exponents; run it with \[products\]"):
-        summarise(cube.drop_vars("lyapunov"))
 
 
 @pytest.mark.slow
@@ -131,10 +119,6 @@ def test_spectrum_of_jacobians__is_the_spectrum_of_the_engine():
     assert found.stderr[0] == pytest.approx(expected.stderr * 2.4, abs=1e-4)
 
 
-def artists(fig, gid):
-    return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
-
-
 @pytest.mark.slow
 def test_plot_lyapunov__points_are_the_largest_exponents_with_their_errors(cube):
     cube["lyapunov"][0, 1, 0] = 0.97
@@ -151,13 +135,19 @@ def test_plot_lyapunov__points_are_the_largest_exponents_with_their_errors(cube)
     assert (0.95, 1.02) in {
         (round(p.vertices[:, 1].min(), 9), round(p.vertices[:, 1].max(), 9)) for p in band.get_paths()
     }
-    top, bottom = fig.axes
-    assert bottom.get_shared_x_axes().joined(top, bottom)
-    assert bottom.get_ylabel() == "largest exponent [1/s]"
 
 
 @pytest.mark.slow
-def test_plot_lyapunov__mistakes(cube):
+def test_plot_lyapunov_map__the_largest_over_the_cells(cube):
+    rates = np.array([[[0.5, -0.1], [-0.2, -0.3]], [[0.1, 0.7], [np.nan, np.nan]]])
+    plane = exponents_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
+    fig = plot_lyapunov_map(plane)
+    (mesh,) = artists(fig, "map")
+    expected = np.array([[0.5, 0.7], [-0.2, np.nan]])  # rows q, columns frequency
+    assert np.ma.filled(mesh.get_array(), np.nan) == pytest.approx(expected, nan_ok=True)
+    assert fig.data["chaotic_share"].values.tolist() == [[0.5, 1.0], [0.0, 0.0]]
+    per_period = plot_lyapunov_map(plane, per="period").data["exponent_value"].values
+    assert per_period == pytest.approx(expected / np.array([1.0, 2.0]), nan_ok=True)
     with pytest.raises(ValueError, match="unknown unit"):
         plot_lyapunov(cube, per="second")
     with pytest.raises(ValueError, match=r"two swept parameters, and 1 are left \(frequency\)"):
@@ -166,18 +156,3 @@ def test_plot_lyapunov__mistakes(cube):
     with pytest.raises(ValueError, match="choose a value first"):
         plot_lyapunov(two)
     assert plot_lyapunov(two, at={"q": 1.5}).data["exponent_value"].sizes == {"frequency": 2, "exponent": 1}
-
-
-@pytest.mark.slow
-def test_plot_lyapunov_map__the_largest_over_the_cells():
-    rates = np.array([[[0.5, -0.1], [-0.2, -0.3]], [[0.1, 0.7], [np.nan, np.nan]]])
-    cube = exponents_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
-    fig = plot_lyapunov_map(cube)
-    (mesh,) = artists(fig, "map")
-    expected = np.array([[0.5, 0.7], [-0.2, np.nan]])  # rows q, columns frequency
-    assert np.ma.filled(mesh.get_array(), np.nan) == pytest.approx(expected, nan_ok=True)
-    assert fig.data["chaotic_share"].values.tolist() == [[0.5, 1.0], [0.0, 0.0]]
-    per_period = plot_lyapunov_map(cube, per="period").data["exponent_value"].values
-    assert per_period == pytest.approx(expected / np.array([1.0, 2.0]), nan_ok=True)
-    # white is zero on both sides of the scale
-    assert mesh.norm(0.0) == 0.5

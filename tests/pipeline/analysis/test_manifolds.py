@@ -1,15 +1,12 @@
 """Manifolds of saddle orbits and their first tangency, against scipy's integrator and Melnikov's function."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
-from magpend_core.orbits import polish_orbits
-from pipeline.analysis.manifolds import Saddle, first_tangency, stable_manifold, unstable_manifold
-from pipeline.analysis.manifolds.growing import Resolution
+from pipeline.analysis.manifolds.analysis import first_tangency
+from pipeline.analysis.manifolds.growing import Resolution, Saddle, stable_manifold, unstable_manifold
+from tests.core.cells import polish, scipy_end
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.0 / (2.0 * np.pi)
@@ -17,10 +14,10 @@ FREQUENCY = 1.0 / (2.0 * np.pi)
 
 def saddle_of(damping, amplitude, guess):
     """A saddle orbit of x'' + d x' - x + x^3 = g cos t."""
-    packed = DUFFING.load(damping=damping, linear=-1.0, cubic=1.0, amplitude=amplitude).pack()
-    orbit = polish_orbits(packed[None], np.array([FREQUENCY]), np.array([guess]), np.array([1]), system=DUFFING.system)
+    parameters = DUFFING.load(damping=damping, linear=-1.0, cubic=1.0, amplitude=amplitude)
+    orbit = polish(parameters, [guess], frequency=FREQUENCY)
     assert orbit.converged[0]
-    return Saddle(DUFFING.system, FREQUENCY, packed, orbit.section[0], 1, orbit.derivative[0])
+    return Saddle(DUFFING.system, FREQUENCY, parameters.pack(), orbit.section[0], 1, orbit.derivative[0])
 
 
 EDGE = (-0.099835710177, 0.007534227463)
@@ -30,8 +27,7 @@ def image(state, damping, amplitude, n_periods):
     def rates(t, z):
         return [z[1], amplitude * np.cos(t) - damping * z[1] + z[0] - z[0] ** 3]
 
-    span = (0.0, 2.0 * np.pi * n_periods)
-    return solve_ivp(rates, span, state, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    return scipy_end(rates, state, 2.0 * np.pi * n_periods, 1e-13)
 
 
 @pytest.mark.slow
@@ -81,9 +77,6 @@ def test_manifold__needs_one_direction():
         unstable_manifold(sink, 1.0)
     with pytest.raises(ValueError, match="2 stable directions"):
         stable_manifold(sink, 1.0)
-
-
-def test_unstable_manifold__of_a_negative_multiplier_keeps_its_side():
     saddle = saddle_of(0.15, 0.2, (0.165496, 0.155508))
     assert saddle.direction(stable=False)[0] < -1.0
     curve = unstable_manifold(saddle, 1.0, Resolution(chord=0.05, length=0.5))
@@ -102,9 +95,5 @@ def test_first_tangency__tends_to_that_of_melnikov():
     ]
     assert ratios[0] > ratios[1] > 0.7530181
     assert (4.0 * ratios[1] - ratios[0]) / 3.0 == pytest.approx(0.7530181, abs=1e-6)
-
-
-@pytest.mark.slow
-def test_first_tangency__refuses_an_interval_without_one():
     with pytest.raises(ValueError, match=r"are apart at both 0\.05 and 0\.055"):
         first_tangency(lambda g: saddle_of(0.08, g, (-0.5 * g, 0.0)), 0.05, 0.055, (1.0, 1.0), Resolution(0.05, 6.0))

@@ -8,14 +8,12 @@ import xarray as xr
 
 from magpend_core import load_model
 from magpend_core.status import Status
-from pipeline.analysis.noise.cells import PointCells
 from pipeline.analysis.noise.density import effective_number, find_density_peaks, silverman_bandwidth
-from pipeline.analysis.noise.escapes import mean_and_spread
-from pipeline.analysis.noise.exits import NOT_LEFT, find_exits, labels_of
-from pipeline.analysis.noise.passages import region_of
-from pipeline.analysis.noise.rates import NO_FIT, constancy, fit_kramers, rate_interval
+from pipeline.analysis.noise.escapes import NO_FIT, constancy, fit_kramers, mean_and_spread, rate_interval
+from pipeline.analysis.noise.exits import NOT_LEFT, PointCells, find_exits, labels_of, region_of
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.noise import EscapeOptions
+from tests.core.flows import table
 
 
 def cells_of(section: np.ndarray, status: list[int] | None = None, n_periods: list[int] | None = None) -> PointCells:
@@ -40,9 +38,6 @@ def test_find_exits__on_paper() -> None:
     assert found.first_out.tolist()[:4] == [2, NOT_LEFT, 1, 3]
     assert found.end.tolist()[:4] == [1, NOT_LEFT, 0, 1]
     assert found.at_risk.tolist() == [2, 4, 1, 3, 0]
-
-
-def test_find_exits__skips_sections_and_counts_divergence() -> None:
     codes = np.array([[0, 0, 1, 1, 1], [1, 1, 1, 1, 1], [1, 1, 1, 1, 1]])
     status = [int(Status.BOUNDED), int(Status.DIVERGED), int(Status.DIVERGED)]
     # after a transient of 10 periods, one diverged in the fourth counted period, one in the transient
@@ -63,13 +58,13 @@ def test_rate_interval__covers_the_rate() -> None:
     covered = float(((low < rate) & (rate < high)).mean())
     assert 0.9 <= covered < 0.97  # exact for Poisson's numbers, conservative for these
     assert float(found.mean()) == pytest.approx(rate, rel=0.03)
-
-
-def test_rate_interval__without_events_or_time() -> None:
     rate, low, high = rate_interval(np.array([0, 0]), np.array([100, 0]), 1.0, 0.95)
     assert rate[0] == low[0] == 0.0
     assert high[0] == pytest.approx(-np.log(0.025) / 100, rel=0.05)
     assert np.isnan([rate[1], low[1], high[1]]).all()
+    assert constancy(50, 52, 1000, 1000) > 0.1
+    assert constancy(80, 20, 1000, 1000) < 1e-4
+    assert np.isnan(constancy(0, 0, 10, 10))
 
 
 def test_fit_kramers__finds_the_slope_of_drawn_numbers() -> None:
@@ -88,18 +83,9 @@ def test_fit_kramers__finds_the_slope_of_drawn_numbers() -> None:
     # a rate that grows like another power does not fit
     bent = rng.binomial(risked, 1.0 - np.exp(-0.5 * 0.3 * np.exp(-0.01 / np.maximum(strength, 0.05) ** 4)))
     assert fit_kramers(strength, bent, risked, 0.5, 0.95).misfit < 1e-3
-
-
-def test_fit_kramers__is_not_decided_with_too_little() -> None:
     few = np.array([0.1, 0.2])
     assert np.isnan(fit_kramers(few, np.array([1, 9]), np.array([100, 100]), 1.0, 0.95).slope)
     assert fit_kramers(np.array([0.1, 0.2, 0.3]), np.array([0, 0, 9]), np.full(3, 100), 1.0, 0.95) == NO_FIT
-
-
-def test_constancy__sees_a_rate_that_falls() -> None:
-    assert constancy(50, 52, 1000, 1000) > 0.1
-    assert constancy(80, 20, 1000, 1000) < 1e-4
-    assert np.isnan(constancy(0, 0, 10, 10))
 
 
 def test_effective_number__of_an_autoregression() -> None:
@@ -111,6 +97,13 @@ def test_effective_number__of_an_autoregression() -> None:
     # (1 - rho)/(1 + rho) of all points
     assert effective_number(x) == pytest.approx(x.size / 9.0, rel=0.1)
     assert effective_number(np.ones((3, 4))) == 12.0
+    values = np.random.default_rng(2).normal(0.0, 2.0, 100_000)
+    assert silverman_bandwidth(values, 1e5) == pytest.approx(0.9 * 2.0 * 0.1, rel=0.02)
+    points = np.array([[np.pi - 0.1, 1.0], [-np.pi + 0.1, 3.0]])
+    mean, spread = mean_and_spread(points, np.array([True, False]))
+    assert abs(mean[0]) == pytest.approx(np.pi)
+    np.testing.assert_allclose(spread, [0.1, 1.0])
+    assert mean[1] == 2.0
 
 
 @pytest.mark.parametrize("on_circle", [False, True])
@@ -137,26 +130,13 @@ def test_find_density_peaks__across_the_cut_of_a_circle() -> None:
     assert len(find_density_peaks(density, float(x[1] - x[0]), 0.1, 0.05, False)[1]) == 2
 
 
-def test_silverman_bandwidth__of_normal_numbers() -> None:
-    values = np.random.default_rng(2).normal(0.0, 2.0, 100_000)
-    assert silverman_bandwidth(values, 1e5) == pytest.approx(0.9 * 2.0 * 0.1, rel=0.02)
-
-
-def test_mean_and_spread__of_angles_across_the_cut() -> None:
-    points = np.array([[np.pi - 0.1, 1.0], [-np.pi + 0.1, 3.0]])
-    mean, spread = mean_and_spread(points, np.array([True, False]))
-    assert abs(mean[0]) == pytest.approx(np.pi)
-    np.testing.assert_allclose(spread, [0.1, 1.0])
-    assert mean[1] == 2.0
-
-
-TABLE = {
-    "name": "sides",
-    "states": {"th": {"on_circle": True, "unit": "rad"}, "v": {"scale": 2.0}},
-    "parameters": {"a": 1.0},
-    "equations": {"th": "v", "v": "-a*sin(th) - v + 0*t"},
-    "classifier": {"meaning": "side", "words": {"left": "th < -0.5", "right": "th > 0.5"}},
-}
+TABLE = table(
+    "sides",
+    {"th": "v", "v": "-a*sin(th) - v + 0*t"},
+    {"a": 1.0},
+    states={"th": {"on_circle": True, "unit": "rad"}, "v": {"scale": 2.0}},
+    classifier={"meaning": "side", "words": {"left": "th < -0.5", "right": "th > 0.5"}},
+)
 
 
 def test_region_of__box_and_ball() -> None:
@@ -171,9 +151,6 @@ def test_region_of__box_and_ball() -> None:
     assert inside(low={"th": -4.0}) == [True] * 4  # the whole circle
     assert inside(radius=0.2, centre={"th": 3.14}) == [False, True, True, False]  # on the circle, whatever v is
     assert inside(radius=1.9) == [True, False, False, True]  # about the first section; v counts in units of 2
-
-
-def test_labels_of__classes() -> None:
     model = load_model(TABLE)
     cube = xr.Dataset(attrs={"model": model_attribute(model), "parameters": "a = 1.0"})
     section = np.array([[[-1.0, 0.0], [3.1, 0.0], [-3.1, 0.0], [0.0, 3.0]]])

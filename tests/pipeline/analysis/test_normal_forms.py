@@ -1,69 +1,34 @@
 """Coefficients of normal forms, against exact maps and the shape of the branches."""
 
-from __future__ import annotations
-
-import tomllib
-
 import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, explore
 from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.normal_forms import critical_vectors, judge
 from pipeline.analysis.branches.problems import Family
+from tests.core.flows import model_of, table
+
+pytestmark = pytest.mark.slow
 
 FREQUENCY = 0.5
 PERIOD = 1.0 / FREQUENCY
 
-RADIAL = """
-name = "radial"
-[states]
-x = {}
-y = {}
-[parameters]
-mu = 0.0
-w = 1.3
-a = -0.7
-F = 0.0
-[equations]
-x = "mu*x - w*y + a*x*(x^2 + y^2) + F*cos(2*pi*f*t)"
-y = "w*x + mu*y + a*y*(x^2 + y^2)"
-"""
-
-BRUSSELATOR = """
-name = "brusselator"
-[states]
-x = {}
-y = {}
-[parameters]
-a = 1.2
-b = 2.0
-F = 0.0
-[equations]
-x = "a + x^2*y - (b + 1)*x DRIVE"
-y = "b*x - x^2*y"
-"""
-
-SCALAR = """
-name = "scalar"
-[states]
-x = {}
-y = {}
-[parameters]
-mu = 0.0
-a = 0.0
-b = 0.0
-F = 0.0
-[equations]
-x = "mu*x + a*x^2 + b*x^3 + F*cos(2*pi*f*t)"
-y = "-y"
-"""
+RADIAL = table(
+    "radial",
+    {"x": "mu*x - w*y + a*x*(x^2 + y^2) + F*cos(2*pi*f*t)", "y": "w*x + mu*y + a*y*(x^2 + y^2)"},
+    {"mu": 0.0, "w": 1.3, "a": -0.7, "F": 0.0},
+)
+SCALAR = table(
+    "scalar", {"x": "mu*x + a*x^2 + b*x^3 + F*cos(2*pi*f*t)", "y": "-y"}, {"mu": 0.0, "a": 0.0, "b": 0.0, "F": 0.0}
+)
 
 
-def at_rest(text, interval=(-0.5, 0.4), **values):
+def at_rest(equations, interval=(-0.5, 0.4), **values):
     """Follow the orbit at 0 of a model along `mu`, and return its branches."""
-    model = load_model(tomllib.loads(text))
+    model = load_model(equations)
     family = Family(model.system, 1, FREQUENCY, model.load(**values).pack(), ("mu",), (1.0,))
     low, high = interval
     return explore([Start(family, np.zeros(2), low + 0.03)], Scope(low, high, max_period=1, max_generations=1))
@@ -74,7 +39,6 @@ def only(branch, kind):
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("a", [-0.7, 0.4])
 def test_neimark_sacker__of_a_radial_flow(a):
     """r' = a r^3 at mu = 0, so that the map over T is r + a T r^3 + ..., and r^2 = 2 |z|^2 with |q| = 1."""
@@ -85,12 +49,12 @@ def test_neimark_sacker__of_a_radial_flow(a):
     assert one.criticality == ("supercritical" if a < 0.0 else "subcritical")
 
 
-@pytest.mark.slow
 def test_neimark_sacker__of_a_flow_seen_at_even_times():
     """The map over T of a flow at its Hopf point: d = T w l1, quadratic terms included (Brusselator)."""
     found = {}
     for drive in ("", " + F*cos(2*pi*f*t)"):
-        model = load_model(tomllib.loads(BRUSSELATOR.replace("DRIVE", drive)))
+        rates = {"x": "a + x^2*y - (b + 1)*x" + drive, "y": "b*x - x^2*y"}
+        model = model_of(rates, {"a": 1.2, "b": 2.0, "F": 0.0})
         family = Family(model.system, 1 if drive else 0, FREQUENCY, model.load().pack(), ("b",), (1.0,))
         (branch, *_) = explore([Start(family, np.array([1.2, 2.0 / 1.2]), 2.0)], Scope(1.8, 2.8, 1, max_generations=1))
         (one,) = branch.bifurcations
@@ -100,7 +64,6 @@ def test_neimark_sacker__of_a_flow_seen_at_even_times():
     assert torus.coefficient == pytest.approx(PERIOD * 1.2 * hopf.coefficient, rel=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("b", [-1.0, 0.5])
 def test_branch_point__pitchfork(b):
     """x' = b x^3 at mu = 0: the map is x + b T x^3 + ..."""
@@ -109,7 +72,6 @@ def test_branch_point__pitchfork(b):
     assert one.criticality == ("supercritical" if b < 0.0 else "subcritical")
 
 
-@pytest.mark.slow
 def test_branch_point__transcritical():
     """x' = a x^2 at mu = 0: the map is x + a T x^2 + ..."""
     one = only(at_rest(SCALAR, a=0.8, b=-1.0)[0], "transcritical")
@@ -117,7 +79,6 @@ def test_branch_point__transcritical():
     assert one.criticality == ""
 
 
-@pytest.mark.slow
 def test_fold__bends_the_branch_as_its_coefficient_says(settled):
     """On the centre manifold x = x + beta + b x^2: the orbits lie at x^2 = -beta/b, beta = <p, dF/dmu>."""
     parameters, frequency = load_model("duffing").load(damping=0.1, linear=1.0, cubic=1.0, amplitude=0.1), 0.7 / np.pi
@@ -141,7 +102,6 @@ def test_fold__bends_the_branch_as_its_coefficient_says(settled):
         assert one.coefficient_error < 1e-5 * abs(one.coefficient)
 
 
-@pytest.mark.slow
 def test_doubling__orbits_of_twice_the_period_are_as_far_as_its_coefficient_says(cascade):
     """x -> -(1 + beta) x + c x^3: the orbits lie at x^2 = beta/c."""
     singles = [b for b in cascade[1] if b.family.period == 1]
@@ -165,9 +125,6 @@ def test_doubling__orbits_of_twice_the_period_are_as_far_as_its_coefficient_says
         ratio = np.polynomial.Polynomial.fit(*np.transpose(shares), 1)(0.0)
         assert one.coefficient == pytest.approx(ratio, rel=0.02)
         assert one.criticality == ("supercritical" if one.coefficient > 0.0 else "subcritical")
-
-
-def test_judge__a_branch_that_disagrees_is_told(cascade):
     parent, one = next(
         (b, one) for b in cascade[1] for one in b.bifurcations if one.kind == "period_doubling" and one.child
     )

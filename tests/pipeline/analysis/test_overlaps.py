@@ -1,33 +1,16 @@
 """Tipping probabilities from overlaps of basins: a toy case on paper, and basins known in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from pipeline.analysis.tipping.overlaps import overlap_counts, overlaps_table
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
+from tests.core.flows import table
 
-SPEC = """
-kind = "sweep"
-[parameters]
-frequency_hz = 1.0
-[axes]
-a = { values = [0.0, 0.5] }
-[initial_conditions]
-kind = "grid"
-x = { start = -1.975, stop = 1.975, num = 80 }
-[integration]
-n_transient = 20
-n_keep = 20
-[model]
-name = "two-basins"
-states = { x = {} }
-parameters = { a = 0.0 }
-equations = { x = "(x - a)*(1 - x)*(1 + x)" }
-"""
+from .cubes import line, sweep
+
+TWO_BASINS = table("two-basins", {"x": "(x - a)*(1 - x)*(1 + x)"}, {"a": 0.0})
 
 
 def test_overlap_counts__of_the_toy_case_of_attractors_jl():
@@ -40,9 +23,6 @@ def test_overlap_counts__of_the_toy_case_of_attractors_jl():
     probability = counts / counts.sum(axis=1, keepdims=True)
     assert (first.tolist(), last.tolist()) == ([0, 1], [1, 2])
     np.testing.assert_allclose(probability, [[1.0, 0.0], [1 / 3, 2 / 3]])
-
-
-def test_overlap_counts__leaves_out_what_is_not_known():
     _, _, counts = overlap_counts(np.array([0, 0, -1, -2]), np.array([0, -1, 0, -2]))
     np.testing.assert_array_equal(counts, [[1, 0], [0, 1]])
     with pytest.raises(ValueError, match="same starts"):
@@ -50,16 +30,17 @@ def test_overlap_counts__leaves_out_what_is_not_known():
 
 
 @pytest.mark.slow
-def test_overlaps__of_basins_whose_boundary_is_known(tmp_path, write_spec):
+def test_overlaps__of_basins_whose_boundary_is_known(computed):
     """x = -1 and x = 1 attract, and a lies between their basins: of the 40 starts above 0, 10 lie below 0.5."""
-    run(write_spec(SPEC), out=tmp_path / "run", workers=0, echo=lambda line: None)
-    ds = derive(tmp_path / "run", "overlaps", {"parameter": "a", "before": 0.0, "after": 0.5})
+    starts, axes = {"kind": "grid", "x": line(-1.975, 1.975, 80)}, {"a": {"values": [0.0, 0.5]}}
+    directory = computed(sweep(TWO_BASINS, starts, axes=axes, frequency_hz=1.0, lengths=(20, 20)))
+    ds = derive(directory, "overlaps", {"parameter": "a", "before": 0.0, "after": 0.5})
     np.testing.assert_array_equal(ds["count"], [[40, 0], [10, 30]])
     np.testing.assert_allclose(ds["probability"], [[1.0, 0.0], [0.25, 0.75]])
     assert (ds["low"] <= ds["probability"]).all()
     assert (ds["probability"] <= ds["high"]).all()
-    table = overlaps_table(ds)
-    assert len(table.rows) == 4
-    assert any("0.2500" in line for line in table.lines)
+    shown = overlaps_table(ds)
+    assert len(shown.rows) == 4
+    assert any("0.2500" in row for row in shown.lines)
     with pytest.raises(SpecError, match=r"a = 0\.7"):
-        derive(tmp_path / "run", "overlaps", {"parameter": "a", "before": 0.0, "after": 0.7})
+        derive(directory, "overlaps", {"parameter": "a", "before": 0.0, "after": 0.7})

@@ -1,20 +1,14 @@
 """Portraits: full motions on attractors, and the path of the moving magnet."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 import xarray as xr
 
 from magpend_core import load_preset
-from pipeline.analysis.attractors.describing.portraits import portraits
+from pipeline.analysis.attractors.portraits import portraits
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, BOUNDED_SET, PERIODIC_ORBIT
 
-ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
-STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+from .cubes import ORBITS, STATES, attributes_of
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +32,7 @@ def attractors():
             "attractor_points": ((*per, "point", "state"), points),
         },
         coords={"frequency": [2.0, 2.2], "state": STATES, "attractor": [0, 1, 2]},
-        attrs={"parameters": "\n".join(f"{k} = {v!r}" for k, v in load_preset().items())},
+        attrs={"parameters": attributes_of(load_preset())["parameters"]},
     )
 
 
@@ -64,9 +58,6 @@ def test_portraits__velocities_are_those_of_the_angles(attractors):
     orbit, time = found["orbit"].values[0, :2001], found["time"].values[:2001]
     rate = np.gradient(orbit[:, :2], time, axis=0)[1:-1]
     assert np.abs(rate - orbit[1:-1, 2:]).max() < 2e-2
-
-
-def test_portraits__magnet_and_fixed_magnet(attractors):
     p = load_preset()
     found = portraits(attractors, at={"frequency": 2.2}, parameters=p, n_periods=1)
     assert found["fixed"].sel(fixed_place="fixed magnet", axis="y") == -p["h"]
@@ -75,9 +66,6 @@ def test_portraits__magnet_and_fixed_magnet(attractors):
     assert (x[0] > 0).all()
     assert (x[1] < 0).all()
     assert found["points"].attrs["units"] == "m"
-
-
-def test_portraits__bad_input(attractors):
     with pytest.raises(ValueError, match=r"frequency \(2 values\)"):
         portraits(attractors)
     with pytest.raises(ValueError, match="n_samples = 0"):

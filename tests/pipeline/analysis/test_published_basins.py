@@ -2,25 +2,21 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
-from magpend_core import load_model, run_branches
+from magpend_core import load_model
 from magpend_core.engine.vecmath import TWO_PI
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.layout.vocabulary import ABSENT, PERIODIC_ORBIT
+from tests.core.cells import run_cells
 from tests.pipeline.analysis.dense_sets import identify
 
-from . import torque_pendulum as bench
-from .cubes import cube_of, integrated
+from .cubes import WELLS, cube_of, integrated
 
 UNIT_FREQUENCY = 1.0 / TWO_PI  # forcing cos t
 
 
 DUFFING = load_model("duffing").system
 TWO_WELLS = load_model("duffing").load("twin-well-periodic")  # x'' = .2 cos t + x - x^3 - .15 x'
-
-# recomputed independently, also in issue 139 of DynamicalSystemsBase.jl
-POINTS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
 
 
 def grid(n, x, y):
@@ -50,7 +46,7 @@ def found_wells(two_wells):
 
 def test_basin_fractions__duffing_as_published(found_wells):
     # by the least point: the left one first
-    assert np.max(abs(found_wells["attractor_points"].values[:, 0] - POINTS)) < 1e-9
+    assert np.max(abs(found_wells["attractor_points"].values[:, 0] - WELLS)) < 1e-9
     fractions = basin_fractions(found_wells["attractor_id"], method="clopper-pearson")
     # on 200 x 200 cells; the interval, which takes the cells for independent, has room for our 40 x 40
     for label, published in enumerate((0.498, 0.502)):
@@ -81,7 +77,7 @@ def test_identify__duffing_cells_go_where_another_integrator_takes_them(found_we
     # transients are chaotic: after 30 periods each integrator and tolerance has labels of its own for
     # hundreds of cells. What is settled after ten is not in doubt, but for errors of a long step.
     ends = runge_kutta(STARTS, 10, 200)
-    distance = np.abs(ends[:, None] - POINTS).max(axis=-1)
+    distance = np.abs(ends[:, None] - WELLS).max(axis=-1)
     settled = distance.min(axis=1) < 0.05
     assert settled.mean() > 0.4
     differ = found_wells["attractor_id"].values != distance.argmin(axis=1)
@@ -97,28 +93,21 @@ REST_FRACTIONS = [1.0, 0.483, 0.327, 0.238, 0.147, 0.065, 0.007]
 
 def rest_fraction(torques, n):
     """Fractions of rest on n x n starts, and what `identify` found."""
-    rest = np.arcsin(0.5)
-    starts = grid(n, (rest - np.pi, rest + np.pi), (-10.0, 10.0))
-    cells = len(torques) * len(starts)
-    packed = np.full((cells, 1, 2), 0.1)
-    packed[:, 0, 1] = np.repeat(torques, len(starts))
-    # without forcing any time between sections will do; ten time units have a rotation's phase drift
-    result = run_branches(
-        packed,
-        np.full((cells, 1), 0.1),
-        np.tile(starts, (len(torques), 1)),
-        system=bench.PENDULUM,
-        n_transient=40,
-        n_keep=30,
-        rtol=1e-8,
-        atol=1e-8,
-        closure_tolerance=1e-4,
-        max_orbit_period=1,
+    rest, model = np.arcsin(0.5), load_model("driven-pendulum")
+    starts, system, own = (
+        grid(n, (rest - np.pi, rest + np.pi), (-10.0, 10.0)),
+        model.system,
+        model.load("constant-torque"),
     )
-    dims, shape = ("torque", "initial_condition"), (len(torques), len(starts))
-    ds = cube_of(result, bench.PENDULUM.state_names, dims, shape, frequency=0.1, torque=torques)
+    packed = np.tile(own.pack(), (len(torques) * len(starts), 1))
+    packed[:, model.parameter_names.index("bias")] = np.repeat(torques, len(starts))
+    # without forcing any time between sections will do; ten time units have a rotation's phase drift
+    options = {"n_transient": 40, "n_keep": 30, "closure_tolerance": 1e-4, "max_orbit_period": 1}
+    result = run_cells(system, packed, 0.1, np.tile(starts, (len(torques), 1)), **options)
+    dims, shape = ("bias", "initial_condition"), (len(torques), len(starts))
+    ds = cube_of(result, system.state_names, dims, shape, frequency=0.1, bias=torques)
     # not polished: at rest, steps that the trajectory alone controls grow too long for its tangents
-    found = identify(ds, system=bench.PENDULUM, parameters=np.array([0.1, 0.0]), polish=False, tolerance=1e-3)
+    found = identify(ds, system=system, parameters=own.pack(), polish=False, tolerance=1e-3)
     turning = np.abs(found["rotation"].isel(angle=0)) > 0.1
     at_rest = (found["kind"] == PERIODIC_ORBIT) & (np.abs(found["rotation"].isel(angle=0)) < 1e-3)
     assert ((found["kind"] == ABSENT) | turning | at_rest).all()
@@ -139,46 +128,5 @@ def test_basin_fractions__rest_against_torque_as_published():
 def test_basin_fractions__rest_at_torque_one_half_as_published():
     fractions, found = rest_fraction(np.array([0.5]), 60)
     assert fractions["fraction"].sel(label=0).item() == pytest.approx(0.152, abs=0.008)
-    at_rest = found.isel(torque=0, attractor=found["kind"].values[0].argmin())
+    at_rest = found.isel(bias=0, attractor=found["kind"].values[0].argmin())
     assert at_rest["attractor_points"].values[0] == pytest.approx([np.arcsin(0.5), 0.0], abs=1e-5)
-
-
-@pytest.mark.parametrize("torque", [0.2, 0.5])
-def test_regions__rotation_begins_at_the_unstable_manifold(torque):
-    """Speed over angle from the saddle on, d(w^2/2)/d(angle) = torque - damping w - sin(angle)."""
-    saddle = np.pi - np.arcsin(torque) - TWO_PI
-    slope = -0.05 + np.sqrt(0.05**2 + np.sqrt(1.0 - torque**2))  # the saddle's larger eigenvalue
-    angles = saddle + np.linspace(0.1, TWO_PI, 50)
-    speed = solve_ivp(
-        lambda angle, w: (torque - 0.1 * w - np.sin(angle)) / w,
-        (saddle + 1e-5, angles[-1]),
-        [slope * 1e-5],
-        t_eval=angles,
-        rtol=1e-9,
-        atol=1e-12,
-    ).y[0]
-    regions = bench.Regions.of(torque)
-    for shift in (1e-4, -1e-4):
-        label = regions.certain(np.stack([angles, speed + shift], axis=-1))
-        assert ((label == bench.ROTATION) == (shift > 0.0)).all()
-
-
-def test_regions__certain_states_go_there():
-    """What the two regions promise, against scipy; and they leave room for the boundary alone."""
-    regions = bench.Regions.of(bench.TORQUE)
-    starts = bench.draw_starts(300, seed=5)
-    label = regions.certain(starts)
-    assert set(label) == {bench.UNDECIDED, bench.REST, bench.ROTATION}
-    rows = np.flatnonzero(label != bench.UNDECIDED)[:25]
-    for start, code in zip(starts[rows], label[rows], strict=True):
-        end = solve_ivp(
-            lambda t, y: (y[1], bench.TORQUE - bench.DAMPING * y[1] - np.sin(y[0])),
-            (0.0, 150.0),
-            start,
-            rtol=1e-8,
-            atol=1e-8,
-        ).y[:, -1]
-        assert (end[1] > 1.0) == (code == bench.ROTATION)
-    # no rotation where none lasts
-    assert bench.Regions.of(0.11).manifold is None
-    assert bench.Regions.of(0.16).manifold is not None

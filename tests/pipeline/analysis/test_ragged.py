@@ -1,7 +1,5 @@
 """Rows of sets: what is selected, stored and shown of a result made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -39,7 +37,7 @@ def found():
     )
 
 
-def test_isel__takes_the_rows_of_the_points_that_are_left(found):
+def test_rows__come_along_with_what_is_selected(found):
     part = isel(found, {"frequency": slice(1, 3)})
     assert part["n_sets"].values.tolist() == [0, 2]
     assert part["attractor"].values.tolist() == [0, 2]
@@ -48,18 +46,12 @@ def test_isel__takes_the_rows_of_the_points_that_are_left(found):
     assert [part[name].values.tolist() for name in ("from_set", "to", "n_to")] == [[0, 1], [2, 0], [5, 7]]
     assert isel(found, {"frequency": 1}).sizes["set"] == 0
     assert isel(found, {"initial_condition": 0}).sizes["set"] == 4
-
-
-def test_select__rows_come_along(found):
     for part in (
         choose(found, {"frequency": 0.4}, ("initial_condition",), ""),
         select_points(found, {"frequency": 0.4}),
     ):
         assert part["attractor"].values.tolist() == [1]
         assert part["attractor_points"].values[:, 0].tolist() == [3.0] * 4
-
-
-def test_take__keeps_what_belongs_to_a_row(found):
     part = take(found, np.array([2, 1]))
     assert part["share"].values.tolist() == [0.2, 0.1]
     assert part["attractor_points"].values[:, 0].tolist() == [2, 2, 2, 1, 1]
@@ -83,6 +75,8 @@ def test_dense__every_id_has_its_place(found):
     # of a part the ids are those of the whole
     assert dense(isel(found, {"frequency": 3}))["share"].values.tolist() == [0.0, 0.3, 0.0]
     assert dense(table) is table
+    # The analysis of what settles keeps some variables only
+    assert "attractor_points" not in dense(found.drop_vars(["attractor_points", "n_points"]), points=True)
 
 
 def test_sets__are_rows_for_xarray_and_pandas(found):
@@ -95,8 +89,3 @@ def test_sets__are_rows_for_xarray_and_pandas(found):
     assert found.magpend.sets().identical(rows)
     with pytest.raises(ValueError, match="needs a result with rows of sets"):
         dense(found).magpend.sets()
-
-
-def test_dense__of_a_result_without_section_points(found):
-    """The analysis of what settles keeps some variables only."""
-    assert "attractor_points" not in dense(found.drop_vars(["attractor_points", "n_points"]), points=True)

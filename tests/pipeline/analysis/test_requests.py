@@ -1,7 +1,5 @@
 """Progress of the search for attractors: it does not promise an end that is far away."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -44,8 +42,6 @@ def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
         assert left is None or float(left[1]) > 0.5 * (now[0] - at), line
     assert lines[-1][1] == f"{EXTENDING}: 15 of 20 (75 %), {duration(now[0])} so far"
 
-
-def test_answer_all__a_point_moves_while_its_cells_are_extended(monkeypatch):
     def work():
         for spent in (0.0, 0.25, 0.5):
             yield Leg(np.zeros((1, 1)), np.zeros(1), spent)

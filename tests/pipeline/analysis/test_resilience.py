@@ -1,74 +1,49 @@
 """Responses to shocks and edge states, against DOP853, closed forms and published numbers."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, search_together
-from pipeline.analysis.resilience.edge_table import edge_table
-from pipeline.analysis.resilience.shocks import Settings, ShockSearch
-from pipeline.analysis.resilience.table import resilience_table
+from pipeline.analysis.resilience.analysis import resilience_table
+from pipeline.analysis.resilience.edge import edge_table
+from pipeline.analysis.resilience.shocks import Asked, Bases, Settings, Shocked, ShockSearch, search_together
 from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
-from pipeline.plots.edge import plot_edge
+from pipeline.plots.basins import plot_edge
 from pipeline.plots.resilience import plot_resilience
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
+from tests.core.cells import scipy_end
+from tests.core.flows import table
 
-DUFFING = """
-kind = "sweep"
-model = "duffing"
-[parameters]
-frequency_hz = 0.15915494309189535
-[parameters.overrides]
-damping = {damping}
-linear = {linear}
-cubic = {cubic}
-amplitude = {amplitude}
-[initial_conditions]
-kind = "grid"
-x = {{ start = -2.0, stop = 2.0, num = {num} }}
-v = {{ start = -2.0, stop = 2.0, num = {num} }}
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 200
-n_keep = 8
-stop_when_closed = true
-closure_tolerance = 1e-6
-"""
-WELLS = {"damping": 0.15, "linear": -1.0, "cubic": 1.0, "amplitude": 0.2, "num": 21}
+from .cubes import WELLS, line, sweep
 
-MAGNETS = """
-kind = "sweep"
-model = "three-magnets"
-[parameters]
-frequency_hz = 0.5
-[initial_conditions]
-kind = "grid"
-x = { start = -1.4, stop = 1.4, num = 12 }
-y = { start = -1.4, stop = 1.4, num = 12 }
-[integration]
-rtol = 1e-8
-atol = 1e-8
-n_transient = 200
-n_keep = 8
-stop_when_closed = true
-closure_tolerance = 1e-4
-"""
+UNIT_HZ = 0.15915494309189535
+WELL_VALUES = {"damping": 0.15, "linear": -1.0, "cubic": 1.0, "amplitude": 0.2}
+
+
+def grid(size, num, *names):
+    """Starts on a square about 0."""
+    return {"kind": "grid", **dict.fromkeys(names, line(-size, size, num))}
+
+
+MAGNETS = sweep("three-magnets", grid(1.4, 12, "x", "y"), frequency_hz=0.5, tolerance=1e-8, closes=1e-4)
 
 
 @pytest.fixture(scope="module")
 def duffing(computed):
     """Make a run of the Duffing oscillator with some values of its own."""
-    return lambda **values: AnalysedRun.of(computed(DUFFING.format(**{**WELLS, **values})))
+
+    def call(num=21, **values):
+        parameters = {"overrides": {**WELL_VALUES, **values}}
+        spec = sweep("duffing", grid(2.0, num, "x", "v"), frequency_hz=UNIT_HZ, closes=1e-6, parameters=parameters)
+        return AnalysedRun.of(computed(spec))
+
+    return call
 
 
 @pytest.fixture(scope="module")
@@ -96,9 +71,6 @@ def at_point(a_run):
 
 # ---- by DOP853 ---------------------------------------------------------------------------------
 
-# section points of validation.md, 4
-WELL_POINTS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
-
 
 def flow(states, begin, end, amplitude=0.2, rtol=1e-9):
     """States (n, 2) of x'' + .15 x' - x + x^3 = F cos t at the end, from those at the begin, by scipy."""
@@ -107,14 +79,13 @@ def flow(states, begin, end, amplitude=0.2, rtol=1e-9):
         x, v = z.reshape(2, -1)
         return np.concatenate([v, amplitude * np.cos(t) - 0.15 * v + x - x**3])
 
-    steps = solve_ivp(rates, (begin, end), np.asarray(states).T.ravel(), method="DOP853", rtol=rtol, atol=rtol)
-    return steps.y[:, -1].reshape(2, -1).T
+    return scipy_end(rates, np.asarray(states).T.ravel(), end, rtol, begin).reshape(2, -1).T
 
 
 def well_of(states, begin):
     """Which of the two orbits trajectories are on after some eighty periods; -1 for none yet."""
     ends = flow(states, begin, 80 * 2.0 * np.pi)
-    away = np.abs(ends[:, None] - WELL_POINTS).max(axis=-1)
+    away = np.abs(ends[:, None] - WELLS).max(axis=-1)
     return np.where(away.min(axis=1) < 1e-2, away.argmin(axis=1), -1)
 
 
@@ -126,7 +97,7 @@ def exhaustive():
     least = np.full((2, 8), np.inf)
     for k in range(8):
         begin = 2.0 * np.pi * k / 8
-        base = flow(WELL_POINTS, 0.0, begin, rtol=1e-12) if k else WELL_POINTS
+        base = flow(WELLS, 0.0, begin, rtol=1e-12) if k else WELLS
         ends = well_of((base[:, None] + shocks).reshape(-1, 2), begin).reshape(2, 2, -1)
         for well in (0, 1):
             away = (ends[well] == 1 - well).any(axis=0)
@@ -153,7 +124,7 @@ def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
         assert exhaustive[well].min() - 0.004 <= size <= exhaustive[well].min()
         assert exhaustive[well, round(8 * phase)] == exhaustive[well].min()
         begin = 2.0 * np.pi * phase
-        base = flow(WELL_POINTS[[well]], 0.0, begin, rtol=1e-12)[0]
+        base = flow(WELLS[[well]], 0.0, begin, rtol=1e-12)[0]
         assert one["shock_from"].values == pytest.approx(base, abs=1e-8)
         jump = one["shock"].values
         assert jump[0] == 0.0
@@ -169,7 +140,7 @@ def test_resilience__distances_of_duffing(found):
     """In any direction at the section, and along each state: smaller shocks stay, larger ones leave (DOP853)."""
     turns = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
     circle = np.column_stack([np.cos(turns), np.sin(turns)])
-    for well, point in enumerate(WELL_POINTS):
+    for well, point in enumerate(WELLS):
         one = found.isel(set=well)
         size = float(one["distance_high"])
         assert np.hypot(*one["distance"].values) == pytest.approx(size)
@@ -191,12 +162,12 @@ def test_resilience__basin_stability_and_table(found, wells):
     assert shares == pytest.approx(fractions)
     assert (found["basin_stability_low"] < shares).all()
     assert (shares < found["basin_stability_high"]).all()
-    table = resilience_table(found)
-    assert [row["letter"] for row in table.rows] == ["A", "B"]
-    assert [row["shock_leads_to"] for row in table.rows] == ["B", "A"]
-    assert table.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(set=0, state=1)))
-    json.dumps([dict(row) for row in table.rows])
-    assert f"{float(found['shock_high'][0]):.5g}" in "\n".join(table.lines)
+    shown = resilience_table(found)
+    assert [row["letter"] for row in shown.rows] == ["A", "B"]
+    assert [row["shock_leads_to"] for row in shown.rows] == ["B", "A"]
+    assert shown.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(set=0, state=1)))
+    json.dumps([dict(row) for row in shown.rows])
+    assert f"{float(found['shock_high'][0]):.5g}" in "\n".join(shown.lines)
     figure = plot_resilience(found, dense(wells.derive("attractors"), points=True))
     assert [ax.get_ylabel() for ax in figure.axes] == ["basin stability", "smallest shock", "arrival [drive periods]"]
     assert float(figure.data["shock_high"].isel(attractor=0)) == float(found["shock_high"][0])
@@ -254,11 +225,7 @@ def test_shocks__magnetic_pendulum_as_published(magnets):
         one = search_together({"it": Asked(search.run(), bases, which)}, Shocked(there), np.ones(4), "")["it"]
         assert one.high == pytest.approx(least, abs=1e-4)
         assert one.leads_to in {0, 1, 2} - {own}
-
-
-@pytest.mark.slow
-def test_resilience__of_the_magnets(magnets):
-    """Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above."""
+    # Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above
     found = magnets.derive("resilience", states="x,y", timed=0)
     assert found["shock_high"].values == pytest.approx(np.full(3, 0.40204), abs=1e-4)
     assert (found["shock"].values[:, 2:] == 0.0).all()
@@ -287,7 +254,7 @@ def test_edge__of_a_fractal_boundary(wells):
     lines = edge_table(found).lines
     assert "on a path" in "\n".join(lines)
     figure = plot_edge(found)
-    gids = {line.get_gid().partition(":")[0] for line in figure.axes[0].lines if ":" in (line.get_gid() or "")}
+    gids = {curve.get_gid().partition(":")[0] for curve in figure.axes[0].lines if ":" in (curve.get_gid() or "")}
     assert gids == {"edge orbit", "edge set"}
 
 
@@ -342,27 +309,12 @@ def test_edge__of_two_magnets(magnets):
     assert (values.real > 0.0).sum() == 1
 
 
-THOMAS = """
-kind = "sweep"
-section = { of = "x", value = 0.0, direction = "up" }
-[initial_conditions]
-kind = "random"
-n = 200
-seed = 1
-x = [-5.0, 5.0]
-y = [-5.0, 5.0]
-z = [-5.0, 5.0]
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 200
-n_keep = 32
-[model]
-name = "thomas"
-states = { x = {}, y = {}, z = {} }
-parameters = { b = 0.16 }
-equations = { x = "sin(y) - b*x", y = "sin(z) - b*y", z = "sin(x) - b*z" }
-"""
+THOMAS = sweep(
+    table("thomas", {"x": "sin(y) - b*x", "y": "sin(z) - b*y", "z": "sin(x) - b*z"}, {"b": 0.16}),
+    {"kind": "random", "n": 200, "seed": 1, "x": [-5.0, 5.0], "y": [-5.0, 5.0], "z": [-5.0, 5.0]},
+    section={"of": "x", "value": 0.0, "direction": "up"},
+    lengths=(200, 32),
+)
 
 
 @pytest.mark.slow
@@ -411,7 +363,7 @@ def test_edge__says_what_is_not_decided(wells):
 def test_destinations__ends_of_trajectories(wells):
     """Near an orbit they end on it; an orbit that is not known is elsewhere, and undecided without the extension."""
     there = at_point(wells)
-    near = WELL_POINTS + 0.01
+    near = WELLS + 0.01
     assert there.follow(near).label.tolist() == [0, 1]
     there.orbits, there.orbit_ids = there.orbits[:1], there.orbit_ids[:1]
     assert there.follow(near).label.tolist() == [0, ELSEWHERE]

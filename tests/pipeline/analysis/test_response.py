@@ -9,8 +9,8 @@ from scipy.optimize import fsolve
 
 import magpend
 from magpend_core.models import load_model
+from pipeline.analysis.response.analysis import response_table
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
-from pipeline.analysis.response.table import response_table
 from pipeline.plots.response import read_points
 from pipeline.specification.problems import SpecError
 
@@ -147,7 +147,11 @@ def test_subharmonics__and_turning_angles():
     model = load_model(
         magpend.model(
             "th'' = -c*th' - sin(th) + b + A*cos(2*pi*f*t)",
-            name="turning", states={"th": {"unit": "rad", "on_circle": True}}, c=0.25, b=0.6, A=1.0,
+            name="turning",
+            states={"th": {"unit": "rad", "on_circle": True}},
+            c=0.25,
+            b=0.6,
+            A=1.0,
         )  # fmt: skip
     )
     base = model.load(None)
@@ -162,9 +166,7 @@ def test_subharmonics__and_turning_angles():
         states = [solve_ivp(rates, (0.0, 400 * seconds), [0.3, 0.0], **settings).y[:, -1]]
         for _ in range(8):
             states.append(solve_ivp(rates, (0.0, seconds), states[-1], **settings).y[:, -1])
-        away = [
-            abs(np.angle(np.exp(1j * (s[0] - states[0][0])))) + abs(s[1] - states[0][1]) for s in states[1:]
-        ]
+        away = [abs(np.angle(np.exp(1j * (s[0] - states[0][0])))) + abs(s[1] - states[0][1]) for s in states[1:]]
         period = 1 + int(np.flatnonzero(np.array(away) < 1e-7)[0])
         t = np.linspace(0.0, period * seconds, 8192 * period + 1)
         th = solve_ivp(rates, (0.0, t[-1]), states[0], t_eval=t, **settings).y[0]

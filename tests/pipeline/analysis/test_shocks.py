@@ -1,7 +1,5 @@
 """The search for the smallest shock that leads away, on basins whose boundary is known on paper."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -52,10 +50,7 @@ def test_shock_search__largest_jump_of_a_state():
     least = 0.37 / np.abs(NORMAL).sum()
     assert one.high == pytest.approx(least, rel=2e-3)
     assert np.abs(one.shock) == pytest.approx(np.full(3, least), rel=1e-2)
-
-
-def test_shock_search__finds_the_best_base_state():
-    """The distance is least at the eleventh of 16 base states."""
+    # The distance is least at the eleventh of 16 base states
     distance = 0.5 - 0.2 * np.cos(2.0 * np.pi * (np.arange(1000) - 11) / 16)
     one, _ = found(beyond(distance), 3, n_bases=16)
     assert one.base == 11
@@ -108,18 +103,12 @@ def test_shock_search__nothing_leads_away():
     assert one.safe == pytest.approx(2.0)
     assert np.isnan(one.shock).all()
     assert one.n_below == sum(len(t.base) for t in tried)
-
-
-def test_shock_search__safe_size_is_a_shell_that_stayed():
     one, tried = found(beyond(0.37), 3)
     assert one.safe < one.low
     shells = np.linalg.norm(np.concatenate([t.shock for t in tried]), axis=1)
     assert np.isclose(shells, one.safe).sum() == 32
     # the next shell has a shock that leads away, or is larger than the smallest
     assert one.safe * 2.0 ** (1.0 / 3.0) > one.low * 0.99
-
-
-def test_shock_search__repeats_itself():
     a, b = (found(beyond(0.37), 3)[0] for _ in range(2))
     assert a.high == b.high
     assert (a.shock == b.shock).all()

@@ -1,7 +1,5 @@
 """Slow spirals: cells near a bifurcation that take thousands of periods to close are their orbit's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -54,13 +52,6 @@ def test_identify__a_slow_spiral_is_no_attractor():
     assert named["stability"].values.tolist() == [NOT_SETTLED]
 
 
-def test_near_closed__the_period_at_which_sections_lie_nearest():
-    """Not the shortest at which they lie near: half the period leads to the orbit that doubled."""
-    n = np.arange(60)
-    section = np.stack([0.02 * (-1.0) ** n + 1e-4 * 0.999**n, np.zeros(60)], axis=-1)[None]
-    assert near_closed(section, 8, PLANE).period.tolist() == [2]
-
-
 def test_recurrence__of_many_periods_as_by_definition():
     """The shortest period within 1.5 times the least distance over the younger half, where that is below 0.05."""
     rng, n = np.random.default_rng(3), np.arange(60)
@@ -92,6 +83,10 @@ def test_recurrence__a_rotating_spiral_contracts_to_its_centre():
     assert found.centre[0] == pytest.approx([1.0, 2.0], abs=0.05)
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 64, 2))
     assert Recurrence.of(noise, 4, PLANE).is_near.mean() < 0.05
+    # Not the shortest at which they lie near: half the period leads to the orbit that doubled
+    n = np.arange(60)
+    section = np.stack([0.02 * (-1.0) ** n + 1e-4 * 0.999**n, np.zeros(60)], axis=-1)[None]
+    assert near_closed(section, 8, PLANE).period.tolist() == [2]
 
 
 def test_leap__along_the_unstable_direction():

@@ -1,68 +1,55 @@
 """Margins and errors of eigenvalues; equilibria, degenerate orbits and conservative flows of small texts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.describing.features import Features
-from pipeline.analysis.attractors.describing.labelling import _fill_orbit
+from pipeline.analysis.attractors.analysis import attractors_table
+from pipeline.analysis.attractors.features import Features
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
-from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.attractors.labelling import _fill_orbit
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
 from pipeline.analysis.ragged import dense, isel
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, PERIODIC_ORBIT, UNSTABLE
 from pipeline.runs.derive import derive, stale
+from tests.core.flows import table
+
+from .cubes import line, sweep
 
 
 def orbit(multiplier, residual=1e-13):
     return Orbit(np.zeros((1, 1)), np.array([multiplier + 0j]), residual, np.array([[multiplier]]))
 
 
-def test_by_margin__within_the_error_nothing_is_said():
+def test_stability__by_the_error_of_a_multiplier():
     assert by_margin(0.9, 1.0, 0.05) == ATTRACTS
     assert by_margin(0.97, 1.0, 0.05) == by_margin(1.03, 1.0, 0.05) == NEUTRAL
     assert by_margin(1.1, 1.0, 0.05) == UNSTABLE
-
-
-def test_largest_error__a_double_eigenvalue_moves_by_a_root():
     assert largest_error(np.diag([1.0, 0.5]), 1e-10) < 1e-9
     jordan = np.array([[1.0, 1.0], [0.0, 1.0]])
     assert largest_error(jordan, 1e-10) == pytest.approx(1e-5, rel=0.9)
     assert np.isnan(largest_error(np.full((2, 2), np.nan), 1e-10))
-
-
-def test_orbit__weak_attraction_is_attraction():
     assert orbit(0.999).stability == ATTRACTS
     assert orbit(-1.001).stability == UNSTABLE
     assert orbit(1.0).stability == NEUTRAL
     # beside a fold Newton's method stops where the residual is small, and the multiplier off by its root
     assert orbit(1.0 - 1e-5, residual=1e-10).stability == NEUTRAL
+    saddle = replace(orbit(382.0, residual=1e6), approached_within=0.05)
+    assert saddle.is_stable
+    with pytest.raises(AssertionError, match="a multiplier of modulus 382 is said to attract"):
+        _fill_orbit(Features(saddle.points, PERIODIC_ORBIT, 1, np.zeros(0), 0, np.zeros(1), np.zeros(1)), saddle, False)
 
 
-SPEC = """
-kind = "sweep"
-[parameters]
-frequency_hz = 1.0
-[model]
-name = "unst"
-states = { x = {}, y = {} }
-parameters = { r = 0.3 }
-equations = { x = "r*x - x**3", y = "-y + cos(2*pi*f*t)" }
-[axes]
-r = { values = [0.0, 0.001, 3.0] }
-[initial_conditions]
-kind = "grid"
-x = { start = -1.0, stop = 1.0, num = 5 }
-y = 0.0
-[integration]
-n_transient = 300
-n_keep = 60
-"""
-"""A pitchfork at r = 0, beside a damped state that the drive moves; from starts on a symmetric grid."""
+# a pitchfork at r = 0, beside a damped state that the drive moves; from starts on a symmetric grid
+SPEC = sweep(
+    table("unst", {"x": "r*x - x**3", "y": "-y + cos(2*pi*f*t)"}, {"r": 0.3}),
+    {"kind": "grid", "x": line(-1.0, 1.0, 5), "y": 0.0},
+    axes={"r": {"values": [0.0, 0.001, 3.0]}},
+    frequency_hz=1.0,
+    lengths=(300, 60),
+)
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +60,8 @@ def pitchfork(computed):
 @pytest.mark.slow
 def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     """+-sqrt(r) with the multiplier exp(-2 r), half of the cells each; 0 with exp(r); all cells at r = 0."""
-    table = attractors_table(derive(pitchfork, "attractors"))
-    rows = table.rows
+    shown = attractors_table(derive(pitchfork, "attractors"))
+    rows = shown.rows
     told = {(row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows}
     assert told == {
         (0.0, "attracts", 5, 1.0),
@@ -92,22 +79,19 @@ def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
         root = 0.0 if row["stability"] == "unstable" else np.copysign(np.sqrt(3.0), row["section_x"])
         assert [row[f"{part}_x"] for part in ("section", "min", "max")] == pytest.approx([root] * 3, abs=1e-8)
         assert [row["section_y"], row["min_y"], row["max_y"]] == pytest.approx([sweep**2, -sweep, sweep], abs=2e-3)
-    text = "\n".join(table.lines)
+    text = "\n".join(shown.lines)
     assert "  1.732  " in text
     assert "  0.0247 (-0.1572 to 0.1572)  " in text
 
 
-def test_outcomes__cells_on_the_repeller_are_counted_by_name(pitchfork):
+@pytest.mark.slow
+def test_outcomes_and_basins__of_a_repeller(pitchfork):
     ids = dense(derive(pitchfork, "attractors"), points=True)
     assert (outcomes(ids) == -1).sum() == 2
     assert {name: int(which.sum()) for name, which in other_cells(ids).items()} == {
         "on an unstable orbit or equilibrium": 2
     }
     assert sentence(ids) == "13 of 15 cells end on attractors; 2 on an unstable orbit or equilibrium"
-
-
-@pytest.mark.slow
-def test_basins__have_no_basin_of_a_repeller(pitchfork):
     found = derive(pitchfork, "basins")
     assert found["n_unstable"].values.tolist() == [0, 1, 1]
     at = isel(found, {"r": found["r"].values.tolist().index(3.0)})
@@ -127,10 +111,3 @@ def test_derive__options_of_attractors_hold_everywhere(pitchfork):
     assert derive(pitchfork, "attractors").attrs["derived_key"] == more.attrs["derived_key"]
     assert any("basins" in name for name in stale(pitchfork))
     assert derive(pitchfork, "basins").attrs["identify_budget"] == 3.0
-
-
-def test_fill_orbit__no_table_says_that_a_saddle_attracts():
-    saddle = replace(orbit(382.0, residual=1e6), approached_within=0.05)
-    assert saddle.is_stable
-    with pytest.raises(AssertionError, match="a multiplier of modulus 382 is said to attract"):
-        _fill_orbit(Features(saddle.points, PERIODIC_ORBIT, 1, np.zeros(0), 0, np.zeros(1), np.zeros(1)), saddle, False)

@@ -1,69 +1,55 @@
 """Rotation numbers in a cube, and Arnold tongues: closed forms, and orbits integrated by DOP853."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
-from pipeline.analysis.branches.tongues import fractions_between
-from pipeline.analysis.branches.tongues_product import cells_of, tongues_table
-from pipeline.plots.rotation import plot_rotation
-from pipeline.plots.tongues import plot_tongues
+from pipeline.analysis.branches.tongues import cells_of, fractions_between, tongues_table
+from pipeline.plots.tongues import plot_rotation, plot_tongues
 from pipeline.products.rotation import RotationFlag
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
+from tests.core.cells import scipy_end
+from tests.core.flows import table
+from tests.pipeline.factories import quietly
 
-STUART_LANDAU = """
-kind = "sweep"
-[parameters]
-frequency_hz = 0.15915494309189535
-[axes]
-w0 = { start = 0.4, stop = 1.6, num = 25 }
-[initial_conditions]
-kind = "list"
-points = [[0.5, 0.0]]
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 200
-n_keep = 8
-stop_when_closed = true
-closure_tolerance = 1e-7
-[products]
-rotation = { of = ["y", "x"], n_periods = 300 }
-[model]
-name = "stuart_landau"
-states = { x = {}, y = {} }
-parameters = { w0 = 1.0, F = 0.4 }
-[model.equations]
-x = "x - w0*y - (x^2 + y^2)*x + F*cos(2*pi*f*t)"
-y = "w0*x + y - (x^2 + y^2)*y + F*sin(2*pi*f*t)"
-"""
+from .cubes import line, sweep
 
-VAN_DER_POL = """
-kind = "sweep"
-model = "forced-van-der-pol"
-[axes]
-frequency_hz = { start = 0.22, stop = 0.48, num = 14 }
-A = { values = [0.8, 1.0] }
-[initial_conditions]
-kind = "list"
-points = [[1.0, 0.0]]
-[integration]
-rtol = 1e-8
-atol = 1e-8
-n_transient = 300
-n_keep = 8
-stop_when_closed = true
-closure_tolerance = 1e-6
-[products]
-rotation = { n_periods = 200 }
-"""
+
+def locking(model, axes, start, *, tolerance=1e-8, closes=1e-6, lengths=(300, 8), rotation=(), **more):
+    """A sweep from one start that computes rotation numbers."""
+    options = {"axes": axes, "tolerance": tolerance, "closes": closes, "lengths": lengths, **more}
+    return sweep(model, [start], products={"rotation": dict(rotation)}, **options)
+
+
+UNIT_FREQUENCY = 0.15915494309189535
+EQUATIONS = {"x": "x - w0*y - (x^2 + y^2)*x + F*cos(2*pi*f*t)", "y": "w0*x + y - (x^2 + y^2)*y + F*sin(2*pi*f*t)"}
+STUART_LANDAU = locking(
+    table("stuart_landau", EQUATIONS, {"w0": 1.0, "F": 0.4}),
+    {"w0": line(0.4, 1.6, 25)},
+    [0.5, 0.0],
+    frequency_hz=UNIT_FREQUENCY,
+    tolerance=1e-9,
+    closes=1e-7,
+    lengths=(200, 8),
+    rotation={"of": ["y", "x"], "n_periods": 300},
+)
+VAN_DER_POL = locking(
+    "forced-van-der-pol",
+    {"frequency_hz": line(0.22, 0.48, 14), "A": {"values": [0.8, 1.0]}},
+    [1.0, 0.0],
+    rotation={"n_periods": 200},
+)
+STAIRCASE_HZ = 0.2801126998417
+STAIRCASE = locking(
+    "driven-pendulum",
+    {"bias": line(0.9, 3.1, 45)},
+    [0.0, 0.0],
+    frequency_hz=STAIRCASE_HZ,
+    parameters={"overrides": {"d": 1.576, "A": 1.0}},
+)
 
 
 @pytest.fixture(scope="module")
@@ -129,25 +115,15 @@ def section_map(state, frequency, force, periods, mu=1.0):
         turning = (v * v - x * acceleration) / (x * x + v * v)
         return [v, acceleration, *(a @ m).ravel(), turning]
 
-    found = solve_ivp(
-        rates, (0.0, periods / frequency), [*state, 1.0, 0.0, 0.0, 1.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-12
-    )
-    end = found.y[:, -1]
+    end = scipy_end(rates, [*state, 1.0, 0.0, 0.0, 1.0, 0.0], periods / frequency)
     return end[:2], end[2:6].reshape(2, 2), end[6] / (2.0 * np.pi)
 
 
 @pytest.mark.slow
 def test_tongues__edges_by_another_integrator(van_der_pol):
     """At the edges the orbit closes after q periods, has turned p times, and has a multiplier 1."""
-    ds = van_der_pol.derive(
-        "tongues",
-        parameter="frequency_hz",
-        second="A",
-        second_low=0.9,
-        second_high=1.1,
-        max_denominator=3,
-        at={"A": 1.0},
-    )
+    plane = {"parameter": "frequency_hz", "second": "A", "second_low": 0.9, "second_high": 1.1}
+    ds = van_der_pol.derive("tongues", **plane, max_denominator=3, at={"A": 1.0})
     rows = {row["tongue"]: row for row in tongues_table(ds).rows}
     assert list(rows) == ["1/3", "1/2", "2/3"]
     assert [rows["1/3"]["from"], rows["1/3"]["to"]] == pytest.approx([0.434667, 0.464610], abs=1e-6)
@@ -165,33 +141,9 @@ def test_tongues__edges_by_another_integrator(van_der_pol):
     assert all(row["curves"] == 2 for row in rows.values())
 
 
-STAIRCASE = """
-kind = "sweep"
-model = "driven-pendulum"
-[parameters]
-frequency_hz = 0.2801126998417
-overrides.d = 1.576
-overrides.A = 1.0
-[axes]
-bias = { start = 0.9, stop = 3.1, num = 45 }
-[initial_conditions]
-kind = "list"
-points = [[0.0, 0.0]]
-[integration]
-rtol = 1e-8
-atol = 1e-8
-n_transient = 300
-n_keep = 8
-stop_when_closed = true
-closure_tolerance = 1e-6
-[products]
-rotation = {}
-"""
-
-
 def edge_of_step(state, bias, turns, periods):
     """Return the torque at which an orbit of the pendulum has a multiplier 1, by Newton's method and DOP853."""
-    omega = 2.0 * np.pi * 0.2801126998417
+    omega = 2.0 * np.pi * STAIRCASE_HZ
 
     def rates(t, u, torque):
         slope = np.array([[0.0, 1.0], [-np.cos(u[0]), -1.576]])
@@ -200,9 +152,7 @@ def edge_of_step(state, bias, turns, periods):
 
     def residual(z):
         start = [z[0], z[1], 1.0, 0.0, 0.0, 1.0]
-        end = solve_ivp(
-            rates, (0.0, 2.0 * np.pi * periods / omega), start, args=(z[2],), method="DOP853", rtol=1e-12, atol=1e-12
-        ).y[:, -1]
+        end = scipy_end(rates, start, periods / STAIRCASE_HZ, args=(z[2],))
         return [end[0] - z[0] - 2.0 * np.pi * turns, end[1] - z[1], np.linalg.det(end[2:].reshape(2, 2) - np.eye(2))]
 
     found = root(residual, [*state, bias], tol=1e-11)
@@ -238,10 +188,7 @@ def test_tongues__thin_one_between_cells(van_der_pol):
     """2/3 is locked on 3e-4 Hz, between two cells .02 Hz apart; the search finds it."""
     cube = van_der_pol.cube()
     assert not (np.abs(cube["rotation"] - 2.0 / 3.0) < 1e-6).any()
-
-
-def test_cells__only_good_rotation_numbers(van_der_pol):
-    """A rotation number whose turns may be miscounted starts no search."""
+    # A rotation number whose turns may be miscounted starts no search
     point = van_der_pol.cube().isel(A=0)
     flags = point["rotation_flag"].copy()
     flags[{"frequency": 3}] = RotationFlag.COARSE
@@ -256,8 +203,7 @@ def test_figures(van_der_pol):
     data = plot_rotation(cube).data
     assert data["rotation"].dims == ("A", "frequency")
     np.testing.assert_array_equal(data["rotation"].values, cube["rotation"].isel(initial_condition=0).values.T)
-    line = plot_rotation(cube, at={"A": 1.0})
-    texts = [text.get_text() for text in line.axes[0].texts]
+    texts = [text.get_text() for text in plot_rotation(cube, at={"A": 1.0}).axes[0].texts]
     assert "1/3" in texts
     with pytest.raises(ValueError, match="no rotation numbers"):
         plot_rotation(cube.drop_vars("rotation"))
@@ -269,22 +215,21 @@ def test_fractions_between():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("given", "message"),
     [
-        ('of = ["y", "x"]', 'of = ["y", "z"]', "'z' is not a state"),
-        ('of = ["y", "x"]', 'of = ["y"]', "y is not an angle"),
-        ('of = ["y", "x"]', 'of = ["y", "y"]', "given twice"),
-        ("n_periods = 300", "n_periods = 3", "at least 8"),
+        ({"of": ["y", "z"]}, "'z' is not a state"),
+        ({"of": ["y"]}, "y is not an angle"),
+        ({"of": ["y", "y"]}, "given twice"),
+        ({"of": ["y", "x"], "n_periods": 3}, "at least 8"),
     ],
 )
-def test_specification__mistakes(tmp_path, old, new, message):
+def test_specification__mistakes(tmp_path, given, message):
     with pytest.raises(SpecError, match=message):
-        run(STUART_LANDAU.replace(old, new), tmp_path / "run", workers=0, echo=lambda line: None)
+        quietly({**STUART_LANDAU, "products": {"rotation": given}}, tmp_path / "run")
 
 
 def test_tongues__needs_rotation_numbers(computed):
-    text = STUART_LANDAU.replace("[products]", "").replace('rotation = { of = ["y", "x"], n_periods = 300 }', "")
-    text = text.replace("num = 25", "num = 2").replace("n_transient = 200", "n_transient = 2")
-    found = AnalysedRun.of(computed(text))
+    short = {k: v for k, v in STUART_LANDAU.items() if k != "products"} | {"axes": {"w0": line(0.4, 1.6, 2)}}
+    found = AnalysedRun.of(computed({**short, "integration": {**short["integration"], "n_transient": 2}}))
     with pytest.raises(SpecError, match="no rotation numbers"):
         found.derive("tongues", second="F", second_low=0.1, second_high=0.5)

@@ -18,10 +18,9 @@ from magpend_core.engine import jit
 from magpend_core.models import DEFAULT
 from pipeline.cli import console, models
 from pipeline.cli.common import tell
-from pipeline.cli.console import Work, progress
-from pipeline.cli.exits import Exit
+from pipeline.cli.console import Exit, Work, progress
 from pipeline.products.product import Table
-from pipeline.products.reporting import report, reporting, track
+from pipeline.products.reporting import report, reporting
 from tests.programs import fresh_python
 
 TABLE = Table([{"x": np.float64(1.5), "name": "a"}, {"x": np.nan, "name": "b"}], ["two lines", "for people"])
@@ -95,16 +94,6 @@ def test_at_rest__ends_the_lines_of_a_command_that_serves(monkeypatch, capsys):
     console.at_rest()  # without a display there is nothing to end
 
 
-def test_track__reports_each_item():
-    heard = []
-    with reporting(lambda *said: heard.append(said)):
-        assert list(track([7, 8], "work")) == [7, 8]
-        report("more", 1, 3)
-    assert [said[:3] for said in heard] == [("work", 0, 2), ("work", 1, 2), ("work", 2, 2), ("more", 1, 3)]
-    report("nobody listens", 0, 1)
-    assert len(heard) == 4
-
-
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
 def test_reporting__says_when_it_compiles():
     """The work is named again afterwards, and what is compiled says nothing."""
@@ -122,26 +111,16 @@ def test_reporting__says_when_it_compiles():
 
 
 @pytest.mark.slow
-def test_head__ends_with_0(magpend, made, environment):
+def test_head__ends_with_0(made, environment):
     """Whoever reads no further is no error."""
     command = f"{sys.executable} -m pipeline.cli.main status {made.info.directory} | head -c 1"
-    found = subprocess.run(
-        ["bash", "-c", f"{command}; echo rc ${{PIPESTATUS[0]}}"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command += "; echo rc ${PIPESTATUS[0]}"
+    found = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=True)
     assert found.stdout.endswith("rc 0\n")
     assert "Error" not in found.stderr  # on a busy machine progress is shown
     code = "import sys; from pipeline.cli import console\nfor i in range(100000): console.result('line')"
-    found = subprocess.run(
-        ["bash", "-c", f'{sys.executable} -c "{code}" 2>&1 | head -1'],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = f'{sys.executable} -c "{code}" 2>&1 | head -1'
+    found = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=True)
     assert "EnoughError" in found.stdout or found.stdout == "line\n"
 
 
@@ -190,12 +169,3 @@ def test_models__lists_states_parameters_and_presets(main):
     assert code == Exit.REFUSED
     assert "duffing" in err
     assert "twin-well" in main("presets", "--model", "duffing")[1]
-
-
-def test_status__for_programs(main, made):
-    made.commit(0)
-    code, out, _ = main("status", made.info.directory, "--json")
-    assert code == 0
-    (found,) = json.loads(out)
-    assert found["complete"] is False
-    assert found["committed_cells"] == made.plan.cells_in(0)

@@ -1,40 +1,32 @@
-"""``magpend model show`` and ``magpend model new``."""
+"""``magpend model``, the page on systems of one's own, and presets in files."""
 
 from __future__ import annotations
 
 import json
 import re
 import tomllib
+from pathlib import Path
 
 import pytest
+import xarray as xr
 
+from magpend_core.models.preset_writing import write_preset
+from magpend_core.models.text.grammar import FUNCTIONS
+from magpend_core.models.text.reading import KEYS
 from pipeline.runs.modelling import TEMPLATE
-from pipeline.specification.parsing import load_spec
+from pipeline.specification.spec import Spec
 
 
 @pytest.mark.slow
-def test_new__runs_as_it_is(main, tmp_path):
+def test_new__runs_as_it_is_and_overwrites_nothing(main, tmp_path):
     code, out, _ = main("model", "new", "mine.toml")
     assert (code, out) == (0, "specification: mine.toml\n")
+    assert main("model", "new")[1] == (tmp_path / "mine.toml").read_text()
+    for file in ("mine.toml", "mine.txt", "nowhere/mine.toml"):
+        assert main("model", "new", file)[0] == 2
     code, _, said = main("run", "mine.toml", "--smoke", "--workers", 0)
     assert code == 0, said
     assert (tmp_path / "runs" / "mine-smoke" / "run.json").is_file()
-
-
-def test_new__overwrites_nothing(main, tmp_path):
-    (tmp_path / "mine.toml").write_text("kept")
-    code, _, said = main("model", "new", "mine.toml")
-    assert code == 2
-    assert "exists already" in said
-    assert (tmp_path / "mine.toml").read_text() == "kept"
-    assert main("model", "new", "mine.txt")[0] == 2
-    assert main("model", "new", "nowhere/mine.toml")[0] == 2
-
-
-def test_new__without_a_file_writes_to_the_output(main):
-    code, out, _ = main("model", "new")
-    assert code == 0
-    assert tomllib.loads(out)["model"]["name"] == "oscillator"
 
 
 def test_template__every_line_that_is_offered_can_be_taken(tmp_path):
@@ -46,7 +38,7 @@ def test_template__every_line_that_is_offered_can_be_taken(tmp_path):
     path = tmp_path / "whole.toml"
     # a state more has an equation more: those two come together
     path.write_text("\n".join(whole))
-    spec = load_spec(path)
+    spec = Spec.read(path)
     assert spec.model.state_names == ("x", "v", "th")
     assert spec.model.drawing is not None
     assert spec.model.classifier is not None
@@ -138,3 +130,81 @@ def test_run__what_is_said_of_states_is_checked_where_equations_are_wrong(main, 
     for words in ("did you mean d?", "axes.B: 'B' is not a parameter", "initial_conditions.y: unknown key"):
         assert words in said
     assert "section" not in said
+
+
+# ---- docs: "your own system in ten minutes" --------------------------------------------------------------
+
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs" / "own-system.md").read_text("utf-8")
+
+
+def block(mark: str, language: str) -> str:
+    (text,) = re.findall(rf"<!-- {mark} -->\n```{language}\n(.*?)```", PAGE, re.DOTALL)
+    return text
+
+
+def test_own_system__text_of_the_page_is_twenty_lines_and_errors_are_as_it_says(main, tmp_path):
+    text = block("file: mine.toml", "toml")
+    lines = [line for line in text.splitlines() if line.strip()]
+    assert len(lines) <= 25
+    wrong = text.replace("drive - d*v", "driv - d*v").replace("rtol = 1e-7", "rtol = -1")
+    wrong = wrong.replace("\natol", "\n#")
+    (tmp_path / "mine.toml").write_text(wrong, "utf-8")
+    said = main("run", "mine.toml")[2]
+    for line in said.splitlines():
+        assert line in PAGE
+    (tmp_path / "mine.toml").write_text(text.replace("- x**3", "- log(x + 0.5)"), "utf-8")
+    said = main("run", "mine.toml", "--smoke")[2]
+    assert said[:100] in PAGE
+
+
+def test_own_system__page_names_every_key_and_function():
+    for key in KEYS:
+        assert f"`{key}`" in PAGE, key
+    (functions,) = re.findall(r"^    (sin .*)$", PAGE, re.MULTILINE)
+    assert set(functions.split()) == set(FUNCTIONS)
+
+
+def test_own_system__section_without_a_drive_fits():
+    (section,) = re.findall(r"```toml\n(\[section\].*?)```", PAGE, re.DOTALL)
+    data = tomllib.loads(block("file: mine.toml", "toml") + "\n" + section)
+    data["model"]["equations"]["v"] = "(1 - x**2)*v - x"
+    del data["parameters"], data["model"]["define"], data["smoke"]
+    assert Spec.parse(data).section is not None
+
+
+# ---- presets in files ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def rig(tmp_path):
+    values = {"damping": 0.2, "linear": -1.0, "cubic": 1.0, "amplitude": 0.3}
+    return write_preset(
+        tmp_path / "rig.toml", "duffing", values, dict.fromkeys(values, "fit of 3 swings"), "a bent beam"
+    )
+
+
+def test_presets__shows_a_file_with_its_own_model(main, rig):
+    code, out, _ = main("presets", str(rig))
+    assert code == 0
+    assert out.startswith("preset rig: a bent beam")
+    assert "damping    0.2" in out
+    assert "fit of 3 swings" in out
+
+
+def test_simulate__takes_a_file_and_says_where_the_values_come_from(main, rig, tmp_path):
+    series = tmp_path / "x.nc"
+    words = ("--model", "duffing", "--preset", str(rig), "--set", "amplitude=0.25", "--periods", "1")
+    code, _, err = main("simulate", *words, "--out", str(series), "--no-figure")
+    assert code == 0, err
+    with xr.open_dataset(series, engine="scipy") as ds:
+        assert "damping = 0.2" in ds.attrs["parameters"]
+        assert ds.attrs["preset"] == "rig"
+        assert "damping: fit of 3 swings" in ds.attrs["sources"]
+        assert "amplitude: given" in ds.attrs["sources"]
+
+
+def test_simulate__refuses_the_file_of_another_model(main, rig):
+    code, _, err = main("simulate", "--preset", str(rig))
+    assert code == 2
+    assert "is of model 'duffing'" in err

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import pytest
 
+from pipeline.cli.console import Exit
+from tests.pipeline.factories import contents, duffing, quietly
+
 pytestmark = pytest.mark.slow
 
-SPEC = """
-kind = "sweep"
-model = "duffing"
-parameters = { frequency_hz = 0.2 }
-axes = { amplitude = { start = 0.2, stop = 0.3, num = 3 } }
-initial_conditions = { kind = "list", points = [[0.1, 0.0], [1.0, 0.2]] }
-integration = { n_transient = 30, n_keep = 8 }
-"""
+SPEC = duffing(
+    "amplitude = { start = 0.2, stop = 0.3, num = 3 }",
+    n_transient=30,
+    n_keep=8,
+    more="[parameters]\nfrequency_hz = 0.2",
+)
 
 ANALYSE = ("analyse", "attractors", "run", "--no-polish", "--no-extend", "--csv")
 PLOT = ("plot", "bifurcation", "run", "--out")
@@ -42,13 +43,9 @@ def whole(copied):
     return copied(SPEC)
 
 
-def everything(folder):
-    return {f.relative_to(folder): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands__write_into_no_run_directory_and_follow_no_link(whole, main, tmp_path, name):
-    before = everything(whole)
+    before = contents(whole)
     for below in (".", "cube.zarr", "commits"):
         code, _, said = main(*COMMANDS[name], whole / below / name)
         assert code == 2, said
@@ -60,7 +57,7 @@ def test_commands__write_into_no_run_directory_and_follow_no_link(whole, main, t
     assert code == 2, said
     assert "link that leads nowhere" in said
     assert not (tmp_path / "nowhere").exists()
-    assert everything(whole) == before
+    assert contents(whole) == before
 
 
 @pytest.mark.parametrize("name", [n for n in COMMANDS if n not in ("film.gif", "copy.html", "new.toml")])
@@ -86,3 +83,44 @@ def test_plot__figures_of_the_run_may_be_named(whole, main):
     assert main(*PLOT, whole / "figures" / "mine.png")[0] == 2  # no such folder yet
     assert main(*PLOT[:-1])[0] == 0
     assert main(*PLOT, whole / "figures" / "mine.png")[0] == 0
+
+
+# ---- a page or figure never replaces that of another run -------------------------------------------------
+
+
+@pytest.fixture
+def two(tmp_path):
+    """Two runs of one name in two folders."""
+    for folder, start in (("a-runs", 0.15), ("b-runs", 0.16)):
+        text = duffing(f"frequency_hz = {{ start = {start}, stop = 0.25, num = 3 }}").replace('"small"', '"Öl"')
+        (tmp_path / folder).mkdir()
+        (tmp_path / f"{folder}/spec.toml").write_text(text, "utf-8")
+        quietly(tmp_path / f"{folder}/spec.toml", tmp_path / f"{folder}/first")
+    return "a-runs/first", "b-runs/first"
+
+
+def test_commands__never_replace_the_file_of_another_run(main, two, tmp_path):
+    one, other = two
+    commands = {
+        "first-report.html": lambda run: ("report", run, "--only-stored"),
+        "first.html": lambda run: ("export", run),
+        "own.html": lambda run: ("report", run, "--only-stored", "--out", "own.html"),
+        **{
+            f"own.{kind}": lambda run, kind=kind: ("plot", "bifurcation", run, "--out", f"own.{kind}")
+            for kind in ("png", "pdf", "svg")
+        },
+    }
+    for name, command in commands.items():
+        code, _, err = main(*command(one))
+        assert code == 0, err
+        before = (tmp_path / name).read_bytes()
+        if name != "first.html":  # an export never replaces a file without --force
+            assert main(*command(one))[0] == 0
+        code, _, err = main(*command(other))
+        assert code == Exit.REFUSED
+        assert "--force" in err
+        assert (tmp_path / name).read_bytes() == before
+        assert main(*command(other), "--force")[0] == 0
+        assert (tmp_path / name).read_bytes() != before
+        for file in tmp_path.glob("own.*"):
+            file.unlink()

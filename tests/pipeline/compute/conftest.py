@@ -8,12 +8,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
-PATIENCE_S = 90.0
+from tests.pipeline.factories import LOOPBACK, wait_for
+
+QUIET = ("--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0")
+"""Options of dask's commands."""
 
 
 @pytest.fixture
@@ -37,13 +39,7 @@ def scheduler(faulty):
         def begin(n_workers=2, **settings):
             names = {name.replace("_", "-"): value for name, value in settings.items()}
             stack.enter_context(dask.config.set({f"distributed.scheduler.{n}": v for n, v in names.items()}))
-            cluster = LocalCluster(
-                n_workers=n_workers,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-                silence_logs=60,
-            )
+            cluster = LocalCluster(n_workers=n_workers, threads_per_worker=1, silence_logs=60, **LOOPBACK)
             return stack.enter_context(cluster).scheduler_address
 
         yield begin
@@ -84,46 +80,16 @@ def end(process):
 @pytest.fixture
 def scheduler_file(tmp_path, processes):
     path = tmp_path / "scheduler.json"
-    processes(
-        "distributed.cli.dask_scheduler",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        "0",
-        "--no-dashboard",
-        "--dashboard-address",
-        "127.0.0.1:0",
-        "--scheduler-file",
-        path,
-    )
-    until(lambda: path.exists() and "address" in json.loads(path.read_text() or "{}"))
+    processes("distributed.cli.dask_scheduler", *QUIET, "--port", "0", "--scheduler-file", path)
+    wait_for(lambda: path.exists() and "address" in json.loads(path.read_text() or "{}"))
     return path
 
 
 @pytest.fixture
 def worker(processes, scheduler_file, tmp_path):
+    own = ("--scheduler-file", scheduler_file, "--nthreads", "1", "--local-directory", tmp_path / "scratch")
+
     def begin(**options):
-        return processes(
-            "distributed.cli.dask_worker",
-            "--scheduler-file",
-            scheduler_file,
-            "--host",
-            "127.0.0.1",
-            "--nthreads",
-            "1",
-            "--no-dashboard",
-            "--dashboard-address",
-            "127.0.0.1:0",
-            "--local-directory",
-            tmp_path / "scratch",
-            **options,
-        )
+        return processes("distributed.cli.dask_worker", *QUIET, *own, **options)
 
     return begin
-
-
-def until(true):
-    deadline = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)

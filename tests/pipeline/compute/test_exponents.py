@@ -1,5 +1,7 @@
 """The product ``lyapunov``: stored beside the sections, the same as computed directly, flagged."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,10 @@ from magpend_core import LyapunovExponents, Status, load_preset, lyapunov_expone
 from pipeline import open_run
 from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
-from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag
-from pipeline.runs.run import run
-from pipeline.specification.parsing import load_spec
+from pipeline.products.lyapunov import LyapunovFlag
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
+from tests.pipeline.factories import finished
 
 SPEC = """
 kind = "sweep"
@@ -36,9 +38,7 @@ lyapunov = { n_transient = 100, n_periods = 160, n_blocks = 4 }
 @pytest.fixture(scope="module")
 def cube(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lyapunov")
-    (folder / "spec.toml").write_text(SPEC)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-    return open_run(folder / "run").load()
+    return open_run(finished(folder, SPEC)).load()
 
 
 @pytest.mark.slow
@@ -76,44 +76,16 @@ def test_lyapunov__of_a_closed_orbit_is_that_of_its_multipliers(cube):
     assert closed.lyapunov_flag == LyapunovFlag.GOOD
 
 
-def test_lyapunov__variables_explain_themselves(cube):
-    assert cube.lyapunov.dims == ("frequency", "initial_condition", "exponent")
-    assert cube.exponent.values.tolist() == [1, 2, 3, 4]
-    assert cube.sizes["block"] == 4
-    for variable in LYAPUNOV_VARIABLES:
-        assert cube[variable.name].dtype == variable.dtype
-        assert cube[variable.name].attrs["units"] == variable.units
-    assert "audit_failed" in cube.lyapunov_flag.attrs["flag_meanings"]
-
-
 def test_lyapunov__failed_cells_have_none(tmp_path):
     spec = SPEC.replace("max_steps_per_period = 400", "max_steps_per_period = 20")
-    (tmp_path / "spec.toml").write_text(spec)
-    run(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=lambda line: None)
-    found = open_run(tmp_path / "run").load()
+    found = open_run(finished(tmp_path, spec)).load()
     assert (found.status == Status.STEP_LIMIT).all()
     assert (found.lyapunov_flag == LyapunovFlag.ABSENT).all()
     assert np.isnan(found.lyapunov).all()
 
 
-def test_lyapunov__pending_cells_have_none(tmp_path):
-    from pipeline.layout.identity import identity_of
-    from pipeline.store.setup import create
-
-    (tmp_path / "spec.toml").write_text(SPEC)
-    spec = load_spec(tmp_path / "spec.toml")
-    plan = make_plan(spec)
-    create(tmp_path / "run", spec, plan, identity_of(spec, plan), SPEC)
-    found = open_run(tmp_path / "run")
-    assert (found.lyapunov_flag == LyapunovFlag.ABSENT).all()
-    assert np.isnan(found.lyapunov).all()
-
-
-def test_lyapunov__without_the_product_there_is_no_variable(tmp_path):
-    (tmp_path / "spec.toml").write_text(SPEC[: SPEC.index("[products]")])
-    plan = make_plan(load_spec(tmp_path / "spec.toml"))
-    (tmp_path / "spec.toml").write_text(SPEC)
-    whole = make_plan(load_spec(tmp_path / "spec.toml"))
+def test_lyapunov__without_the_product_there_is_no_variable():
+    plan, whole = (make_plan(Spec.parse(tomllib.loads(text))) for text in (SPEC[: SPEC.index("[products]")], SPEC))
     assert "lyapunov" not in [v.name for v in plan.variables]
     # 260 more periods at twice the cost of the 304
     assert whole.core_seconds / plan.core_seconds == pytest.approx(1.0 + 2.0 * 260 / 304)
@@ -143,34 +115,25 @@ def made_up(**changes):
         ({"divergence": np.array([-0.7, -0.68])}, LyapunovFlag.AUDIT_FAILED),
         ({"loss": np.array([1.0, 1e15])}, LyapunovFlag.UNRESOLVED),
         ({"status": np.array([2, Status.DIVERGED], np.int8)}, LyapunovFlag.FAILED),
+        # a whole spectrum is held against the divergence, whatever its length, and a part of it is not
+        ({"exponents": np.tile([0.1, -0.3], (2, 1)), "divergence": np.array([-0.2, -0.3])}, LyapunovFlag.AUDIT_FAILED),
+        ({"exponents": np.tile([0.5], (2, 1)), "is_whole": False}, LyapunovFlag.GOOD),
     ],
 )
 def test_flags__say_what_is_wrong(changes, expected):
     assert flags(made_up(**changes)).tolist() == [LyapunovFlag.GOOD, expected]
 
 
-def test_flags__a_part_of_the_spectrum_is_not_held_against_the_divergence():
-    part = made_up(exponents=np.tile([0.5], (2, 1)), is_whole=False)
-    assert flags(part).tolist() == [LyapunovFlag.GOOD] * 2
-
-
-def test_flags__audit_a_whole_spectrum_of_any_length():
-    two = made_up(exponents=np.tile([0.1, -0.3], (2, 1)), divergence=np.array([-0.2, -0.3]))
-    assert flags(two).tolist() == [LyapunovFlag.GOOD, LyapunovFlag.AUDIT_FAILED]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ("n_blocks = 4", "n_blocks = 1", r"products.lyapunov.n_blocks = 1: must be at least 2"),
-        ("n_transient = 100,", "n_exponents = 5,", r"products.lyapunov.n_exponents = 5: must be at most 4"),
-        ("n_transient = 100,", "n_transients = 20,", r"n_transients: unknown key; did you mean n_transient"),
+        ("{ n_transient = 100,", "{ n_exponents = 5,", r"products.lyapunov.n_exponents = 5: must be at most 4"),
+        ("{ n_transient = 100,", "{ n_transients = 20,", r"n_transients: unknown key; did you mean n_transient"),
         ("lyapunov = {", "liapunov = {", r"products.liapunov: unknown key; did you mean lyapunov"),
     ],
 )
-def test_products__mistakes_are_named(tmp_path, old, new, words):
+def test_products__mistakes_are_named(old, new, words):
     assert old in SPEC
-    head, products = SPEC.split("[products]")
-    (tmp_path / "spec.toml").write_text(head + "[products]" + products.replace(old, new))
     with pytest.raises(SpecError, match=words):
-        load_spec(tmp_path / "spec.toml")
+        Spec.parse(tomllib.loads(SPEC.replace(old, new)))

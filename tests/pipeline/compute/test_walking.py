@@ -11,37 +11,9 @@ import pytest
 from magpend_core import Status
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
-from pipeline.runs.run import run
-from pipeline.runs.status import state
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import marker_key
-
-DUFFING = """
-kind = "continuation"
-model = "duffing"
-[axes]
-{axes}
-[continuation]
-path = "{path}"
-direction = "{direction}"
-[initial_conditions]
-kind = "random"
-n = 4
-seed = 1
-x = [-1.5, 1.5]
-v = [-1.0, 1.0]
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 12
-n_keep = 5
-{integration}
-[products]
-{products}
-[execution]
-trajectories_per_task = 4
-{execution}
-"""
+from tests.pipeline.factories import duffing, quietly
 
 VAN_DER_POL = """
 kind = "continuation"
@@ -66,16 +38,26 @@ rtol = 1e-6
 atol = 1e-6
 n_transient = 3
 n_keep = 2
+[execution]
 """
 
 FREQUENCIES = "frequency_hz = { start = 0.06, stop = 0.26, num = 7 }"
 
 
-def duffing(axes=FREQUENCIES, path="frequency_hz", direction="both", integration="", products="", cut=None):
-    execution = "" if cut is None else f"points_per_task = {cut}"
-    return DUFFING.format(
-        axes=axes, path=path, direction=direction, integration=integration, products=products, execution=execution
+def walk(axes=FREQUENCIES, path="frequency_hz", direction="both", n=4, more="", **options):
+    return duffing(
+        axes,
+        f'kind = "random"\nn = {n}\nseed = 1\nx = [-1.5, 1.5]\nv = [-1.0, 1.0]',
+        kind="continuation",
+        more=f'[continuation]\npath = "{path}"\ndirection = "{direction}"\n{more}',
+        **{"n_transient": 12, "n_keep": 5, **options},
     )
+
+
+def cut_at(text, cut):
+    """The same walks in tasks of four branches and `cut` points."""
+    table = "" if cut is None else f"points_per_task = {cut}\n"
+    return text.replace("[execution]\n", f"[execution]\ntrajectories_per_task = 4\n{table}")
 
 
 @pytest.fixture(autouse=True)
@@ -84,16 +66,9 @@ def no_waiting(monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda handle: None)
 
 
-def silent(line):
-    pass
-
-
 def cut_run(write_spec, folder, text, cut):
     """Run a specification with tasks of `cut` points; returns the cube in memory and the plan."""
-    table = "" if cut is None else f"points_per_task = {cut}"
-    text = text if "[execution]" in text else f"{text}\n[execution]\n"
-    path = write_spec(f"{text}\n{table}", f"cut{cut}.toml")
-    found = run(path, folder / f"run{cut}", workers=0, echo=silent)
+    found = quietly(write_spec(cut_at(text, cut), f"cut{cut}.toml"), folder / f"run{cut}")
     return open_run(folder / f"run{cut}").load(), found.plan
 
 
@@ -111,7 +86,7 @@ def assert_same_whatever_the_cut(write_spec, folder, text, cuts=(1, 3, None)):
 
 @pytest.mark.slow
 def test_walk__plain_both_ways(write_spec, tmp_path):
-    ds = assert_same_whatever_the_cut(write_spec, tmp_path, duffing())
+    ds = assert_same_whatever_the_cut(write_spec, tmp_path, walk())
     assert np.isfinite(ds.section).all()
     assert (ds.step_size > 0).all()
     # a walk is no sweep: what was found depends on the way
@@ -121,14 +96,13 @@ def test_walk__plain_both_ways(write_spec, tmp_path):
 @pytest.mark.slow
 def test_walk__along_another_dim(write_spec, tmp_path):
     axes = "frequency_hz = { values = [0.1, 0.2] }\namplitude = { start = 0.2, stop = 0.5, num = 5 }"
-    ds = assert_same_whatever_the_cut(write_spec, tmp_path, duffing(axes, "amplitude"), (1, 2, None))
+    ds = assert_same_whatever_the_cut(write_spec, tmp_path, walk(axes, "amplitude"), (1, 2, None))
     assert ds.section.dims[:3] == ("frequency", "amplitude", "branch")
 
 
 @pytest.mark.slow
 def test_walk__stops_when_closed(write_spec, tmp_path):
-    closing = "stop_when_closed = true\nclosure_tolerance = 1e-2"
-    text = duffing(integration=closing).replace("n_transient = 12", "n_transient = 200")
+    text = walk(n_transient=200).replace("n_keep", "stop_when_closed = true\nclosure_tolerance = 1e-2\nn_keep")
     ds = assert_same_whatever_the_cut(write_spec, tmp_path, text)
     assert len(np.unique(ds.n_periods)) > 2
 
@@ -136,9 +110,10 @@ def test_walk__stops_when_closed(write_spec, tmp_path):
 @pytest.mark.slow
 def test_walk__ends_with_a_cell_that_fails(write_spec, tmp_path):
     # the lower the frequency the more steps to a period: downwards all fail on the way, upwards at once
-    limit = "max_steps_per_period = 40"
-    products = 'lyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\nextremes.quantities = ["energy"]'
-    ds = assert_same_whatever_the_cut(write_spec, tmp_path, duffing(integration=limit, products=products))
+    lyapunov = "lyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }"
+    text = walk(more=f'[products]\n{lyapunov}\nextremes.quantities = ["energy"]')
+    text = text.replace("n_keep", "max_steps_per_period = 40\nn_keep")
+    ds = assert_same_whatever_the_cut(write_spec, tmp_path, text)
     status = ds.status.values
     assert {Status.STEP_LIMIT, Status.UNREACHED} < set(status.ravel())
     down = status[::-1, 4:]
@@ -170,36 +145,13 @@ def test_walk__goes_on_from_where_it_does_not_return(write_spec, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_committed", [1, 3, 5])
-def test_walk__interrupted_and_resumed(write_spec, tmp_path, bytes_of, monkeypatch, n_committed):
-    from pipeline.compute import task
-
-    path, original, calls = write_spec(duffing(cut=3)), task.write_task, []
-    run(path, tmp_path / "whole", workers=0, echo=silent)
-
-    def stop(*arguments):
-        if len(calls) == n_committed:
-            raise KeyboardInterrupt
-        calls.append(arguments)
-        original(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(task, "write_task", stop)
-        with pytest.raises(Exception, match="the same command continues"):
-            run(path, tmp_path / "run", workers=0, echo=silent)
-    assert len(state(tmp_path / "run").done) == n_committed
-    assert run(path, tmp_path / "run", workers=0, echo=silent).complete
-    assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
-
-
-@pytest.mark.slow
 def test_walk__a_task_in_its_middle_is_lost(write_spec, tmp_path, bytes_of):
-    path, directory = write_spec(duffing(cut=3)), tmp_path / "run"
-    plan = run(path, directory, workers=0, echo=silent).plan
+    path, directory = write_spec(cut_at(walk(), 3)), tmp_path / "run"
+    plan = quietly(path, directory).plan
     before = bytes_of(directory)
     middle = next(i for i in range(plan.n_tasks) if plan.depth(i) == 1)
     (directory / marker_key(middle)).unlink()
-    assert run(path, directory, workers=0, echo=silent).complete
+    assert quietly(path, directory).complete
     assert bytes_of(directory) == before
 
 
@@ -208,8 +160,8 @@ def test_walk__needs_the_task_before(write_spec, tmp_path):
     from pipeline.store.errors import IncompleteError
     from pipeline.store.runfile import read_run
 
-    path, directory = write_spec(duffing(cut=3)), tmp_path / "run"
-    plan = run(path, directory, workers=0, echo=silent).plan
+    path, directory = write_spec(cut_at(walk(), 3)), tmp_path / "run"
+    plan = quietly(path, directory).plan
     last = max(range(plan.n_tasks), key=plan.depth)
     before = plan.predecessor(last)
     (directory / marker_key(before)).unlink()
@@ -224,7 +176,7 @@ def test_walk__needs_the_task_before(write_spec, tmp_path):
 @pytest.mark.parametrize("axes", [FREQUENCIES, f"amplitude = {{ values = [0.2, 0.3] }}\n{FREQUENCIES}"])
 @pytest.mark.parametrize("cut", [1, 2, 3, 7])
 def test_predecessor__walks_from_end_to_end(direction, axes, cut):
-    plan = make_plan(parse_spec(tomllib.loads(duffing(axes, direction=direction, cut=cut))))
+    plan = make_plan(Spec.parse(tomllib.loads(cut_at(walk(axes, direction=direction), cut))))
     path, n_chains = plan.path, 0
     for index in range(plan.n_tasks):
         block, before = plan.task(index), plan.predecessor(index)
@@ -247,8 +199,7 @@ SEEDS = [1, 2, 7, 16, 17, 24, 32, 37, 48, 100, 101, 640]
 
 @pytest.mark.parametrize("n", SEEDS)
 def test_make_plan__directions_apart(n):
-    text = duffing().replace("n = 4", f"n = {n}").replace("trajectories_per_task = 4", "")
-    plan = make_plan(parse_spec(tomllib.loads(text)))
+    plan = make_plan(Spec.parse(tomllib.loads(walk(n=n))))
     for index in range(plan.n_tasks):
         branches = plan.task(index)[-1]
         assert branches.stop <= n or branches.start >= n
@@ -259,11 +210,8 @@ def test_make_plan__directions_apart(n):
 @pytest.mark.parametrize("axis", ["start = 0.1, stop = 3.0, num = 581", "start = 0.01, stop = 0.2, num = 40"])
 @pytest.mark.parametrize(("n", "n_keep"), [(16, 100), (32, 3000), (640, 100), (5, 20)])
 def test_make_plan__tasks_of_some_seconds(axis, n, n_keep):
-    axes = f"frequency_hz = {{ {axis} }}"
-    text = duffing(axes).replace("n = 4", f"n = {n}").replace("trajectories_per_task = 4", "")
-    text = text.replace("n_keep = 5", f"n_keep = {n_keep}").replace("n_transient = 12", "n_transient = 300")
-    spec = parse_spec(tomllib.loads(text))
-    plan = make_plan(spec)
+    text = walk(f"frequency_hz = {{ {axis} }}", n=n, n_keep=n_keep, n_transient=300)
+    plan = make_plan(Spec.parse(tomllib.loads(text)))
     seconds = [plan.seconds(index) for index in range(plan.n_tasks)]
     # a single point of so many branches may take longer
     assert max(seconds) <= 20 or plan.block[0] == 1

@@ -15,15 +15,16 @@ from tornado.httpserver import HTTPServer
 from tornado.simple_httpclient import SimpleAsyncHTTPClient
 from tornado.websocket import websocket_connect
 
+from pipeline.explorer import server
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.live.live import LiveRun
 from pipeline.explorer.live.session import LiveSession
-from pipeline.explorer.serving import server
-from pipeline.explorer.serving.security import Guard, Rate, new_token
-from pipeline.explorer.serving.server import Service, application, listening
+from pipeline.explorer.security import Guard, Rate, new_token
+from pipeline.explorer.server import Service, application, listening
 from pipeline.runs.derive import derive
-from pipeline.store.run import Run
-from tests.pipeline.explorer.small_runs import LITTLE, bent_resonance, finished, shocked_wells
+from pipeline.store.run import RunDirectory
+from tests.pipeline.explorer.small_runs import LITTLE, bent_resonance, shocked_wells
+from tests.pipeline.factories import finished
 
 PATIENCE_S = 120.0
 """How long a test waits for what must come, on the busiest machine [s]."""
@@ -154,7 +155,7 @@ class Client:
 @pytest.fixture(scope="module")
 def client(little):
     """A server of the run of four cells, which answers as often as it is asked."""
-    found = Client(Run.open(little))
+    found = Client(RunDirectory.open(little))
     found.service.rate = found.service.strangers = found.service.files = Rate(1e6, 1_000_000)
     yield found
     found.close()
@@ -212,7 +213,7 @@ def watch():
     opened = []
 
     def begin(source):
-        live = source if isinstance(source, LiveRun) else LiveRun(Run.open(source))
+        live = source if isinstance(source, LiveRun) else LiveRun(RunDirectory.open(source))
         watcher = Watcher(live)
         opened.append((watcher, live))
         return watcher

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run
+from tests.pipeline.factories import finished
 
 LITTLE = """
 kind = "sweep"
@@ -80,14 +80,6 @@ initial_conditions.y = { start = -1.05, stop = 0.95, num = 3 }
 integration = { rtol = 1e-9, atol = 1e-9, n_transient = 100, n_keep = 12 }
 """
 """A cycle, and a rest beside it."""
-
-
-def finished(folder: Path, text: str) -> Path:
-    """Run a specification in a folder, and return the run's directory."""
-    folder.mkdir(exist_ok=True)
-    (folder / "spec.toml").write_text(text, "utf-8")
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
-    return folder / "run"
 
 
 def bent_resonance(folder: Path) -> tuple[Path, Path]:

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from pipeline.explorer import RequestError
+from pipeline.explorer.answers import ANSWERS, Query
 from pipeline.explorer.copies.content import gather, place_key
-from pipeline.explorer.data.disturbances import disturbances
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
-from pipeline.explorer.data.overlays import attractors
-from pipeline.explorer.live import noisy_starting
-from pipeline.explorer.serving.answers import ANSWERS, Query
-from pipeline.store.run import Run
-from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.overlays import attractors, disturbances
+from pipeline.explorer.live import starting
+from pipeline.store.run import RunDirectory
+from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH
+from tests.pipeline.factories import finished
 
 DAMPING, AMPLITUDES = 0.15, (0.1, 0.2)
 
@@ -89,7 +90,7 @@ def test_edges__are_orbits_at_their_own_point(wells):
 
 
 def test_disturbances__refuse_an_index_off_the_axis(wells):
-    with pytest.raises(ExplorerError, match="out of bounds"):
+    with pytest.raises(RequestError, match="out of bounds"):
         disturbances(wells, {"amplitude": 2})
 
 
@@ -143,7 +144,7 @@ noise = {{ seed = 7, strengths = {{ v = 0.05 }} }}
 @pytest.mark.slow
 def test_noisy_start__has_the_bits_of_a_noisy_run(watcher, tmp_path):
     directory = finished(tmp_path, NOISY)
-    cell = Run.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
+    cell = RunDirectory.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
     end, section = noisy(watcher, noise=0.05, seed=7, periods=40)
     np.testing.assert_array_equal(section, cell["section"].transpose("period_index", "state").values)
     assert (end["kind"], end["noise"], end["seed"], end["noisy_states"]) == ("done", 0.05, 7, ["v"])
@@ -165,18 +166,18 @@ def test_noisy_start__without_noise_is_the_plain_one(watcher):
 def test_noisy_start__is_refused_in_a_sentence(watcher, monkeypatch):
     assert "noise" in noisy(watcher, noise=-1.0)[0]["error"]
     assert "seed" in noisy(watcher, noise=0.1, seed=-1)[0]["error"]
-    monkeypatch.setattr(noisy_starting, "TOLERANCE", 1e-12)
+    monkeypatch.setattr(starting, "TOLERANCE", 1e-12)
     assert "too few for this motion" in noisy(watcher, noise=0.1)[0]["error"]
 
 
 def test_noisy_start__takes_shorter_steps_where_it_must(watcher, monkeypatch):
     plain = noisy(watcher, noise=0.05, periods=1)[0]
-    monkeypatch.setattr(noisy_starting, "TOLERANCE", plain["step_error"] / 1.5)
+    monkeypatch.setattr(starting, "TOLERANCE", plain["step_error"] / 1.5)
     finer = noisy(watcher, noise=0.05, periods=1)[0]
-    assert plain["steps_per_period"] == noisy_starting.STEPS
-    assert finer["steps_per_period"] > noisy_starting.STEPS
-    assert finer["step_error"] <= noisy_starting.TOLERANCE
+    assert plain["steps_per_period"] == starting.STEPS
+    assert finer["steps_per_period"] > starting.STEPS
+    assert finer["step_error"] <= starting.TOLERANCE
     # also later on the way
-    monkeypatch.setattr(noisy_starting, "TOLERANCE", plain["step_error"] / 100.0)
-    monkeypatch.setattr(noisy_starting._NoisyPath, "choose_steps", lambda path, job: None)
+    monkeypatch.setattr(starting, "TOLERANCE", plain["step_error"] / 100.0)
+    monkeypatch.setattr(starting._NoisyPath, "choose_steps", lambda path, job: None)
     assert "256 steps in a period are too few" in noisy(watcher, noise=0.05, periods=40)[0]["error"]

@@ -12,17 +12,15 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.explorer.copies import folder as folder_module
+from pipeline.explorer.copies import export as folder_module
 from pipeline.explorer.copies import orbits as copied_orbits
-from pipeline.explorer.copies.columns import fit, levels
-from pipeline.explorer.copies.content import Column
-from pipeline.explorer.copies.export import RESERVE, export_page
-from pipeline.explorer.copies.folder import export_folder
+from pipeline.explorer.copies.content import Column, fit, levels
+from pipeline.explorer.copies.export import RESERVE, export_folder, export_page
 from pipeline.explorer.copies.orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.store.errors import RefusedError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 HOSTILE = '</script><script>alert(1)</script><!-- \\" onload=alert(1) &lt;b'
 
@@ -54,7 +52,7 @@ def run(made):
     """All of the small sweep but its last task."""
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
-    return Run.open(made.info.directory)
+    return RunDirectory.open(made.info.directory)
 
 
 @pytest.mark.slow

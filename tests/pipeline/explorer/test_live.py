@@ -10,13 +10,15 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
+from pipeline.analysis.attractors.destinations import destinations_at
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
-from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.live import Legend, LiveRun
 from pipeline.explorer.live.messages import MOST_BYTES, Region
+from pipeline.explorer.live.orbit_following import _period_of_attractor
 from pipeline.explorer.live.regions import zoom_toml, zoomed
 from pipeline.explorer.live.settling import settle_cells
 from pipeline.layout.vocabulary import (
@@ -28,15 +30,15 @@ from pipeline.layout.vocabulary import (
     NOT_SETTLED,
     PERIODIC_ORBIT,
     UNSTABLE,
+    split_dims,
 )
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.status import state
-from pipeline.specification.parsing import load_spec
-from pipeline.store.run import Run
-from tests.pipeline.explorer.small_runs import FLOW, finished
-
-HZ = 0.15915494309189535
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
+from tests.pipeline.explorer.small_runs import FLOW, HZ
+from tests.pipeline.factories import finished
 
 DRIVEN = """
 kind = "sweep"
@@ -48,6 +50,15 @@ initial_conditions.x = { start = -0.9375, stop = 0.9375, num = 16 }
 initial_conditions.v = { start = -0.5, stop = 1.0, num = 7 }
 integration = { rtol = 1e-7, atol = 1e-7, n_transient = %d, n_keep = 12, stop_when_closed = %s }
 """
+
+
+def test_follow__period_of_a_cell_is_that_of_its_attractor(little):
+    live = LiveRun(RunDirectory.open(little))
+    periods = live.cube["orbit_period"].values
+    found = [_period_of_attractor(live, {"x_0": i}) for i in range(periods.size)]
+    live.close()
+    assert np.all((periods == 0) | (periods % np.array(found) == 0))
+    assert min(found) > 0
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +87,7 @@ def start_of(cube, at):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["whole", "closing"])
 def test_start__has_the_bits_and_the_attractor_of_the_cell(directories, watch, name):
-    opened = Run.open(directories[name])
+    opened = RunDirectory.open(directories[name])
     cube, attractors = opened.cube(), derive(directories[name], "attractors")
     watcher, seen = watch(opened), set()
     ids = attractors["attractor_id"].transpose("A", "x_0", "v_0").values
@@ -134,7 +145,7 @@ def test_start__off_the_cube_is_told_by_its_orbit(directories, watch):
 @pytest.mark.slow
 def test_start__ends_of_a_flow(directories, watch):
     """At rest or on the cycle, as the analysis says of the cell; what leaves, and what lies beside, says so."""
-    cube = Run.open(directories["flow"]).cube()
+    cube = RunDirectory.open(directories["flow"]).cube()
     attractors = dense(derive(directories["flow"], "attractors"))
     watcher, kinds = watch(directories["flow"]), set()
     for mu in (0, 1):
@@ -207,7 +218,7 @@ def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, wat
         return settle_cells(place, integration, catalog, states, check)
 
     monkeypatch.setattr(slices, "settle_cells", counted)
-    opened = Run.open(directories["whole"])
+    opened = RunDirectory.open(directories["whole"])
     attractors = dense(derive(directories["whole"], "attractors"), points=True)
     cube = opened.cube()
     watcher = watch(opened)
@@ -267,7 +278,7 @@ def follow(watcher, origin, value, parameter="A"):
 
 
 def test_follow__is_the_orbit_at_the_value(directories, watch):
-    live = LiveRun(Run.open(directories["whole"]))
+    live = LiveRun(RunDirectory.open(directories["whole"]))
     watcher = watch(live)
     orbit = follow(watcher, {"cell": closed_cell(live), "point": 2}, 0.23)
     assert (orbit["lost"], orbit["value"], orbit["parameters"]["A"]) == (False, 0.23, 0.23)
@@ -288,7 +299,7 @@ def test_follow__is_the_orbit_at_the_value(directories, watch):
 
 @pytest.mark.slow
 def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directories, watch):
-    live = LiveRun(Run.open(directories["whole"]))
+    live = LiveRun(RunDirectory.open(directories["whole"]))
     watcher = watch(live)
     held = {"cell": closed_cell(live), "point": 0}
     stable = []
@@ -307,7 +318,7 @@ def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directori
 
 @pytest.mark.slow
 def test_follow__refuses_with_a_sentence(directories, watch):
-    live = LiveRun(Run.open(directories["whole"]))
+    live = LiveRun(RunDirectory.open(directories["whole"]))
     watcher, cell = watch(live), closed_cell(live)
     for origin, parameter, value, word in (
         ({"cell": 10**9, "point": 0}, "A", 0.2, "the cube has"),
@@ -322,7 +333,7 @@ def test_follow__refuses_with_a_sentence(directories, watch):
 
 @pytest.mark.slow
 def test_follow__of_a_flow(directories, watch):
-    live = LiveRun(Run.open(directories["flow"]))
+    live = LiveRun(RunDirectory.open(directories["flow"]))
     watcher = watch(live)
     period = live.cube["orbit_period"].isel(mu=1).transpose("x_0", "y_0").values
     x, y = map(int, np.argwhere(period == 1)[0])
@@ -345,10 +356,10 @@ REGION = {"x": [-0.5, 0.5], "y": [0.0, 0.5], "axes": ["x_0", "v"], "at": {"A": 1
 
 
 def test_zoomed__is_the_region_and_reads_back(directories, tmp_path):
-    opened = Run.open(directories["whole"])
+    opened = RunDirectory.open(directories["whole"])
     region = Region.model_validate_json(json.dumps(REGION))
     (tmp_path / "zoom.toml").write_text(zoom_toml(opened, region))
-    spec = load_spec(tmp_path / "zoom.toml")
+    spec = Spec.read(tmp_path / "zoom.toml")
     assert spec == zoomed(opened, region)[0]
     assert spec.values["A"] == 0.25
     assert not spec.axes
@@ -381,7 +392,7 @@ def test_run__a_region_beside_the_run(directories, watch, monkeypatch):
     assert state(beside / end["name"]).complete
     last = [a for a in watcher.of(second) if a["kind"] == "progress"][-1]
     assert last["done"] == last["total"] == end["cells"] == 112
-    cube = Run.open(beside / end["name"]).cube()
+    cube = RunDirectory.open(beside / end["name"]).cube()
     np.testing.assert_allclose(cube["x_0"].values[[0, -1]], [-0.5, 0.5])
 
 
@@ -437,3 +448,25 @@ def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
     ):
         assert word in watcher.ask(**wrong)["error"]
     assert watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})["kind"] == "done"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["whole", "closing", "flow"])
+def test_settle_cells__ends_where_the_analysis_follows(directories, name):
+    """The live page and the analyses name the same attractor for the same initial states."""
+    opened = RunDirectory.open(directories[name])
+    live, cube, attractors = LiveRun(opened), opened.cube(), derive(directories[name], "attractors")
+    rng, n_named = np.random.default_rng(3), 0
+    for points in slabs(cube, Dynamics.of(cube), BUDGET):
+        for index, there in destinations_at(cube, attractors, points):
+            (axis,) = split_dims(cube["status"])[0]
+            place = live.place({axis: float(cube[axis][index[0]])}, None)
+            catalog = live.catalog(place)
+            starts = rng.uniform(-0.9, 0.9, (64, 2))
+            numbers = settle_cells(place, live.integration, catalog, starts, lambda: None)
+            labels = there.follow(starts).label
+            ends = [catalog.entry(number) for number in numbers.tolist()]
+            named = [i for i, end in enumerate(ends) if end.attractor is not None and end.stability == ATTRACTS]
+            assert [ends[i].attractor for i in named] == labels[named].tolist()
+            n_named += len(named)
+    assert n_named > 64

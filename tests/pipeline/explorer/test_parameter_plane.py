@@ -9,12 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pipeline.analysis.ragged import dense
+from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.view import describe_view
 from pipeline.runs.derive import derive
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.small_runs import CURVES
 
 
@@ -22,7 +23,7 @@ from tests.pipeline.explorer.small_runs import CURVES
 def test_line__its_own_curves(bent):
     """Of the run that was followed: its curves, and no map."""
     line, _ = bent
-    found, curves = parameter_plane(Run.open(line)), derive(line, "curves", CURVES)
+    found, curves = parameter_plane(RunDirectory.open(line)), derive(line, "curves", CURVES)
     assert [axis["name"] for axis in found["axes"]] == ["frequency", "amplitude"]
     assert found["map"] is None
     assert len(found["curves"]) == curves.sizes["curve"] >= 1
@@ -37,7 +38,7 @@ def test_line__its_own_curves(bent):
 def test_plane__curves_of_another_run(bent):
     """Over the number of attractors, which two folds bound."""
     line, plane = bent
-    explored = replace(ExploredRun.of(plane), curves=Run.open(line))
+    explored = replace(ExploredRun.of(plane), curves=RunDirectory.open(line))
     found, attractors = parameter_plane(explored), dense(derive(plane, "attractors"))
     assert len(found["curves"]) >= 1
     number = np.array(found["map"]["number"]).reshape(len(found["map"]["y"]), len(found["map"]["x"]))
@@ -52,7 +53,7 @@ def test_plane__curves_of_another_run(bent):
 def test_no_curves(bent):
     """A run without curves says how to get them."""
     _, plane = bent
-    found = parameter_plane(Run.open(plane))
+    found = parameter_plane(RunDirectory.open(plane))
     assert found["curves"] == []
     assert "magpend analyse curves" in found["note"]
     assert not describe_view(ExploredRun.of(plane), False)["has"]["curves"]
@@ -65,7 +66,7 @@ def test_curve_orbit__by_another_integrator(bent):
     curves = derive(line, "curves", CURVES)
     i = int(np.flatnonzero(curves["kind"].values == 0)[0])
     point = int(curves["n_points"][i]) // 4  # not where the curve begins, at the run's own values
-    arrays, attrs = unpack_arrays(curve_orbit(Run.open(line), i, point))
+    arrays, attrs = unpack_arrays(curve_orbit(RunDirectory.open(line), i, point))
     assert attrs["frequency"] == float(curves["first"][i, point])
     assert attrs["parameters"]["amplitude"] == float(curves["second"][i, point])
     states = arrays["states"].reshape(-1, 2)
@@ -83,9 +84,9 @@ def test_curve_orbit__by_another_integrator(bent):
 
 def test_curve_orbit__what_is_not_there(bent):
     line, plane = bent
-    with pytest.raises(ExplorerError, match="curve = 99"):
-        curve_orbit(Run.open(line), 99, 0)
-    with pytest.raises(ExplorerError, match="point = 99999"):
-        curve_orbit(Run.open(line), 0, 99999)
-    with pytest.raises(ExplorerError, match="there are 0 curves"):
-        curve_orbit(Run.open(plane), 0, 0)
+    with pytest.raises(RequestError, match="curve = 99"):
+        curve_orbit(RunDirectory.open(line), 99, 0)
+    with pytest.raises(RequestError, match="point = 99999"):
+        curve_orbit(RunDirectory.open(line), 0, 99999)
+    with pytest.raises(RequestError, match="there are 0 curves"):
+        curve_orbit(RunDirectory.open(plane), 0, 0)

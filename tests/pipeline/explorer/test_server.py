@@ -18,12 +18,12 @@ import pytest
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import websocket_connect
 
-from pipeline.explorer.serving import answering, answers, browser, page_html, server
-from pipeline.explorer.serving.answers import ANSWERS
-from pipeline.explorer.serving.security import Guard, Rate, content_policy, new_token
-from pipeline.explorer.serving.server import listening
+from pipeline.explorer import answers, html, server
+from pipeline.explorer.answers import ANSWERS
+from pipeline.explorer.security import Guard, Rate, content_policy, new_token
+from pipeline.explorer.server import listening
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import Client
 
 
@@ -135,7 +135,7 @@ def test_page__has_the_token_and_no_script_of_its_own(client):
     assert "<style" not in text
     assert " on" not in re.sub(r">[^<]*<", "><", text)
     # a title stays text
-    text = page_html.page("</title><script>alert(1)</script>", "abc")
+    text = html.served_html("</title><script>alert(1)</script>", "abc")
     assert "<script>alert" not in text
     assert "&lt;script&gt;" in text
 
@@ -168,7 +168,7 @@ def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
     answer = client.ask(f"/api/view?x={'a' * server.MOST_ADDRESS}")
     assert answer.code == 414
     with monkeypatch.context() as patched:
-        patched.setattr(client.service.answering, "waiting", answering.THREADS + answering.MOST_WAITING)
+        patched.setattr(client.service.answering, "waiting", answers.THREADS + answers.MOST_WAITING)
         assert client.ask("/api/view").code == 429
     assert client.ask("/api/view").code == 200
     head = (
@@ -186,7 +186,7 @@ def test_api__what_integrates_waits_for_what_it_needs(client, monkeypatch):
     found = []
     orbits = [
         threading.Thread(target=lambda: found.append(client.ask("/api/orbit?cell=99999&point=0").code))
-        for _ in range(answering.THREADS + 1)
+        for _ in range(answers.THREADS + 1)
     ]
     for one in orbits:
         one.start()
@@ -209,7 +209,7 @@ def test_api__damage_is_said_and_nothing_is_shown(made_run):
             content = bytearray(file.read_bytes())
             content[len(content) // 2] ^= 1
             file.write_bytes(bytes(content))
-    client = Client(Run.open(made_run))
+    client = Client(RunDirectory.open(made_run))
     try:
         answer = client.ask("/api/diagram?x=frequency&y=psi1&at.q=0")
     finally:
@@ -259,8 +259,8 @@ def test_listening__is_on_loopback_and_says_what_is_taken():
 def test_browser__is_told_a_file_for_this_user_alone(monkeypatch):
     """The address with its token is no argument of a process, and nothing is left behind."""
     opened, done = [], threading.Event()
-    monkeypatch.setattr(browser.webbrowser, "open", lambda address: (opened.append(address), done.set()))
-    with browser.browser() as open_address:
+    monkeypatch.setattr(server.webbrowser, "open", lambda address: (opened.append(address), done.set()))
+    with server.browser() as open_address:
         open_address("http://127.0.0.1:1/?token=secret&b=\"'<")
         assert done.wait(120)
         assert opened[0].startswith("file://")

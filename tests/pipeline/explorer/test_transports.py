@@ -10,17 +10,16 @@ from urllib.parse import urlencode
 
 import pytest
 
+from pipeline.explorer import server as sockets
+from pipeline.explorer.answers import ANSWERS, Answering
+from pipeline.explorer.connection import MOST_PAGES, Connection
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import orbit
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import orbit
 from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live.messages import MOST_BYTES
-from pipeline.explorer.notebook.connection import MOST_PAGES, Connection
-from pipeline.explorer.serving import socket as sockets
-from pipeline.explorer.serving.answering import Answering
-from pipeline.explorer.serving.answers import ANSWERS
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import PATIENCE_S
 
 REGION = {"x": [-0.9, 0.5], "axes": ["x_0", None]}
@@ -69,7 +68,7 @@ class Notebook:
 
     def __init__(self, directory):
         self.sent = queue.Queue()
-        self.answering = Answering(Run.open(directory))
+        self.answering = Answering(RunDirectory.open(directory))
         self.connection = Connection(self.answering, lambda content, buffers: self.sent.put((content, buffers)))
         self.dropped = []
 

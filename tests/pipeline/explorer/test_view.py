@@ -14,27 +14,28 @@ from scipy.integrate import solve_ivp
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
 from pipeline.analysis.ragged import dense
+from pipeline.explorer import RequestError
 from pipeline.explorer.data import diagram as diagrams
 from pipeline.explorer.data import tables
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.clicked_orbit import cell_of, linearise, orbit
 from pipeline.explorer.data.colours import NONE
 from pipeline.explorer.data.diagram import diagram
-from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.orbits import SAMPLES, cell_of, linearise, orbit
 from pipeline.explorer.data.overlays import attractors, branches, curves
-from pipeline.explorer.data.plain_text import plain
 from pipeline.explorer.data.planes import plane
-from pipeline.explorer.data.series import SAMPLES
 from pipeline.explorer.data.tables import table
+from pipeline.explorer.data.verticals import plain
 from pipeline.explorer.data.view import describe_view
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
 from pipeline.runs.derive import derive
-from pipeline.specification.parsing import load_spec
-from pipeline.store.run import Run
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create
-from tests.pipeline.explorer.small_runs import FLOW, finished
+from tests.pipeline.explorer.small_runs import FLOW
+from tests.pipeline.factories import finished
 
 # the same model, and the same is watched, as in tests/test_duffing_day.py: nothing more is compiled
 TIGHT = "integration = { rtol = 1e-9, atol = 1e-9, n_transient = 150, n_keep = 12 }"
@@ -123,11 +124,11 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
 
 
 @pytest.mark.slow
-def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_run):
+def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made):
     # of what a run of two parameters is to be followed along, a person has to say
     assert describe_view(ExploredRun.of(sweep), False)["commands"] == {}
     assert "basins" not in describe_view(ExploredRun.of(walk), False)["commands"]  # a walk has no basins
-    assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made_run.directory), False)["commands"].keys()
+    assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made.info.directory), False)["commands"].keys()
 
 
 @pytest.mark.slow
@@ -140,7 +141,7 @@ def test_describe_view__reads_what_is_computed_later(walk):
     derive(walk, "settling")
     assert explored.refreshed() is not explored
     # whoever holds an opened run may hand it over; an explored one is taken as it is
-    opened = Run.open(walk)
+    opened = RunDirectory.open(walk)
     assert ExploredRun.of(ExploredRun.of(opened)).digest == opened.digest
     assert ExploredRun.of(explored) is explored
 
@@ -220,22 +221,22 @@ def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkey
     own = whole["y"][whole["first"][k] : whole["first"][k + 1]]
     np.testing.assert_array_equal(part["y"][part["first"][k] : part["first"][k + 1]], own[-5:])
     monkeypatch.setattr(diagrams, "MOST_POINTS", 71)
-    with pytest.raises(ExplorerError, match="71 cells at most"):
+    with pytest.raises(RequestError, match="71 cells at most"):
         diagram(explored, "amplitude", "x", {"frequency": 0})
 
 
 @pytest.mark.slow
-def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
+def test_diagram__of_a_run_in_progress_has_what_is_committed(made):
     """Pending cells are there without points; after a commit and a fresh look they have them."""
-    explored = ExploredRun.of(made_run.directory)
-    assert describe_view(explored, False)["cells"]["pending"] == made_run.plan.n_cells
-    made_run.commit(0)
+    explored = ExploredRun.of(made.info.directory)
+    assert describe_view(explored, False)["cells"]["pending"] == made.plan.n_cells
+    made.commit(0)
     assert explored.refreshed() is not explored
     explored = explored.refreshed()
     view = describe_view(explored, False)
-    committed = made_run.plan.cells_in(0)
+    committed = made.plan.cells_in(0)
     assert not view["complete"]
-    assert view["cells"]["pending"] == made_run.plan.n_cells - committed
+    assert view["cells"]["pending"] == made.plan.n_cells - committed
     cube = explored.cube().load()
     total = 0
     for q in range(2):
@@ -244,12 +245,6 @@ def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
         np.testing.assert_array_equal(counts > 0, arrays["status"] != 0)
         total += int((counts > 0).sum())
     assert total == committed == int((cube.status != 0).sum())
-
-
-@pytest.fixture
-def made_run(made):
-    made.directory = made.info.directory
-    return made
 
 
 # ---- orbits
@@ -368,9 +363,9 @@ def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
     assert attrs["exponents"][1] < 0.0
 
 
-def test_orbit__of_a_pending_cell_is_refused(made_run):
-    with pytest.raises(ExplorerError, match="not computed yet"):
-        orbit(ExploredRun.of(made_run.directory), 0, 0)
+def test_orbit__of_a_pending_cell_is_refused(made):
+    with pytest.raises(RequestError, match="not computed yet"):
+        orbit(ExploredRun.of(made.info.directory), 0, 0)
 
 
 def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
@@ -383,7 +378,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
         "[integration]\nn_transient = 5\nn_keep = 3\n"
     )
     (tmp_path / "spec.toml").write_text(text, "utf-8")
-    spec = load_spec(tmp_path / "spec.toml")
+    spec = Spec.read(tmp_path / "spec.toml")
     plan = make_plan(spec)
     create(tmp_path / "run", spec, plan, identity_of(spec, plan), text)
     explored = ExploredRun.of(tmp_path / "run")
@@ -392,7 +387,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
     assert [v["name"] for v in view["verticals"]] == list(explored.model.state_names)
     arrays, _ = unpack_arrays(diagram(explored, "q", view["verticals"][0]["name"], {}))
     assert len(arrays["cell"]) == 2
-    with pytest.raises(ExplorerError, match="recording"):
+    with pytest.raises(RequestError, match="recording"):
         orbit(explored, 0, 0)
 
 
@@ -516,7 +511,3 @@ def test_table__a_word_is_no_formula(monkeypatch):
     ds = xr.Dataset({"name": ("row", np.array(names)), "value": ("row", np.array(values))})
     written = ["name,value", "'=1+1,-1.0", "'+x,", "'@y,0.1", "B: left,2.0", ",1e-300"]
     assert tables._csv(ds).decode().splitlines() == written
-
-
-def test_table__of_branches(walk):
-    assert table(ExploredRun.of(walk), "branches", {"x": "amplitude", "y": "x", "at": {}}).startswith(b"# title")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import magpend
-from pipeline.explorer.notebook.showing import explorer
+from pipeline.explorer.notebook import explorer
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.conftest import PATIENCE_S
 from tests.pipeline.explorer.test_transports import LONG
 from tests.programs import fresh_python
@@ -40,7 +40,7 @@ def test_selected__is_of_the_cube_and_shown_in_the_page(widget, little):
     seen = []
     widget.observe(lambda change: seen.append(change["new"]), "selected")
     widget.selected = {"cell": 2}
-    cube = Run.open(little).cube().load()
+    cube = RunDirectory.open(little).cube().load()
     one = cube.isel(x_0=2)
     section = one["section"].transpose("period_index", "state").values
     found = widget.selected
@@ -99,7 +99,7 @@ def test_explore__is_a_method_of_a_run(little, widget):
 
 def test_explorer__says_what_is_missing(little, monkeypatch):
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    monkeypatch.delitem(sys.modules, "pipeline.explorer.notebook.widget", raising=False)
+    monkeypatch.delitem(sys.modules, "pipeline.explorer.widget", raising=False)
     with pytest.raises(SpecError, match=r"pip install '\.\[notebook\]'"):
         explorer(little)
     with pytest.raises(SpecError, match="height = 100: must be 320 pixels or more"):

@@ -1,4 +1,6 @@
-"""What is too large is refused at once, in words, before anything is created."""
+"""What is too large, or has not the period of the drive, is refused at once, before anything is created."""
+
+from __future__ import annotations
 
 import shutil
 import time
@@ -7,11 +9,11 @@ from collections import namedtuple
 
 import pytest
 
-from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space
-from pipeline.layout.plan import MOST_TASKS, make_plan
+from magpend_core.engine.checks import SystemCheckError
+from pipeline.layout.plan import MOST_CHUNK_BYTES, MOST_TASKS, check_plan, check_space, make_plan
 from pipeline.runs.preview import describe_plan
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.commits import read_commits
 from pipeline.store.runfile import read_run
 from tests.pipeline.factories import duffing, quietly
@@ -25,32 +27,13 @@ def text_of(points=3, starts=2, keep=3, execution=""):
 
 
 def plan_of(**sizes):
-    return make_plan(parse_spec(tomllib.loads(text_of(**sizes))))
+    return make_plan(Spec.parse(tomllib.loads(text_of(**sizes))))
 
 
 def refused(call):
     with pytest.raises(SpecError) as caught:
         call()
     return str(caught.value)
-
-
-@pytest.fixture
-def refuses(write_spec, tmp_path):
-    """Give a specification to a run and a dry run, which both refuse it within seconds; returns the words."""
-
-    def call(**sizes):
-        path = write_spec(text_of(**sizes))
-        started = time.process_time()
-        words = {
-            refused(lambda: quietly(path, tmp_path / "run")),
-            refused(lambda: list(describe_plan(path, tmp_path / "run"))),
-        }
-        assert time.process_time() - started < 60
-        assert [p.name for p in tmp_path.iterdir()] == [path.name]
-        (said,) = words
-        return said
-
-    return call
 
 
 @pytest.mark.parametrize(
@@ -62,21 +45,19 @@ def refuses(write_spec, tmp_path):
         ),
         (
             {"starts": 40, "keep": 1_000_000, "execution": "trajectories_per_task = 1600"},
-            (
-                "section: 1600 cells of a task take 25.6 GB in one piece",
-                "the limit of compression is 2.15 GB",
-                "trajectories_per_task to 134 or less",
-            ),
+            ("section: 1600 cells of a task take 25.6 GB", "the limit of compression", "trajectories_per_task to 134"),
         ),
-        (
-            {"points": 100_000, "starts": 100, "keep": 1000},
-            ("needs up to 16 TB (its cells before compression), and there are", "MAGPEND_SPACE=0"),
-        ),
+        ({"points": 100_000, "starts": 100, "keep": 1000}, ("needs up to 16 TB", "MAGPEND_SPACE=0")),
     ],
     ids=["tasks", "pieces", "room"],
 )
-def test_run__refuses_what_is_too_large(refuses, sizes, words):
-    said = refuses(**sizes)
+def test_run__refuses_what_is_too_large(write_spec, tmp_path, sizes, words):
+    """A run and a dry run say the same within seconds, and create nothing."""
+    path, started = write_spec(text_of(**sizes)), time.process_time()
+    said = refused(lambda: quietly(path, tmp_path / "run"))
+    assert refused(lambda: list(describe_plan(path, tmp_path / "run"))) == said
+    assert time.process_time() - started < 60
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
     assert all(word in said for word in words), said
 
 
@@ -107,7 +88,7 @@ def test_check_plan__branches_whose_starts_fill_the_memory():
         "axes": {"frequency_hz": {"values": [0.1, 0.2]}},
         "initial_conditions": {"kind": "grid", **{s: {"start": 0.0, "stop": 1.0, "num": 100_000} for s in ("x", "v")}},
     }
-    assert "the limit is 10000000" in refused(lambda: check_plan(make_plan(parse_spec(data))))
+    assert "the limit is 10000000" in refused(lambda: check_plan(make_plan(Spec.parse(data))))
 
 
 Usage = namedtuple("Usage", "total used free")
@@ -138,3 +119,69 @@ def test_run__goes_on_where_the_rest_fits(monkeypatch, write_spec, tmp_path):
     with pytest.raises(SpecError, match="needs up to"):
         quietly(path, tmp_path / "another")
     assert not (tmp_path / "another").exists()
+
+
+# ---- expressions of time that have not the drive's period ------------------------------------------------
+
+OWN = """
+kind = "sweep"
+[axes]
+frequency_hz = {{ start = 0.5, stop = 1.0, num = 3 }}
+[initial_conditions]
+kind = "list"
+points = [[0.1, 0.2]]
+[integration]
+n_transient = 1
+n_keep = 1
+[model]
+name = "driven"
+[model.states]
+x = {{}}
+v = {{}}
+[model.parameters]
+A = 0.5
+omega = 3.141592653589793
+[model.equations]
+x = "v"
+v = "-x - v + {drive}"
+"""
+
+ODD = [
+    "A*cos(omega*t)",  # periodic at the first frequency alone
+    "A*sin(pi*f*t)",  # 0 at both ends of the period
+    "A*t",
+    "x*cos(omega*t)",
+    "A*cos(2*pi*f*t) + 0.1*exp(-t)",
+]
+
+
+@pytest.mark.parametrize("drive", ODD)
+def test_commands__refuse_other_periods_before_anything_is_created(main, write_spec, tmp_path, drive):
+    spec = write_spec(OWN.format(drive=drive))
+    for command in (["run", spec, "--workers", "0"], ["run", spec, "--dry-run"], ["model", "show", spec]):
+        code, _, err = main(*command)
+        assert code == 2, err
+        assert "does not repeat after a period of the drive" in err
+        assert "frequency_hz" in err
+        assert list(tmp_path.iterdir()) == [spec]
+
+
+@pytest.mark.parametrize(
+    "drive",
+    ["A*cos(2*pi*f*t)", "A*cos(2*pi*phase)", "A*square(phase, 0.3)", "A*cos(2*pi*f*t)**3*x", "A*sign(sin(4*pi*f*t))"],
+)
+def test_commands__the_drives_period_and_its_fractions(main, write_spec, drive):
+    code, _, err = main("model", "show", write_spec(OWN.format(drive=drive)))
+    assert code == 0, err
+
+
+def test_run__a_model_that_fails_its_checks_leaves_no_directory(own, write_spec, tmp_path, monkeypatch):
+    """A model given as a Python object is checked only when it is compiled."""
+    own.write_module(tmp_path / "models", "slow_drive")
+    module = tmp_path / "models/slow_drive.py"
+    module.write_text(module.read_text().replace("sincos(c[1] * t)", "sincos(0.3 * c[1] * t)"))
+    monkeypatch.syspath_prepend(str(tmp_path / "models"))
+    spec = write_spec(own.spec('model = "slow_drive:MINE"'))
+    with pytest.raises(SystemCheckError, match="must have the period of the drive"):
+        quietly(spec, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.layout.cells import CellMap
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import Spec, parse_spec
+from pipeline.specification.spec import Spec
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,7 @@ def specs(draw, kind):
     if kind == "continuation":
         data["continuation"] = {"direction": draw(st.sampled_from(["up", "down", "both"]))}
         data["execution"]["points_per_task"] = draw(st.integers(1, 3))
-    return parse_spec(data)
+    return Spec.parse(data)
 
 
 def histories(spec: Spec, wanted: Spec | None = None) -> dict[int, bytes]:

@@ -1,9 +1,9 @@
-"""Plans: every cell once, whole chunks, nothing that depends on the machine."""
+"""Plans: every cell once, whole chunks, nothing that depends on the machine; and what the kernel sees of cells."""
 
 from __future__ import annotations
 
+import itertools
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +11,15 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from magpend_core import load_preset
 from magpend_core.models import load_model
 from pipeline.layout import identity
 from pipeline.layout import plan as planning
+from pipeline.layout.cells import CellMap, coordinates, initial_states
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import base_variables, sizes_of
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 
 VARIABLES = base_variables(load_model())
 
@@ -64,35 +66,19 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
         assert size <= planning.CHUNK_BYTES or chunks[0] == 1
 
 
-@pytest.mark.parametrize("n_seeds", [1, 5, 6, 7, 12])
-@pytest.mark.parametrize("wanted", [1, 2, 4, 5, 8, 24])
-def test_make_plan__no_task_walks_both_ways(walk_text, n_seeds, wanted):
-    text = walk_text.replace("n = 5", f"n = {n_seeds}").replace("task = 2", f"task = {wanted}")
-    plan = make_plan(parse_spec(tomllib.loads(text)))
-    assert plan.shape[-1] == 2 * n_seeds
-    for block in plan.tasks():
-        assert block[-1].start // n_seeds == (block[-1].stop - 1) // n_seeds
-
-
 def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
     import os
 
-    spec = parse_spec(tomllib.loads(sweep_text))
+    spec = Spec.parse(tomllib.loads(sweep_text))
     plan = make_plan(spec)
     monkeypatch.setattr(os, "cpu_count", lambda: 97)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(97)), raising=False)
     assert make_plan(spec) == plan
 
 
-def test_task__out_of_range(sweep_text):
-    plan = make_plan(parse_spec(tomllib.loads(sweep_text)))
-    with pytest.raises(IndexError, match="does not exist"):
-        plan.task(plan.n_tasks)
-
-
 def test_identity__what_counts(sweep_text):
     def digest(text):
-        spec = parse_spec(tomllib.loads(text))
+        spec = Spec.parse(tomllib.loads(text))
         return digest_of(identity_of(spec, make_plan(spec)))
 
     same = digest(sweep_text)
@@ -112,27 +98,10 @@ def test_digest_of__numbers_without_loss():
     assert not differences({"a": 2.0}, {"a": 2})
 
 
-def test_identity__other_starts_under_the_same_specification(sweep_text, monkeypatch):
-    """Another version of what makes numbers of a specification is another run."""
-    spec = parse_spec(tomllib.loads(sweep_text))
-    before = identity_of(spec, make_plan(spec))
-    original = identity.coordinates
-
-    def moved(spec):
-        found = list(original(spec))
-        i = next(i for i, c in enumerate(found) if c.name == "psi1_0")
-        found[i] = replace(found[i], values=found[i].values + 1e-15)
-        return tuple(found)
-
-    monkeypatch.setattr(identity, "coordinates", moved)
-    lines = differences(before, identity_of(spec, make_plan(spec)))
-    assert [line.split(":")[0] for line in lines] == ["coordinates"]
-
-
 def test_identity__versions_of_what_is_computed(sweep_text):
     """A product that a run does not ask for bars nobody from completing it."""
-    plain = parse_spec(tomllib.loads(sweep_text))
-    spectra = parse_spec(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
+    plain = Spec.parse(tomllib.loads(sweep_text))
+    spectra = Spec.parse(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
     assert set(identity.versions_of(plain)) == {"engine", "cells"}
     assert set(identity.versions_of(spectra)) == {"engine", "cells", "lyapunov"}
     lines = differences(*(identity_of(s, make_plan(s)) for s in (plain, spectra)))
@@ -145,3 +114,88 @@ def test_differences__key_by_key():
     lines = differences(old, new)
     assert [line.split(":")[0] for line in lines] == ["a.c", "d", "e"]
     assert lines[0] == "a.c: [1, 2] in the directory, [1, 3] now"
+
+
+# ---- between the cells of the cube and what the kernel sees ----------------------------------------------
+
+NAMES = load_preset().names
+
+
+def whole(shape):
+    return tuple(slice(0, n) for n in shape)
+
+
+def test_inputs__sweep_cell_by_cell(sweep_text):
+    spec = Spec.parse(tomllib.loads(sweep_text))
+    cells = CellMap(spec)
+    assert cells.dims == ("frequency", "q", "psi1_0", "psi2_0")
+    coords = {c.name: c.values for c in coordinates(spec)}
+    block = (slice(1, 3), slice(1, 2), slice(0, 3), slice(2, 4))
+    inputs = cells.inputs(block)
+    places = list(itertools.product(*(range(s.start, s.stop) for s in block)))
+    assert inputs.parameters.shape == (len(places), 1, len(NAMES))
+    for row, (i, j, k, m) in enumerate(places):
+        assert inputs.frequency_hz[row, 0] == coords["frequency"][i]
+        expected = load_preset(q=float(coords["q"][j])).pack()
+        assert (inputs.parameters[row, 0] == expected).all()
+        start = [coords["psi1_0"][k], coords["psi2_0"][m], 0.1, 0.0]
+        assert inputs.initial_states[row].tolist() == start
+
+
+def test_inputs__branches_walk_up_and_down(walk_text):
+    spec = Spec.parse(tomllib.loads(walk_text.replace("[axes]", "[axes]\nq = { values = [1.5, 1.6] }")))
+    cells = CellMap(spec)
+    assert cells.dims == ("q", "frequency", "branch")
+    assert cells.shape == (2, 6, 10)
+    inputs = cells.inputs((slice(1, 2), slice(0, 6), slice(4, 7)))
+    path = spec.axes["frequency_hz"].array()
+    assert (inputs.frequency_hz == [path, path[::-1], path[::-1]]).all()
+    assert (inputs.parameters[..., NAMES.index("q")] == 1.6).all()
+    starts = initial_states(spec.initial_conditions).at(np.array([4, 0, 1]))
+    assert (inputs.initial_states == starts).all()
+
+
+@pytest.mark.parametrize("extra", ["", "q = { values = [1.5, 1.6] }"])
+@pytest.mark.parametrize("first", [True, False])
+def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
+    axis = "frequency_hz = { start = 2.0, stop = 2.5, num = 6 }"
+    axes = f"{axis}\n{extra}" if first else f"{extra}\n{axis}"
+    spec = Spec.parse(tomllib.loads(walk_text.replace(axis, axes)))
+    cells = CellMap(spec)
+    coords = {c.name: c.values for c in coordinates(spec)}
+    q = coords.get("q", np.array([load_preset()["q"]]))
+    for block in make_plan(spec).tasks():
+        inputs = cells.inputs(block)
+        echo = np.stack([inputs.frequency_hz, inputs.parameters[..., NAMES.index("q")]], axis=-1)
+        out = cells.outputs(block, echo)
+        index = dict(zip(cells.dims, np.indices(out.shape[:-1]), strict=True))
+        offset = {d: s.start for d, s in zip(cells.dims, block, strict=True)}
+        assert (out[..., 0] == coords["frequency"][index["frequency"] + offset["frequency"]]).all()
+        assert (out[..., 1] == q[index["q"] + offset["q"] if "q" in index else 0]).all()
+
+
+def test_initial_states__samples_do_not_depend_on_what_is_fixed(walk_text):
+    free = Spec.parse(tomllib.loads(walk_text)).initial_conditions
+    fixed = Spec.parse(tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))).initial_conditions
+    rows = np.arange(5)
+    assert (initial_states(free).at(rows)[:, 1] == initial_states(fixed).at(rows)[:, 1]).all()
+    assert (np.abs(initial_states(free).at(rows)[:, :2]) <= np.deg2rad(40)).all()
+
+
+def test_coordinates__fixed_frequency_and_single_cell():
+    text = """
+    kind = "sweep"
+    [parameters]
+    frequency_hz = 2.2
+    [initial_conditions]
+    kind = "grid"
+    psi1 = 0.1
+    """
+    spec = Spec.parse(tomllib.loads(text))
+    cells = CellMap(spec)
+    assert cells.shape == ()
+    inputs = cells.inputs(())
+    assert inputs.frequency_hz.tolist() == [[2.2]]
+    assert inputs.initial_states.tolist() == [[0.1, 0, 0, 0]]
+    assert cells.outputs((), np.ones((1, 1, 3))).shape == (3,)
+    assert {c.name: c.dims for c in coordinates(spec)}["frequency"] == ()

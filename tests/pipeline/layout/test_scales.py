@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.layout.scales import with_sizes
-from pipeline.specification.parsing import parse_spec
+from pipeline.layout.evaluation import with_sizes
+from pipeline.specification.spec import Spec
 
 TEXT = {
     "well": {"x": "v", "v": "w**2*x*(1 - (x/s)**2) - 0.1*w*v"},
@@ -23,7 +23,7 @@ def spec_of(name, s=1.0, w=1.0, *, start=2.0, frequency=0.1, **state):
     if name == "ball":
         model["impacts"] = [{"of": "x", "direction": "down", "set": {"v": "-0.9*v"}, "stick": True}]
     x = {"start": 0.1 * start * s, "stop": start * s, "num": 4}
-    return parse_spec(
+    return Spec.parse(
         {
             "kind": "sweep",
             "model": model,

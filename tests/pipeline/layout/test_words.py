@@ -1,31 +1,38 @@
-"""Words and names of flows in cubes, tables and figures."""
+"""Words and units in cubes, tables and figures: what pint and cf-xarray read is what was meant."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
+import pytest
 import xarray as xr
 
-from magpend_core import load_model
+from magpend_core import load_model, model_names
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
-from pipeline.layout.conventions import conventional
-from pipeline.layout.period_names import once, period_of, section_name
-from pipeline.layout.units import readable_unit, shown_unit, unit_remarks
-from pipeline.layout.vocabulary import frequency_of, model_attribute, model_of, section_attributes, told_by
+from pipeline.layout.conventions import conventional, readable_unit, unit_remarks
+from pipeline.layout.vocabulary import (
+    frequency_of,
+    model_attribute,
+    model_of,
+    once,
+    period_of,
+    section_attributes,
+    section_name,
+    told_by,
+)
 from pipeline.plots.section import section_pair
-from pipeline.specification.inputs import load_model as load_given
+from pipeline.specification.models import load_model as load_given
 from tests.core.flows import ROSSLER, VAN_DER_POL, flow
 
 
 def test_period_of__each_way_to_look():
     whole = flow(VAN_DER_POL)
     seen = sectioned(whole, Crossing("v", 0.5, "down"))
-    assert period_of(load_model()) == "drive period"
-    assert period_of(whole) == "strobe period"
-    assert period_of(seen) == "return"
+    assert [period_of(m) for m in (load_model(), whole, seen)] == ["drive period", "strobe period", "return"]
     assert once(seen) == "crossing of v = 0.5 going down"
-    assert once(load_model()) == "once per drive period"
-    assert section_name(load_model()) == "stroboscopic section"
     assert section_name(seen) == "Poincar\u00e9 section"
 
 
@@ -51,7 +58,6 @@ def test_section_pair__leaves_the_crossing_state_out():
 
 
 def test_readable_unit__none():
-    """What others read: test_units."""
     phrases = ["widgets", "drive periods", "length of the pendulum"]
     for text in [*phrases, "2 m", "m/", "(m", "m)", "m^", "1e-3 m", "$", "s^1.5"]:
         assert readable_unit(text) is None, text
@@ -64,15 +70,73 @@ def test_unit_remarks__name_what_nobody_reads():
     assert line.startswith("units that other programs cannot read: 'widgets' of x; 'widgets/s' of a. ")
 
 
-def test_shown_unit__as_the_model_names_it():
-    assert shown_unit({"units_as_given": "widgets"}) == "widgets"
-    assert shown_unit({"units": "m"}) == "m"
-    assert shown_unit({}, "Hz") == "Hz"
-
-
 def test_conventional__axes_are_continuous():
     """A number of something, such as a period, is no axis, even with a unit."""
     counts, places = ("n", [1, 2], {"units": "1"}), ("force", [0.1, 0.2], {"units": "N"})
     ds = conventional(xr.Dataset({"a": (("n", "force"), np.zeros((2, 2)))}, {"n": counts, "force": places}))
     assert ds["force"].attrs["axis"] == "X"
     assert "axis" not in ds["n"].attrs
+
+
+# ---- units -----------------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).parents[3]
+
+# exponents of mass, length, time, angle by hand
+MEANT = {
+    "m/s2": {"meter": 1, "second": -2},
+    "m/s^2": {"meter": 1, "second": -2},
+    "kg m2": {"kilogram": 1, "meter": 2},
+    "kg*m**2": {"kilogram": 1, "meter": 2},
+    "1/(m2 s2)": {"meter": -2, "second": -2},
+    "m s-1": {"meter": 1, "second": -1},
+    "N·m": {"newton": 1, "meter": 1},
+    "N m s/rad": {"newton": 1, "meter": 1, "second": 1, "radian": -1},
+    "m/s/s": {"meter": 1, "second": -2},
+    "rad/s": {"radian": 1, "second": -1},
+    "mm": {"millimeter": 1},
+    "min": {"minute": 1},
+    "Pa s": {"pascal": 1, "second": 1},
+    "T": {"tesla": 1},
+    "deg": {"degree": 1},
+    "%": {"percent": 1},
+    "1": {},
+    "": {},
+    "cells": {},
+    "nat": {},  # pint alone reads a nano-atmosphere
+}
+
+
+@pytest.fixture(scope="module")
+def registries():
+    pint = pytest.importorskip("pint")
+    return pint.UnitRegistry(), pytest.importorskip("cf_xarray.units").units
+
+
+@pytest.mark.slow
+def test_readable_unit__is_what_was_meant(registries):
+    for text, meant in MEANT.items():
+        for registry in registries:
+            found = registry.Unit(readable_unit(text))
+            assert found == registry.Unit(registry.UnitsContainer(meant)), (text, registry)
+        assert readable_unit(readable_unit(text)) == readable_unit(text)
+
+
+@pytest.mark.slow
+def test_readable_unit__of_all_models_that_ship(registries):
+    registry, _ = registries
+    for name in model_names():
+        model = load_model(name)
+        assert unit_remarks(model) == [], name
+        for entry in (*model.states, *model.parameters, *model.quantities):
+            registry.Unit(readable_unit(entry.unit))
+
+
+@pytest.mark.slow
+def test_readable_unit__of_all_results():
+    """Every unit that is written in the sources of the pipeline."""
+    found = set()
+    for path in {*(ROOT / "pipeline").rglob("*.py")} - {ROOT / "pipeline/layout/conventions.py"}:
+        found |= set(re.findall(r'(?:"units": |\bunits=)"([^"]*)"', path.read_text("utf-8")))
+    assert {"1/s", "N m", "see state_units"} <= found
+    assert {text for text in found if readable_unit(text) is None} == {"see state_units"}

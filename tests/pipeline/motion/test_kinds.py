@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.motion.steady import Steady
 from pipeline.products.registry import ANALYSES
-from pipeline.specification.parsing import parse_spec
+from pipeline.specification.spec import Spec
 
 DUFFING: dict[str, Any] = {
     "kind": "sweep",
@@ -31,7 +31,7 @@ TABLES: dict[str, dict[str, Any]] = {
 def motion(folder: Path, kind: str, **more: Any) -> Steady:
     rows = "".join(f"{t},{(-1) ** t}\n" for t in range(31))
     (folder / "drive.csv").write_text(f"time_s,drive\n{rows}", "utf-8")
-    return parse_spec({**DUFFING, **TABLES[kind], **more}, folder).motion
+    return Spec.parse({**DUFFING, **TABLES[kind], **more}, folder).motion
 
 
 @pytest.mark.parametrize("kind", TABLES)

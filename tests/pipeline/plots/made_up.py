@@ -79,6 +79,16 @@ def make_portraits(n, states=STATES, turning=()):
     )
 
 
+def make_trajectory(n=401, frequency=2.0):
+    """A closed motion of the pendulum's states."""
+    time = np.linspace(0.0, 2.0, n)
+    phase = 2 * np.pi * frequency * time
+    values = (0.1 * np.cos(phase), 0.2 * np.sin(phase), -0.1 * np.sin(phase), 0.2 * np.cos(phase))
+    factors = (1.0, 1.0, 2 * np.pi * frequency, 2 * np.pi * frequency)
+    states = {name: ("time", f * v) for name, f, v in zip(STATES, factors, values, strict=True)}
+    return xr.Dataset(states, coords={"time": time}, attrs={"frequency_hz": frequency})
+
+
 def legend_texts(fig):
     """Texts of the legends, unfolded."""
     return [" ".join(text.get_text().split()) for legend in fig.legends for text in legend.get_texts()]

@@ -14,7 +14,7 @@ from magpend_core.models import load_model
 from pipeline.analysis.selection import place
 from pipeline.plots import Frame, draw_figure, save_data, save_figure
 from pipeline.plots.bifurcation import plot_bifurcation
-from pipeline.plots.motions import motions_of
+from pipeline.plots.palette import motions_of
 from pipeline.plots.style import GREY, PALETTE
 from pipeline.products.product import Options, default_of
 from pipeline.products.registry import FIGURES

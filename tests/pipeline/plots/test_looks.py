@@ -11,9 +11,8 @@ from cycler import cycler
 from matplotlib import pyplot as plt
 from matplotlib.colors import to_hex
 
-from pipeline.plots import Frame, palette, plot_basins, plot_bifurcation, plot_coexisting, plot_fractions, save_figure
+from pipeline.plots import Frame, palette, plot_bifurcation, plot_coexisting, plot_fractions, save_figure
 from pipeline.plots.looks import check_style, given
-from pipeline.plots.targets import drawing_into
 from pipeline.specification.problems import SpecError
 from tests.pipeline.plots.made_up import DUFFING, by_gid, make_attractors
 from tests.pipeline.plots.test_door import make_cube
@@ -70,20 +69,6 @@ def test_look__attractors_keep_the_colours_of_a_style_over_figures():
         assert to_hex(points[f"points:{name}"].get_facecolor()[0]) == colour
     # no colour of its own, rather than that of another
     assert to_hex(points["points:C"].get_facecolor()[0]) == palette.OTHERS.lower()
-
-
-@pytest.mark.slow
-def test_look__images_in_given_axes_leave_their_ticks():
-    grid = {name: (name, [-1.0, 0.0, 1.0], {"units": "m"}) for name in ("x_0", "v_0")}
-    ids = [[0, 0, 1], [0, 1, 1], [0, 1, 1]]
-    mine = {"xtick.direction": "inout", "xtick.labelsize": 19.0, "axes.linewidth": 3.0}
-    with plt.rc_context(mine):
-        _, ax = plt.subplots()
-        with drawing_into(ax):
-            plot_basins(make_attractors(ids, ("x_0", "v_0"), grid, attrs=DUFFING))
-    tick = ax.xaxis.get_major_ticks()[0]
-    assert (tick.get_tickdir(), tick.label1.get_size(), ax.spines["top"].get_linewidth()) == ("inout", 19.0, 3.0)
-    plt.close("all")
 
 
 @pytest.mark.parametrize(

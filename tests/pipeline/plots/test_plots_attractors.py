@@ -1,10 +1,9 @@
-"""Figures of attractors: what is drawn, read back from pixels, artists and the data beside them."""
+"""Figures of attractors: the data beside them, their legends, colours and captions."""
 
 from __future__ import annotations
 
 import itertools
 
-import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,20 +13,18 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
-from pipeline.analysis.attractors.matching.hysteresis import hysteresis
+from pipeline.analysis.attractors.hysteresis import find_hysteresis
 from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
-from pipeline.analysis.branches.curves import Curve
-from pipeline.analysis.branches.curves_dataset import curves_dataset
+from pipeline.analysis.branches.curves import Curve, curves_dataset
 from pipeline.analysis.branches.problems import Family, Value
-from pipeline.analysis.branches.table import curves_table
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.layout import vocabulary
-from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS
-from pipeline.plots import palette, plot_basins, plot_coexisting, plot_curves, plot_fractions, plot_gallery, save_figure
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS, letter
+from pipeline.plots import palette, plot_basins, plot_coexisting, plot_curves, plot_fractions, plot_gallery
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import (
     VALUES,
@@ -62,22 +59,11 @@ def grid():
     return make_attractors(ids, GRID, grid_coords(4), status=status)
 
 
-def colours_of(fig):
-    """RGB of the image's cells, shape (psi1, psi2, 3)."""
-    (image,) = [im for ax in fig.axes for im in ax.get_images() if im.get_gid() == "basins"]
-    return np.swapaxes(image.get_array() / 255.0, 0, 1)
-
-
-def legend_colours(fig):
-    handles = [patch for legend in fig.legends for patch in legend.get_patches()]
-    return dict(zip(legend_texts(fig), [to_rgb(p.get_facecolor()) for p in handles], strict=True))
-
-
 @pytest.mark.slow
-def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
-    fig = plot_basins(grid)
-    picture, legend = colours_of(fig), legend_colours(fig)
-    assert list(legend) == [
+def test_plot_basins__cells_outcomes_and_shares(grid):
+    """The legend counts as the table does: cells that end on attractors or diverge."""
+    fig = plot_basins(grid, n_periods=xr.full_like(grid["attractor_id"], 100))
+    assert legend_texts(fig) == [
         "A: period 1, left, 61.5 %",
         "B: period 1, left, 30.8 %",
         "not settled, 1 cell",
@@ -85,67 +71,25 @@ def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
         "failed, 1 cell",
         "pending, 1 cell",
     ]
-    expected = np.empty((4, 4, 3))
-    expected[:], expected[2:, 2:] = legend["A: period 1, left, 61.5 %"], legend["B: period 1, left, 30.8 %"]
-    for cell, name in {(3, 0): "diverged", (3, 1): "pending", (2, 0): "failed", (2, 1): "not settled"}.items():
-        expected[cell] = legend[f"{name}, {'7.7 %' if name == 'diverged' else '1 cell'}"]
-    assert np.abs(picture - expected).max() < 0.003
-    np.testing.assert_array_equal(fig.data["attractor_id"].transpose(*GRID), grid["attractor_id"])
-    np.testing.assert_array_equal(fig.data["status"].transpose(*GRID), grid["status"])
-    assert fig.data["share"].values.tolist() == [0.5, 0.25]
-    assert fig.data["name"].values.tolist() == ["A: period 1, left", "B: period 1, left"]
-
-
-def test_plot_basins__the_denominator_of_the_table(grid):
-    """Legend and table count the cells that end on attractors or diverge, and the figure says so."""
     ids = outcomes(grid)
     table = basin_fractions(ids, dims=[d for d in ids.dims if d in GRID], unfinished=(-1,)).squeeze()
-    fig = plot_basins(grid)
-    for i, name in enumerate("AB"):
-        share = 100 * float(table["fraction"].sel(label=i))
-        assert any(text.startswith(f"{name}: ") and text.endswith(f"{share:.1f} %") for text in legend_texts(fig))
+    assert table["fraction"].sel(label=[0, 1]).values == pytest.approx([0.615, 0.308], abs=5e-4)
     assert "shares of the 13 of 16 cells that end on attractors or diverge" in caption_of(fig)
-
-
-@pytest.mark.slow
-def test_plot_basins__pixels_of_the_file_lie_where_the_axes_say(grid, tmp_path):
-    """The pixel under each cell's centre, found through the axes, has the cell's colour."""
+    np.testing.assert_array_equal(fig.data["attractor_id"].transpose(*GRID), grid["attractor_id"])
+    np.testing.assert_array_equal(fig.data["status"].transpose(*GRID), grid["status"])
+    assert (fig.data["n_periods"] == 100).all()
+    assert fig.data["share"].values.tolist() == [0.5, 0.25]
+    # the image has the cells where its axes say: equal colours for equal outcomes, along both axes
     fig = plot_basins(grid, degrees=True)
-    pixels = matplotlib.image.imread(save_figure(fig, tmp_path / "a.png"))
-    picture, ax = colours_of(fig), fig.axes[0]
-    for i, j in itertools.product(range(4), repeat=2):
-        # a quarter of a cell off the centre, where no letter stands
-        centre = np.rad2deg([grid["psi1_0"].values[i] + 0.2, grid["psi2_0"].values[j] - 0.2])
-        x, y = ax.transData.transform(centre)
-        assert np.abs(pixels[int(pixels.shape[0] - y), int(x), :3] - picture[i, j]).max() < 0.01, (i, j)
-    # the image ends at the outer edges of the cells, and a degree is as long along both axes
-    limit = np.rad2deg(1.0)
-    assert ax.get_xlim() == pytest.approx((-limit, limit))
-    assert ax.get_ylim() == pytest.approx((-limit, limit))
-    assert ax.get_aspect() == 1.0
-    assert (ax.get_xlabel(), ax.get_ylabel()) == (r"$\psi_1(0)$ [deg]", r"$\psi_2(0)$ [deg]")
-    assert plot_basins(grid).axes[0].get_xlim() == pytest.approx((-1.0, 1.0))
-    wide = grid.assign_coords(psi1_0=grid["psi1_0"] * 2)
-    assert plot_basins(wide).axes[0].get_aspect() == "auto"
-
-
-@pytest.mark.slow
-def test_plot_basins__shading_by_time(grid):
-    """Slower is darker, in the same hue; cells that took no time or did not close are not shaded."""
-    grid["status"][1, :2] = grid["status"][2, 1] = INFERRED  # as the others: no basin of their own
-    periods = xr.full_like(grid["attractor_id"], 100)
-    periods[1, :] = [0, 0, 1000, 1000]
-    fig = plot_basins(grid, n_periods=periods)
-    plain, shaded = colours_of(plot_basins(grid)), colours_of(fig)
-    assert np.allclose(shaded[0], plain[0], atol=0.003)
-    assert (shaded[1, :2] == plain[1, :2]).all()
-    ratio = shaded[1, 2:] / plain[1, 2:]
-    assert (ratio[plain[1, 2:] > 0.1] < 0.5).all()
-    assert np.ptp(ratio[plain[1, 2:] > 0.2]) < 0.03
-    assert np.allclose(shaded[2:, :2], plain[2:, :2])
-    assert "not settled, 1 cell" in legend_texts(fig)
-    assert [ax.get_xlabel() for ax in fig.axes if ax.get_gid() == "time"] == ["drive periods to converge"]
-    assert fig.data["n_periods"].transpose(*GRID).values.tolist() == periods.values.tolist()
+    (image,) = [im for ax in fig.axes for im in ax.get_images() if im.get_gid() == "basins"]
+    colours = np.swapaxes(np.asarray(image.get_array()), 0, 1).reshape(16, -1).tolist()
+    became = [fig.data[name].transpose(*GRID).values.ravel().tolist() for name in ("outcome", "status")]
+    for (one, first), (other, second) in itertools.combinations(
+        zip(zip(*became, strict=True), colours, strict=True), 2
+    ):
+        assert (one == other) == (first == second)
+    assert image.get_extent() == pytest.approx(np.rad2deg([-1.0, 1.0, -1.0, 1.0]))
+    assert image.origin == "lower"
 
 
 def test_plot_basins__selection_and_refusals(grid):
@@ -242,65 +186,35 @@ def sweep():
     return make_attractors(ids, ("frequency", "initial_condition"), coords, status=status)
 
 
-def band(fig, name):
-    """Corners of a band's rectangles: (left, right, low, high) each."""
-    (area,) = [a for a in fig.axes[0].collections if a.get_gid() == f"band:{name}"]
-    boxes = [path.get_extents() for path in area.get_paths()]
-    return [[round(float(v), 9) for v in (b.x0, b.x1, b.y0, b.y1)] for b in boxes]
-
-
 @pytest.mark.slow
-def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(sweep):
+def test_plot_fractions__shares_with_wilsons_intervals(sweep):
     fig = plot_fractions(sweep)
-    assert band(fig, "B") == [[1.95, 2.05, 0, 0.5], [2.05, 2.15, 0, 0.4], [2.15, 2.25, 0, 0.8]]
-    assert band(fig, "A") == [[1.95, 2.05, 0.5, 1.0], [2.05, 2.15, 0.4, 0.8]]
-    assert band(fig, "not settled") == [[2.15, 2.25, 0.8, 1.0]]
-    assert band(fig, "diverged") == [[2.05, 2.15, 0.8, 0.9]]
-    assert band(fig, "pending") == [[2.05, 2.15, 0.9, 1.0]]
     names = ["A: period 1, left", "B: period 1, left", "not settled", "diverged", "pending", "95 % interval of an edge"]
     assert legend_texts(fig) == names
-    assert to_rgb(by_gid(fig)["band:A"].get_facecolor()[0]) == legend_patches(fig)["A: period 1, left"]
-    assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
-    assert fig.data["fraction"].sel(outcome="A").values.tolist() == [0.5, 0.4, 0.0]
-    assert fig.data["fraction"].sum("outcome").values == pytest.approx(1.0)
+    counts = {"A": [5, 4, 0], "B": [5, 4, 8], "not settled": [0, 0, 2], "diverged": [0, 1, 0], "pending": [0, 1, 0]}
+    for outcome, k in counts.items():
+        one, share = fig.data.sel(outcome=outcome), np.array(k) / 10
+        assert one["fraction"].values.tolist() == share.tolist()
+        for end in ("low", "high"):
+            # Wilson's score interval, by its own equation: |p - k/n| = z sqrt(p (1 - p) / n) at both ends
+            p = one[end].values
+            inner = (p > 0) & (p < 1)
+            assert np.abs(p - share)[inner] == pytest.approx(1.959964 * np.sqrt(p * (1 - p) / 10)[inner])
+        assert ((one["low"] <= one["fraction"]) & (one["fraction"] <= one["high"])).all()
+    # five of ten cells have the widest interval
+    assert caption_of(fig).endswith(f"±{float(0.5 - fig.data['low'].sel(outcome='B')[0]):.2g}")
     # more attractors than colours
     fig = plot_fractions(make_attractors([range(15)] * 2, ("q", "initial_condition"), {"q": [1.0, 1.1]}))
-    assert len(legend_patches(fig)) == 13
     assert legend_texts(fig)[-2:] == ["3 others", "95 % interval of an edge"]
-    assert band(fig, "3 others") == [[0.95, 1.15, 0.8, 1.0]]
-
-
-def offsets(fig, gid):
-    """Points and diameters [pt] of a scatter, in rising order."""
-    (points,) = [c for c in fig.axes[0].collections if c.get_gid() == gid]
-    where, area = np.asarray(points.get_offsets()), points.get_sizes()
-    order = np.lexsort(where.T[::-1])
-    return where[order], np.sqrt(np.broadcast_to(area, len(where))[order])
 
 
 @pytest.mark.slow
-def test_plot_coexisting__points_and_weights(sweep):
-    """Points are where the attractors are; the larger the basin fraction per point, the larger."""
-    fig = plot_coexisting(sweep, degrees=True)
-    where, diameter = offsets(fig, "points:A")
-    np.testing.assert_allclose(where, [[2.0, np.rad2deg(0.1)], [2.1, np.rad2deg(0.1)]])
-    assert diameter[0] > diameter[1]
-    both, of_b = offsets(fig, "points:B")
-    assert both[:, 0].tolist() == [2.0, 2.1, 2.2]
-    assert of_b.argsort().tolist() == [1, 0, 2]
-    assert fig.axes[0].get_ylabel() == r"$\psi_1$ [deg]"
-    # two points share out the fraction of one
-    sweep["attractor_points"][0, 0, 1] = 0.3
-    halves = offsets(plot_coexisting(sweep), "points:A")[1]
-    least, growth = 1.1**2, 5.0**2
-    np.testing.assert_allclose(halves**2, [least + growth * 0.25, least + growth * 0.25, least + growth * 0.4])
-
-
-@pytest.mark.slow
-def test_plot_coexisting__angles_on_the_circle(sweep):
+def test_plot_coexisting__values_in_degrees_and_on_the_circle(sweep):
     sweep["attractor_points"][:] = sweep["attractor_points"] + 2 * np.pi
-    np.testing.assert_allclose(offsets(plot_coexisting(sweep), "points:B")[0][:, 1], 0.2)
-    rates = offsets(plot_coexisting(sweep, state="psi1_dot"), "points:B")[0][:, 1]
+    found = plot_coexisting(sweep, degrees=True).data["value"].isel(point=0)
+    np.testing.assert_allclose(found.sel(attractor=1), np.rad2deg([0.2, 0.2, 0.2]))
+    np.testing.assert_allclose(found.sel(attractor=0), np.rad2deg([0.1, 0.1, np.nan]))
+    rates = plot_coexisting(sweep, state="psi1_dot").data["value"].isel(point=0, attractor=1)
     np.testing.assert_allclose(rates, 0.2 + 2 * np.pi)
     with pytest.raises(ValueError, match="unknown state 'psi3'"):
         plot_coexisting(sweep, state="psi3")
@@ -318,24 +232,18 @@ def walk():
 
 
 @pytest.mark.slow
-def test_plot_coexisting__directions_and_loops(walk):
-    fig = plot_coexisting(walk, hysteresis=hysteresis(walk, walk))
-    lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
-    assert {gid: np.round(line.get_xdata(), 9).tolist() for gid, line in lines.items()} == {
-        "points:up:A": [2.0, 2.1, 2.2],
-        "points:down:A": [2.0, 2.1],
-        "points:up:B": [2.3, 2.4],
-        "points:down:B": [2.2, 2.3, 2.4],
-    }
-    up, down = lines["points:up:A"], lines["points:down:A"]
-    assert up.get_markersize() < down.get_markersize()
-    assert up.get_zorder() > down.get_zorder()
+def test_figures_of_walks__directions_loops_and_no_sample(walk):
+    fig = plot_coexisting(walk, hysteresis=find_hysteresis(walk, walk))
+    assert legend_texts(fig)[-3:] == ["up", "down", "up and down differ"]
+    present = fig.data["present"].sel(attractor=0)
+    assert present.sel(direction="up").values.tolist() == [1, 1, 1, 0, 0]
+    assert present.sel(direction="down").values.tolist() == [1, 1, 0, 0, 0]
     (span,) = [patch for patch in fig.axes[0].patches if patch.get_gid() == "loop"]
     box = span.get_extents().transformed(fig.axes[0].transData.inverted())
     assert (box.x0, box.x1) == pytest.approx((2.15, 2.25))
-    assert legend_texts(fig)[-3:] == ["up", "down", "up and down differ"]
-    assert fig.data["present"].sel(direction="up", attractor=0).values.tolist() == [1, 1, 1, 0, 0]
-    assert legend_texts(plot_coexisting(walk))[-2:] == ["up", "down"]
+    fractions = plot_fractions(walk)
+    assert fractions.axes[0].get_ylabel() == "share of the branches"
+    assert "low" not in fractions.data
 
 
 @pytest.fixture
@@ -352,40 +260,18 @@ def map_of_two():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plot", [plot_fractions, plot_coexisting, plot_basins, plot_regimes])
+@pytest.mark.parametrize("plot", [plot_fractions, plot_coexisting])
 def test_legends__list_rising_periods_then_tori_chaos_and_others(plot):
     kinds, periods = [BOUNDED_SET, CHAOTIC_SET, TORUS, *[PERIODIC_ORBIT] * 3], [0, 0, 0, 12, 2, 1]
-    dims, coords = ("q", "initial_condition"), {"q": [1.0]}
-    if plot == plot_basins:
-        dims, coords = ("psi1_0", "psi2_0"), {"psi1_0": [0.0, 1.0, 2.0], "psi2_0": np.arange(7.0)}
-    ids = np.repeat(range(6), [6, 1, 5, 2, 4, 3])
-    if plot == plot_regimes:  # a point for each cell
-        ds = make_attractors(ids.reshape(3, 7, 1), ("p", *dims), {"p": [1.0, 2.0, 3.0], "q": np.arange(7.0)})
-    else:
-        ds = make_attractors(ids.reshape(3, 7) if plot == plot_basins else ids[None], dims, coords)
-    here = ds["kind"] > 0
-    ds["kind"] = xr.where(here, xr.DataArray(kinds, dims="attractor"), 0).transpose(*here.dims)
-    ds["orbit_period"] = xr.where(here, xr.DataArray(periods, dims="attractor"), 0).transpose(*here.dims)
-    texts = legend_texts(plot(ds))
-    if plot == plot_regimes:
-        assert texts == ["1", "2", "12", "not periodic"]
-        assert legend_texts(plot(ds, show="attractors")) == list("ABCDEF")
-        return
-    words = [" ".join(text.partition(": ")[2].partition(",")[0].split()) for text in texts[:6]]
+    ds = make_attractors(np.repeat(range(6), [6, 1, 5, 2, 4, 3])[None], ("q", "initial_condition"), {"q": [1.0]})
+    ds["kind"][:], ds["orbit_period"][:] = kinds, periods
+    words = [text.partition(": ")[2].partition(",")[0] for text in legend_texts(plot(ds))[:6]]
     assert words == ["period 1", "period 2", "period 12", "quasi-periodic", "chaotic", "not periodic"]
 
 
 def regime_names(fig):
-    """Name of each point of the map, (frequency, second parameter), through colour and legend."""
-    (mesh,) = [c for c in fig.axes[0].collections if c.get_gid() == "regimes"]
-    colours = mesh.to_rgba(mesh.get_array())[..., :3]
-    names = {tuple(np.round(c, 3)): name for name, c in legend_patches(fig).items()}
-    return [[names[tuple(np.round(c, 3))] for c in row] for row in np.swapaxes(colours, 0, 1)]
-
-
-def legend_patches(fig):
-    patches = [h for legend in fig.legends for h in legend.get_patches()]
-    return {" ".join(h.get_label().split()): to_rgb(h.get_facecolor()) for h in patches}
+    """Name of each point of the map, (frequency, second parameter)."""
+    return fig.data["label"].values[fig.data["regime"].transpose("frequency", "q").values].tolist()
 
 
 @pytest.mark.slow
@@ -394,15 +280,45 @@ def test_plot_regimes__each_point_has_its_regime(map_of_two):
     assert regime_names(fig) == [["1", "1 + 2", "2"], ["1", "1", "none"]]
     # by rising periods; what has no attractor last
     assert legend_texts(fig)[:4] == ["1", "1 + 2", "2", "none"]
-    assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
-    assert fig.axes[0].get_ylabel() == "amplitude [N m]"
-    assert fig.axes[0].get_xlim() == pytest.approx((1.9, 2.3))
-    assert fig.axes[0].get_ylim() == pytest.approx((0.75, 2.25))
-    (crosses,) = [line for line in fig.axes[0].get_lines() if line.get_gid() == "without"]
-    assert sorted(map(tuple, crosses.get_xydata())) == [(2.0, 2.0), (2.2, 2.0)]
+    assert (fig.axes[0].get_xlabel(), fig.axes[0].get_ylabel()) == ("drive frequency [Hz]", "amplitude [N m]")
     assert regime_names(plot_regimes(map_of_two, show="attractors"))[0] == ["A", "A + B", "B"]
     assert regime_names(plot_regimes(map_of_two, show="number")) == [["1", "2", "1"], ["1", "1", "0"]]
     assert fig.data["n_attractors"].transpose("frequency", "q").values.tolist() == [[1, 2, 1], [1, 1, 0]]
+    here = dense(fig.data).sel(frequency=2.0, q=1.5)
+    assert here["share"].values.tolist() == [0.5, 0.5]
+    within = (fig.data["low"] <= fig.data["share"]) & (fig.data["share"] <= fig.data["high"])
+    assert (within == (fig.data["share"] > 0)).all()
+    unseen = fig.data["unseen_high"].transpose("frequency", "q").values
+    # (1 - p)^n = 0.05 with n decided cells; nothing is known where none is
+    assert unseen[:, :2] == pytest.approx(1 - 0.05 ** (1 / 4))
+    assert unseen[:, 2].tolist() == pytest.approx([1 - 0.05 ** (1 / 3), 1.0])
+    assert "basins below 52.7" in caption_of(fig)
+    with pytest.raises(ValueError, match="Did you mean 'periods'"):
+        plot_regimes(map_of_two, show="period")
+
+
+@pytest.mark.slow
+def test_plot_regimes__what_attracts_is_counted_and_chaos_is_named(map_of_two):
+    map_of_two["orbit_period"][0, 1, 1], map_of_two["kind"][0, 1, 1] = 0, CHAOTIC_SET
+    assert regime_names(plot_regimes(map_of_two))[0][1] == "1 + not periodic"
+    map_of_two["stability"][0, 1, 1] = vocabulary.NOT_SETTLED
+    fig = plot_regimes(map_of_two)
+    assert regime_names(fig) == [["1", "1", "2"], ["1", "1", "none"]]
+    assert fig.data["n_attractors"].sel(frequency=2.0, q=1.5) == 1
+    assert fig.data["share_without"].sel(frequency=2.0, q=1.5) == 0.5
+
+
+@pytest.mark.slow
+def test_plot_regimes__more_regimes_than_colours_are_a_map_each():
+    """Every subset of five attractors: 31 regimes."""
+    masks = np.arange(1, 32)
+    ids = np.array([[np.resize([i for i in range(5) if mask >> i & 1], 10) for mask in masks]])
+    found = make_attractors(ids, ("frequency", "q", "initial_condition"), {"frequency": [0.2], "q": np.arange(31.0)})
+    figure = plot_regimes(found.isel(frequency=[0, 0]).assign_coords(frequency=[0.2, 0.3]), show="attractors")
+    titles = [ax.get_title(loc="left").partition(":")[0] for ax in figure.axes if ax.get_visible()]
+    assert titles == sorted(figure.data["member"].values) == list("ABCDE")
+    there = figure.data["share_of"].isel(frequency=0).sel(member="C").values > 0
+    assert there.tolist() == [bool(mask & 4) for mask in masks]
 
 
 @pytest.mark.slow
@@ -431,23 +347,18 @@ def curves_of_two():
     return curves_dataset([Curve(family, "fold", points, ("bound", "stuck"), 0, [cusp])], "q", "frequency")
 
 
-def test_plot_regimes__curves_over_the_map(map_of_two, curves_of_two):
+def test_curves__alone_in_a_table_and_over_the_map(map_of_two, curves_of_two):
     """Lines have the map's axes, whichever parameter was followed first; another plane is refused."""
     fig = plot_regimes(map_of_two, curves=curves_of_two)
     (line,) = [one for one in fig.axes[0].lines if one.get_gid() == "curve:0"]
-    np.testing.assert_allclose(line.get_xdata(), [2.1, 2.15, 2.2])
-    np.testing.assert_allclose(line.get_ydata(), [1.0, 1.5, 2.0])
+    np.testing.assert_allclose(line.get_xydata(), [[2.1, 1.0], [2.15, 1.5], [2.2, 2.0]])
     assert [text.get_text() for text in fig.axes[0].texts] == ["CP"]
     assert "solid: fold" in caption_of(fig)
     np.testing.assert_allclose(fig.data["special_first_curves"], [1.5])
     with pytest.raises(ValueError, match="plane of q and damping"):
         plot_regimes(map_of_two, curves=curves_of_two.assign_attrs(second_parameter="damping"))
-
-
-def test_plot_curves__names_points_of_codimension_two(curves_of_two):
     ax = plot_curves(curves_of_two).axes[0]
     assert [text.get_text() for text in ax.texts if text.get_text()] == ["CP"]
-    assert [line.get_xdata().tolist() for line in ax.lines if len(line.get_xdata()) > 1] == [[1.0, 1.5, 2.0]]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("q", "drive frequency [Hz]")
     table = curves_table(curves_of_two)
     row = {"type": "cusp", "q": 1.5, "frequency_hz": 2.15, "period": 1, "error": pytest.approx(1e-8), "curve": 0}
@@ -455,55 +366,22 @@ def test_plot_curves__names_points_of_codimension_two(curves_of_two):
     assert table.lines[1].endswith("; ends: stuck")
 
 
-def test_plot_regimes__only_what_attracts_is_counted(map_of_two):
-    map_of_two["stability"][0, 1, 1] = vocabulary.NOT_SETTLED
-    fig = plot_regimes(map_of_two)
-    assert regime_names(fig) == [["1", "1", "2"], ["1", "1", "none"]]
-    assert fig.data["n_attractors"].sel(frequency=2.0, q=1.5) == 1
-    assert fig.data["share_without"].sel(frequency=2.0, q=1.5) == 0.5
-
-
-def test_plot_regimes__not_periodic_and_one_parameter(map_of_two, sweep):
-    map_of_two["orbit_period"][0, 1, 1] = 0
-    map_of_two["kind"][0, 1, 1] = vocabulary.CHAOTIC_SET
-    assert regime_names(plot_regimes(map_of_two))[0][1] == "1 + not periodic"
-    with pytest.raises(ValueError, match="Did you mean 'periods'"):
-        plot_regimes(map_of_two, show="period")
-
-
 @pytest.mark.slow
-def test_plot_gallery__orbits_sections_and_paths():
-    attractors = make_attractors(range(3), ("initial_condition",))
-    drawn = make_portraits(3, turning=(2,))
-    fig = plot_gallery(rows_of(attractors), drawn)
-    lines = by_gid(fig)
-    for i, mark in enumerate("AB"):
-        orbit = drawn["orbit"].values[i]
-        np.testing.assert_allclose(lines[f"orbit:{mark}:psi1"].get_xydata(), orbit[:, [0, 2]])
-        np.testing.assert_allclose(lines[f"orbit:{mark}:psi2"].get_xydata(), orbit[:, [1, 3]])
-        np.testing.assert_allclose(lines[f"section:{mark}:psi2"].get_xydata(), orbit[:1, [1, 3]])
-        path = load_model("pendulum").drawing.points(orbit, VALUES)["magnet"]
-        np.testing.assert_allclose(lines[f"path:{mark}"].get_xydata(), path)
-        assert to_rgb(lines[f"path:{mark}"].get_color()) == to_rgb(palette.cast_of(attractors).colours[i])
-    # on the circle, broken where it passes pi
-    angle = lines["orbit:C:psi2"].get_xdata()
-    assert np.nanmin(angle) >= -np.pi
-    assert np.nanmax(angle) <= np.pi
-    assert np.isnan(angle).sum() == 1
-    magnets = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "fixed:fixed magnet"]
-    assert [m.get_xydata().tolist() for m in magnets] == [[[0.0, -VALUES["h"]]]] * 3
-    titles = [t.get_text().replace("\N{NO-BREAK SPACE}", " ") for ax in fig.axes for t in ax.texts]
-    assert titles[0] == "A: period 1, left, share 10.0 %"
-
-
-@pytest.mark.slow
-def test_plot_gallery__largest_shares_are_drawn():
-    attractors = make_attractors(range(11), ("initial_condition",))
-    portraits = make_portraits(11)
+def test_plot_gallery__orbits_and_paths_of_the_largest_shares():
+    attractors, portraits = make_attractors(range(11), ("initial_condition",)), make_portraits(11, turning=(2,))
     portraits["share"][0] = 0.0
     fig = plot_gallery(rows_of(attractors), portraits)
     assert fig.data["attractor"].values.tolist() == list(range(1, 9))
     assert any("3 more sets" in t.get_text() for t in fig.texts)
+    lines, orbit = by_gid(fig), portraits["orbit"].values[1]
+    np.testing.assert_allclose(lines["orbit:B:psi2"].get_xydata(), orbit[:, [1, 3]])
+    np.testing.assert_allclose(lines["section:B:psi2"].get_xydata(), orbit[:1, [1, 3]])
+    path = load_model("pendulum").drawing.points(orbit, VALUES)["magnet"]
+    np.testing.assert_allclose(lines["path:B"].get_xydata(), path)
+    # on the circle, broken where it passes pi
+    angle = lines["orbit:C:psi2"].get_xdata()
+    assert np.nanmax(np.abs(angle)) <= np.pi
+    assert np.isnan(angle).sum() == 1
     with pytest.raises(ValueError, match="no attractor at this parameter point"):
         plot_gallery(rows_of(attractors), portraits.isel(attractor=[]))
 
@@ -529,47 +407,3 @@ def test_greys__every_cell_without_an_attractor_has_one():
         assert found[name][list(Status).index(code)], name
     on_sets = ["not settled", "on a transient set", "on an unstable orbit or equilibrium", "on a neutral set"]
     assert [bool(found[name][len(Status) + k]) for k, name in enumerate(on_sets)] == [True] * 4
-
-
-@pytest.mark.slow
-def test_plot_fractions__intervals(sweep):
-    fig = plot_fractions(sweep)
-    # Wilson's score interval, by its own equation: |p - k/n| = z sqrt(p (1 - p) / n) at both ends
-    for outcome, k in (("A", [5, 4, 0]), ("B", [5, 4, 8]), ("not settled", [0, 0, 2])):
-        one = fig.data.sel(outcome=outcome)
-        for end in ("low", "high"):
-            p, share = one[end].values, np.array(k) / 10
-            inner = (p > 0) & (p < 1)
-            assert np.abs(p - share)[inner] == pytest.approx(1.959964 * np.sqrt(p * (1 - p) / 10)[inner])
-        assert ((one["low"] <= one["fraction"]) & (one["fraction"] <= one["high"])).all()
-    # five bands: the bars of the lowest stand at a fifth of the columns, which are 0.1 Hz wide
-    b = fig.data.sel(outcome="B")
-    bars = np.array([segment[:, 1] for segment in by_gid(fig)["interval:B"].get_segments()])
-    assert bars == pytest.approx(np.column_stack([b["low"], b["high"]]))
-    # the edge above A is none at the first frequency, where A reaches the top, nor at the last
-    assert [round(float(s[0, 0]), 9) for s in by_gid(fig)["interval:A"].get_segments()] == [2.09]
-    # five of ten cells have the widest interval
-    assert caption_of(fig).endswith(f"±{float(0.5 - b['low'][0]):.2g}")
-    many = sweep.isel(frequency=np.tile(np.arange(3), 7)).assign_coords(frequency=2.0 + 0.1 * np.arange(21))
-    assert not [gid for gid in by_gid(plot_fractions(many)) if "interval" in gid]
-
-
-def test_plot_fractions__branches_are_no_sample(walk):
-    fig = plot_fractions(walk)
-    assert fig.axes[0].get_ylabel() == "share of the branches"
-    assert "low" not in fig.data
-    assert "branches each" in caption_of(fig)
-
-
-@pytest.mark.slow
-def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
-    fig = plot_regimes(map_of_two)
-    here = dense(fig.data).sel(frequency=2.0, q=1.5)
-    assert here["share"].values.tolist() == [0.5, 0.5]
-    within = (fig.data["low"] <= fig.data["share"]) & (fig.data["share"] <= fig.data["high"])
-    assert (within == (fig.data["share"] > 0)).all()
-    unseen = fig.data["unseen_high"].transpose("frequency", "q").values
-    # (1 - p)^n = 0.05 with n decided cells; nothing is known where none is
-    assert unseen[:, :2] == pytest.approx(1 - 0.05 ** (1 / 4))
-    assert unseen[:, 2].tolist() == pytest.approx([1 - 0.05 ** (1 / 3), 1.0])
-    assert "basins below 52.7" in caption_of(fig)

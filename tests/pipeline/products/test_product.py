@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import inspect
-import subprocess
-import sys
 
 import pytest
 
-from pipeline.products.product import FigureOptions, StateOptions, default_of, function_of
+from pipeline.products.product import default_of, function_of
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS, FIGURES
 from pipeline.specification.problems import SpecError, validated
 
 ALL = [*CELL_PRODUCTS.values(), *ANALYSES.values(), *FIGURES.values()]
 NAMES = [f"{type(p).__name__}-{p.name}" for p in ALL]
-
-
-@pytest.mark.slow
-def test_registry__names_are_the_products_own():
-    for registry in (CELL_PRODUCTS, ANALYSES, FIGURES):
-        assert {name: product.name for name, product in registry.items()} == {n: n for n in registry}
 
 
 @pytest.mark.parametrize("product", ALL, ids=NAMES)
@@ -61,35 +53,3 @@ def test_validated__all_mistakes_in_one_sentence_each():
         "interval = 'wilsn': must be 'wilson' or 'clopper-pearson'. Did you mean 'wilson'?",
         "seed = 0.5: must be a whole number.",
     ]
-
-
-def test_label__tells_figures_apart():
-    """Options that are not as by default are in the file's name; where it goes is not."""
-    assert FigureOptions().label() == ""
-    assert FigureOptions(out="a.png", format="pdf").label() == ""
-    labels = {
-        options.label()
-        for options in (
-            StateOptions(state="x"),
-            StateOptions(state="v"),
-            StateOptions(state="x", degrees=True),
-            StateOptions(state="x", at={"q": 1.5}),
-            StateOptions(state="x", at={"q": 1.6}),
-            StateOptions(state="x", width=85.0),
-            StateOptions(state="x", xlim=(1.0, 2.0)),
-        )
-    }
-    assert len(labels) == 7
-    assert StateOptions(state="x", at={"q": 1.5}).label() == "_x_q_1.5"
-    assert all("/" not in label for label in labels)
-
-
-def test_registry__is_light():
-    code = (
-        "import sys\n"
-        "from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, FIGURES\n"
-        "found = [p.options for r in (ANALYSES, CELL_PRODUCTS, FIGURES) for p in r.values()]\n"
-        "print([m for m in ('numba', 'numpy', 'xarray', 'zarr', 'dask', 'matplotlib') if m in sys.modules])\n"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"

@@ -10,10 +10,10 @@ import pytest
 import xarray as xr
 from scipy.stats import binomtest, ttest_1samp
 
+from pipeline.report.estimates import Verdict
 from pipeline.report.measures import MEASURES
 from pipeline.report.reproduce import judge, spelled
 from pipeline.report.study import ClaimTable
-from pipeline.report.verdicts import Verdict
 from pipeline.specification.problems import SpecError
 
 N = 20

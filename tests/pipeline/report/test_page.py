@@ -7,8 +7,8 @@ import re
 
 import pytest
 
+from pipeline.report.estimates import Verdict, judged
 from pipeline.report.page import MOST_ROWS, Facts, Grid, Note, Outcome, Page, Part, Picture, Source, grid_of, render
-from pipeline.report.verdicts import Verdict, judged
 
 HOSTILE = "</title><script>alert('x')</script><img src=http://e.org/x onerror=alert(1)> & \"q\""
 

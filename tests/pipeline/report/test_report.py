@@ -13,10 +13,10 @@ import pytest
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS
-from pipeline.report.stored import stored_options
+from pipeline.report.report import stored_options
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run as run_spec
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
+from tests.pipeline.factories import finished
 
 pytestmark = pytest.mark.slow
 
@@ -41,10 +41,7 @@ integration.closure_tolerance = 1e-2
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    (folder / "spec.toml").write_text(SWEEP)
-    run_spec(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
-    return folder
+    return finished(tmp_path_factory.mktemp("report"), SWEEP).parent
 
 
 def written(command, folder, *words):
@@ -77,7 +74,7 @@ def test_report__of_a_sweep(folder, command):
     html = written(command, folder, "run")
     assert "<script" not in html
     assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; friends" in html
-    run = Run.open(folder / "run")
+    run = RunDirectory.open(folder / "run")
     assert run.digest in html
     found = dense(derive(run, "attractors"), points=True)
     rows = re.findall(r"<tr><td>([A-Z])</td>(.*?)</tr>", html)
@@ -101,9 +98,7 @@ integration = { rtol = 1e-7, atol = 1e-7, n_transient = 100, n_keep = 64 }
 
 def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
     """Without extension it is not shown that the chaotic set of the larger amplitude attracts."""
-    (tmp_path / "spec.toml").write_text(CHAOTIC)
-    run_spec(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=lambda _: None)
-    found = dense(derive(tmp_path / "run", "attractors", {"extend": False}), points=True)
+    found = dense(derive(finished(tmp_path, CHAOTIC), "attractors", {"extend": False}), points=True)
     attract = (found["stability"] == ATTRACTS).any("amplitude").values
     assert 0 < attract.sum() < attract.size
     html = written(command, tmp_path, "run", "--only-stored")
@@ -127,14 +122,13 @@ def test_report__its_commands_work(folder, command):
         assert not re.search(r": computed", notes), c
 
 
-def test_stored_options__of_these_cells(folder):
-    run = Run.open(folder / "run")
+def test_stored_options__of_these_cells(folder, tmp_path):
+    run = RunDirectory.open(folder / "run")
     derive(run, "attractors")
     derive(run, "attractors", {"n_points": 8})
     assert stored_options(run, "attractors") == [{}, {"n_points": 8}]
     assert stored_options(run, "curves") == []
     # what was found of other cells is not shown
-    (folder / "other.toml").write_text(SWEEP.replace("n_transient = 200", "n_transient = 210"))
-    run_spec(folder / "other.toml", folder / "other", workers=0, echo=lambda _: None)
-    shutil.copytree(folder / "run" / "derived", folder / "other" / "derived")
-    assert stored_options(Run.open(folder / "other"), "attractors") == []
+    other = finished(tmp_path, SWEEP.replace("n_transient = 200", "n_transient = 210"))
+    shutil.copytree(folder / "run" / "derived", other / "derived")
+    assert stored_options(RunDirectory.open(other), "attractors") == []

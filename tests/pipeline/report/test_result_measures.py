@@ -11,11 +11,11 @@ from pydantic import ValidationError
 from scipy.stats import norm
 
 from pipeline.products.product import Table
-from pipeline.report import result_measures
+from pipeline.report import measures
+from pipeline.report.estimates import Verdict
 from pipeline.report.measures import MEASURES
 from pipeline.report.reproduce import judge, spelled
 from pipeline.report.study import ClaimTable
-from pipeline.report.verdicts import Verdict
 from pipeline.specification.problems import SpecError
 
 ORBIT = {"kind": "orbit", "rate": math.nan}
@@ -42,7 +42,7 @@ class Analysed:
 
 @pytest.fixture
 def analysed(monkeypatch):
-    monkeypatch.setattr(result_measures, "function_of", lambda name: lambda ds: Table(ROWS, []))
+    monkeypatch.setattr(measures, "function_of", lambda name: lambda ds: Table(ROWS, []))
     return Analysed()
 
 
@@ -115,10 +115,10 @@ def test_derived_number__at_a_parameter_point():
 
 
 def test_ratio_of_intervals__of_three_doublings(monkeypatch):
-    from pipeline.analysis.branches import table
+    from pipeline.analysis.branches import analysis
 
     rows = [{"c": c, "bracket": 1e-6, "type": "period_doubling"} for c in (3.0, 3.449490, 3.544090)]
-    monkeypatch.setattr(table, "table_of", lambda ds: [*rows, {"c": 3.8, "bracket": 0.0, "type": "fold"}])
+    monkeypatch.setattr(analysis, "table_of", lambda ds: [*rows, {"c": 3.8, "bracket": 0.0, "type": "fold"}])
     results = Analysed(xr.Dataset(attrs={"parameter": "c"}))
     options = {"type": "period_doubling", "low": 2.0, "high": 4.0, "max_period": 4}
     found = MEASURES["ratio_of_intervals"](results, ["run"], options)

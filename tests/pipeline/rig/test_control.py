@@ -10,30 +10,20 @@ import pytest
 from magpend_core.models import load_model
 from pipeline.layout.vocabulary import parameters_of
 from pipeline.rig.control import Controlled, load_control, orbits_csv, trace
-from pipeline.rig.measured_branch.comparison import amplitudes, compare
-from pipeline.rig.measured_branch.reading import read_branch
+from pipeline.rig.measured.branch import compare, read_branch
+from pipeline.rig.measured.branch_computed import amplitudes
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import duffing, finished
 
-SWEEP = """
-kind = "sweep"
-model = "duffing"
-[parameters]
-preset = "hardening"
-frequency_hz = 0.22
-[axes]
-amplitude = { start = 0.05, stop = 1.8, num = 8 }
-[initial_conditions]
-kind = "list"
-points = [[0.0, 0.0], [1.8, 0.0]]
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 200
-n_keep = 4
-"""
-
+SWEEP = duffing(
+    "amplitude = { start = 0.05, stop = 1.8, num = 8 }",
+    'kind = "list"\npoints = [[0.0, 0.0], [1.8, 0.0]]',
+    n_transient=200,
+    n_keep=4,
+    tolerance=1e-9,
+    more='[parameters]\npreset = "hardening"\nfrequency_hz = 0.22',
+)
 CONTROL = """
 model = "duffing"
 preset = "hardening"
@@ -50,10 +40,7 @@ num = 9
 @pytest.fixture(scope="module")
 def computed(tmp_path_factory):
     """The S of the response over the drive's amplitude at .22 Hz."""
-    folder = tmp_path_factory.mktemp("computed")
-    (folder / "spec.toml").write_text(SWEEP)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-    found = AnalysedRun.of(folder / "run")
+    found = AnalysedRun.of(finished(tmp_path_factory.mktemp("computed"), SWEEP))
     branches = found.derive("branches", parameter="amplitude")
     return found, branches, amplitudes(branches, parameters_of(found.cube()), "x")
 

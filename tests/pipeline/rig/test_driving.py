@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magpend_core.models import load_model
-from pipeline.compute.simulate import simulate
-from pipeline.rig.driving import drive_file
+from pipeline.rig.drive_file import drive_file
 from pipeline.rig.recordings import read_recording
-from pipeline.specification.drive_files import load_drive, parse_drive
 from pipeline.specification.problems import SpecError
+from pipeline.specification.recorded_drive import load_drive, parse_drive
 
 RIG = """
 model = "pendulum"
@@ -21,15 +19,12 @@ initial_state = { psi1 = 0.3 }
 [drive]
 kind = "torque"
 noise = 0.005
-steps = [STEPS]
+steps = [{ frequency_hz = 2.2, n_periods = 8 }, { frequency_hz = 2.3, n_periods = 8, duty_cycle = 0.55 }]
 [sensors.psi1]
 kind = "encoder"
 [sensors.psi2]
 kind = "encoder"
 """
-
-
-STEPS = "{ frequency_hz = 2.2, n_periods = 8 }, { frequency_hz = 2.3, n_periods = 8, duty_cycle = 0.55 }"
 
 
 def recording(level, rate_hz=1000.0, piece=None, kind="torque"):
@@ -110,7 +105,7 @@ def test_drive_file__refuses():
 @pytest.mark.slow
 def test_cli__from_a_recording_to_a_simulation_and_a_run(main, tmp_path):
     """A virtual rig: what it measured comes back when its motor's recording drives the model."""
-    (tmp_path / "rig.toml").write_text(RIG.replace("STEPS", STEPS), "utf-8")
+    (tmp_path / "rig.toml").write_text(RIG, "utf-8")
     assert main("recordings", "simulate", "rig.toml", "--out", "rec.csv")[0] == 0
     both = "recordings", "drive", "rec.csv", "--mapping", "rec.toml"
     code, out, _ = main(*both, "--kind", "torque", "--tolerance", "0.02", "--out", "torque.csv")
@@ -134,46 +129,3 @@ def test_cli__from_a_recording_to_a_simulation_and_a_run(main, tmp_path):
     (tmp_path / "spec.toml").write_text(spec + "psi1 = [-1.0, 1.0]\n[integration]\nn_transient = 2\nn_keep = 3\n")
     assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
     assert load_drive(tmp_path / "edges.csv").n_periods >= 5
-
-
-def test_cli__refuses_a_model_and_a_file(main, tmp_path):
-    (tmp_path / "drive.csv").write_text("time,torque\n0,1\n", "utf-8")
-    code, _, err = main("simulate", "--drive", "drive.csv")
-    assert code == 2
-    assert "a drive file begins with the line 'rising_s,falling_s' or 'time_s,drive'" in err
-    code, _, err = main("simulate", "--drive", "none.csv")
-    assert code == 2
-    assert "none.csv: cannot be read" in err
-
-
-@pytest.mark.slow
-def test_cli__what_the_motor_did_is_closer_than_what_it_was_told(main, tmp_path):
-    """Periods that jitter by 1 %: the recorded torque, the edges, the mean frequency, in this order."""
-    rng = np.random.default_rng(0)
-    hz, duty = 2.2 * (1 + 0.01 * rng.standard_normal(30)), 0.4927 + 0.005 * rng.standard_normal(30)
-    steps = ", ".join(
-        f"{{ frequency_hz = {h!r}, n_periods = 1, duty_cycle = {d!r} }}"
-        for h, d in zip(hz.tolist(), duty.tolist(), strict=True)
-    )
-    free = {"alpha1": 0.0, "alpha2": 0.0}  # without magnets the motion is regular, and errors do not grow
-    text = RIG.replace("STEPS", steps).replace("[drive]", "parameters = { alpha1 = 0.0, alpha2 = 0.0 }\n[drive]")
-    for kind, drive in (("signal", "edges"), ("torque", "torque")):
-        (tmp_path / f"rig_{kind}.toml").write_text(text.replace('"torque"', f'"{kind}"'), "utf-8")
-        assert main("recordings", "simulate", f"rig_{kind}.toml", "--out", f"{kind}_rec.csv")[0] == 0
-        both = f"{kind}_rec.csv", "--mapping", f"{kind}_rec.toml", "--kind", drive, "--out", f"{drive}.csv"
-        assert main("recordings", "drive", *both)[0] == 0
-    truth = read_recording(tmp_path / "torque_rec.csv", tmp_path / "torque_rec.toml")
-    torque = simulate(None, (0.3, 0.0, 0.0, 0.0), drive=tmp_path / "torque.csv", overrides=free)
-    edges = load_drive(tmp_path / "edges.csv")
-    names = load_model("pendulum").state_names
-    state = [float(np.interp(edges.start_s, torque.time, torque[name])) for name in names]
-    own = simulate(None, state, drive=tmp_path / "edges.csv", overrides=free)
-    told = simulate(edges.frequency_hz, state, n_periods=edges.n_periods, overrides=free)
-    told = told.assign_coords(time=told.time + edges.start_s)
-
-    def rms(series):
-        inside = truth.sel(sample=(truth.time >= series.time[0]) & (truth.time <= series.time[-1]))
-        off = np.interp(inside.time, series.time, series.psi1) - inside.psi1
-        return float(np.sqrt(np.mean(off**2)))
-
-    assert rms(torque) < 3e-4 < rms(own) < 3e-3 < 15e-3 < rms(told)

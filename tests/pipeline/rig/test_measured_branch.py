@@ -7,34 +7,22 @@ import pytest
 
 from magpend_core.models import load_model
 from pipeline.layout.vocabulary import parameters_of
-from pipeline.rig.measured_branch.comparison import amplitudes, branch_table, compare, rms_of
-from pipeline.rig.measured_branch.cycles import CyclesError, cycles_of
-from pipeline.rig.measured_branch.figure import plot_branch
-from pipeline.rig.measured_branch.reading import read_branch
+from pipeline.rig.measured.branch import CyclesError, branch_table, compare, cycles_of, read_branch, rms_of
+from pipeline.rig.measured.branch_computed import amplitudes
+from pipeline.rig.measured.branch_figure import plot_branch
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.workflows import shipped_workflows
+from pipeline.specification.files import shipped_workflows
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import duffing
 
-LINEAR = """
-kind = "sweep"
-model = "duffing"
-[parameters.overrides]
-damping = 0.3
-linear = 1.0
-cubic = 0.0
-amplitude = 0.2
-[axes]
-frequency_hz = { start = 0.1, stop = 0.3, num = 5 }
-[initial_conditions]
-kind = "list"
-points = [[0.1, 0.0]]
-[integration]
-rtol = 1e-10
-atol = 1e-10
-n_transient = 300
-n_keep = 4
-"""
-
+LINEAR = duffing(
+    "frequency_hz = { start = 0.1, stop = 0.3, num = 5 }",
+    'kind = "list"\npoints = [[0.1, 0.0]]',
+    n_transient=300,
+    n_keep=4,
+    tolerance=1e-10,
+    more="[parameters]\noverrides = { damping = 0.3, linear = 1.0, cubic = 0.0, amplitude = 0.2 }",
+)
 FLUTTER = shipped_workflows()["flutter"]
 
 PUBLISHED = {

@@ -12,10 +12,10 @@ from scipy.integrate import solve_ivp
 from magpend_core.models import load_model
 from pipeline.layout.vocabulary import model_of
 from pipeline.rig.identify import identification
-from pipeline.rig.identify.check import check
+from pipeline.rig.identify.validation import check
 from pipeline.rig.recordings import load_mapping, mapping_for, parse_mapping, read_recording, write_recording
 from pipeline.rig.recordings.reading import recording_of
-from pipeline.rig.simulation import load_rig, simulated
+from pipeline.rig.virtual import load_rig, simulated
 from pipeline.specification.problems import SpecError
 
 from .identify.test_identification import MAPPING, TRUTH, oscillator, write_ringdowns

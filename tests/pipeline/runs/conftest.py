@@ -1,4 +1,4 @@
-"""Commands of batch systems, made up for a test."""
+"""Commands of batch systems, made up for a test, and a run with made-up numbers."""
 
 from __future__ import annotations
 
@@ -24,3 +24,11 @@ def command_of(tmp_path, monkeypatch):
         return str(folder / name)
 
     return write
+
+
+@pytest.fixture
+def whole(made):
+    """A run directory of five tasks with made-up numbers, all of them committed."""
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    return made

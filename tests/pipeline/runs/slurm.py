@@ -9,12 +9,14 @@ import contextlib
 import os
 import secrets
 import shutil
-import signal
 import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
+
+import psutil
+
+from tests.pipeline.factories import free_port, wait_for
 
 COMMANDS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scancel", "sinfo")
 SBIN = "/usr/sbin:/sbin"
@@ -27,12 +29,6 @@ def why_not() -> str:
     path = f"{os.environ.get('PATH', '')}:{SBIN}"
     missing = [name for name in COMMANDS if not shutil.which(name, path=path)]
     return f"apt-get install slurm-wlm munge: there is no {', '.join(missing)}" if missing else ""
-
-
-def free_port() -> int:
-    with socket.socket() as chosen:
-        chosen.bind(("127.0.0.1", 0))
-        return int(chosen.getsockname()[1])
 
 
 CONFIG = """
@@ -108,31 +104,20 @@ def _call(environment: dict[str, str], *command: str) -> None:
     assert done.returncode == 0, f"{command[0]}: {done.stdout}{done.stderr}"
 
 
-def _wait_for_node(environment: dict[str, str], folder: Path, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while True:
-        state = subprocess.run(
-            ["sinfo", "-h", "-o", "%T"], env=environment, check=False, capture_output=True, text=True, timeout=30
-        ).stdout.strip()
-        if state == "idle":
-            return
-        if time.monotonic() > deadline:
-            log = (folder / "slurmctld.log").read_text() + (folder / "slurmd.log").read_text()
-            raise AssertionError(f"the node is {state or 'not there'}:\n{log[-3000:]}")
-        time.sleep(0.1)
+def _wait_for_node(environment: dict[str, str], folder: Path) -> None:
+    def is_idle() -> bool:
+        done = subprocess.run(["sinfo", "-h", "-o", "%T"], env=environment, capture_output=True, text=True, timeout=30)
+        return done.stdout.strip() == "idle"
+
+    wait_for(is_idle, seconds=20.0)
 
 
 def _stop(pid_file: Path, seconds: float) -> None:
     try:
-        pid = int(pid_file.read_text())
-        os.kill(pid, signal.SIGTERM)
-    except (OSError, ValueError):
+        process = psutil.Process(int(pid_file.read_text()))
+        process.terminate()
+        process.wait(seconds)
+    except psutil.TimeoutExpired:
+        process.kill()
+    except (OSError, ValueError, psutil.NoSuchProcess):
         return
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(pid, os.WNOHANG)
-        if not Path(f"/proc/{pid}").exists():
-            return
-        time.sleep(0.05)
-    os.kill(pid, signal.SIGKILL)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from magpend_core.engine.threads import number_of_threads
-from pipeline.analysis.attractors import product
+from pipeline.analysis.attractors import analysis
 from pipeline.compute import execute
 from pipeline.products.registry import ANALYSES
 from pipeline.runs import blocks
-from pipeline.runs.derive import AnalysedRun, analyses_in, derive, prune
+from pipeline.runs.derive import AnalysedRun, derive, prune
 from pipeline.runs.stopping import InterruptedRunError
-from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import WELL, contents
 
 MAP = """
 kind = "sweep"
@@ -49,6 +49,12 @@ def copy(computed, tmp_path):
     return make
 
 
+def files_of(run, name):
+    """Return all files of a stored result."""
+    (folder,) = (run.directory / "derived").glob(f"{name}-*.zarr")
+    return contents(folder)
+
+
 @pytest.fixture
 def sizes(monkeypatch):
     """Set the fewest and most cells of a block."""
@@ -58,12 +64,6 @@ def sizes(monkeypatch):
         monkeypatch.setattr(blocks, "MOST_CELLS", most)
 
     return put
-
-
-def files_of(run, name):
-    """Return all files of a stored result."""
-    (folder,) = (run.directory / "derived").glob(f"{name}-*.zarr")
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
@@ -77,75 +77,44 @@ def whole(copy):
 
 def test_blocks_of__cover_each_point_once_in_order(copy, sizes):
     run = copy("run")
-    for fewest, most in ((8, 8), (16, 16), (24, 24), (48, 48), (96, 96)):
-        sizes(fewest, most)
-        found = [
-            (i, j)
+    for most in (8, 16, 24, 48, 96):
+        sizes(most, most)
+        points = [
+            [(i, j) for i in range(*block["frequency"].indices(4)) for j in range(*block["amplitude"].indices(3))]
             for block in blocks.blocks_of(run)
-            for i in range(*block["frequency"].indices(4))
-            for j in range(*block["amplitude"].indices(3))
         ]
-        assert found == [(i, j) for i in range(4) for j in range(3)]
-        most_cells = max(
-            len(range(*b["frequency"].indices(4))) * len(range(*b["amplitude"].indices(3))) * 8
-            for b in blocks.blocks_of(run)
-        )
-        assert most_cells <= most
+        assert [point for one in points for point in one] == [(i, j) for i in range(4) for j in range(3)]
+        assert max(map(len, points)) * 8 <= most
 
 
 @pytest.mark.slow
-def test_in_blocks__same_bytes_for_all_blocks_and_workers(copy, sizes, whole):
-    ways = {"threads": 2, "none": None}
+@pytest.mark.parametrize(("where", "workers"), [("threads", 2), ("none", None), (None, 2)])
+def test_in_blocks__same_bytes_for_all_blocks_and_workers(copy, sizes, whole, monkeypatch, where, workers):
+    places, real = [], execute.run_tasks
+    monkeypatch.setattr(execute, "run_tasks", lambda *a, **o: places.append(o["scheduler"]) or real(*a, **o))
     for bounds in (EACH_POINT, A_ROW):
         sizes(*bounds)
-        for where, workers in ways.items():
-            run = copy(f"{where}{bounds[1]}")
-            derive(run, "attractors", workers=workers, scheduler=where)
-            for name in ("identified", "attractors"):
-                assert files_of(run, name) == files_of(whole, name)
-            assert not list((run.directory / "derived").glob("*.blocks"))
-
-
-@pytest.mark.slow
-def test_in_blocks__processes_compute_the_same_by_default(copy, sizes, whole, monkeypatch):
-    run, places = copy("run"), []
-    sizes(*A_ROW)
-    real = execute.run_tasks
-    monkeypatch.setattr(
-        execute, "run_tasks", lambda *a, **options: (places.append(options["scheduler"]), real(*a, **options))[1]
-    )
-    derive(run, "identified", workers=2)
-    assert [place.resolved() for place in places] == ["processes"]
-    assert files_of(run, "identified") == files_of(whole, "identified")
+        run = copy(f"blocks{bounds[1]}")
+        derive(run, "attractors", workers=workers, scheduler=where)
+        for name in ("identified", "attractors"):
+            assert files_of(run, name) == files_of(whole, name)
+        assert not list((run.directory / "derived").glob("*.blocks"))
+    assert {place.resolved() for place in places} == {where or "processes"}
 
 
 CHAOTIC = f"""{MAP.replace("twin-well-periodic", "twin-well").replace("n_keep = 32", "n_keep = 256")}
 [products]
 lyapunov = {{ n_transient = 20, n_periods = 64 }}
 """
-NOISY = """
-kind = "sweep"
-[model]
-name = "well"
-states.x.meaning = "position"
-equations.x = "x - x**3"
-classifier = { meaning = "side", words = { beyond = "x > 9", right = "x > 0.5", left = "x < -0.5" } }
-[noise]
-strengths = { x = 0.5 }
-seed = 1
-steps_per_period = 8
-[parameters]
-frequency_hz = 5.0
-[axes]
-noise_x = { values = [0.45, 0.55, 0.7] }
-realization = { start = 0, stop = 19, step = 1 }
-[initial_conditions]
-kind = "list"
-points = [[-1.0]]
-[integration]
-n_transient = 0
-n_keep = 200
-"""
+NOISY = (
+    WELL.replace("stop = 199", "stop = 19")
+    .replace("n_keep = 1000", "n_keep = 200")
+    .replace(
+        "parameters = { a = 1.0 }",
+        "parameters = { a = 1.0 }\n"
+        'classifier = { meaning = "side", words = { beyond = "x > 9", right = "x > 0.5", left = "x < -0.5" } }',
+    )
+)
 OPTIONS = {
     "resilience": [{"directions": 8, "confirmations": 8, "phases": 2, "timed": 8}],
     "escapes": [{"high": {"x": 0.8}}, {}],
@@ -172,13 +141,13 @@ def test_in_blocks__every_analysis_of_points(name, options, copy, sizes):
 
 @pytest.mark.parametrize(("workers", "threads"), [(0, 1), (1, 1), (3, 3)])
 def test_derive__workers_are_threads_without_blocks(copy, monkeypatch, workers, threads):
-    seen, real = [], product.attractors
+    seen, real = [], analysis.attractors
 
     def attractors(*given):
         seen.append(number_of_threads())
         return real(*given)
 
-    monkeypatch.setattr(product, "attractors", attractors)
+    monkeypatch.setattr(analysis, "attractors", attractors)
     derive(copy("run"), "attractors", workers=workers)
     assert seen == [threads]
 
@@ -222,19 +191,13 @@ def test_prune__removes_blocks_that_were_left(copy, sizes, monkeypatch):
     assert not list((run.directory / "derived").iterdir())
 
 
-def test_analyses_in__names_unknown_ones_and_missing_options():
-    assert analyses_in(" attractors, basins") == ["attractors", "basins"]
-    with pytest.raises(SpecError, match="--analyse: unknown analysis 'basin'; did you mean basins"):
-        analyses_in("basin")
-    with pytest.raises(SpecError, match="between: missing"):
-        analyses_in("edge")
-
-
 def test_run__analyse(main, write_spec):
-    code, out, err = main("run", write_spec(MAP), "--out", "run", "--workers", 1, "--analyse", "attractors,basins")
+    words = ("run", write_spec(MAP), "--out", "run", "--workers", 1, "--analyse")
+    for names, said in (("attractor", "unknown analysis 'attractor'"), ("edge", "between: missing")):
+        code, _, err = main(*words, names)
+        assert code == 2
+        assert said in err
+    code, out, err = main(*words, " attractors,basins")
     assert code == 0, err
     assert "end on attractors" in out
     assert "boundaries: the starts are no grid" in out
-    code, _, err = main("run", write_spec(MAP), "--out", "other", "--analyse", "attractor")
-    assert code == 2
-    assert "unknown analysis 'attractor'" in err

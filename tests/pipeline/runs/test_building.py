@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import magpend
-from pipeline.layout.cells import initial_states
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.runs.workflows import read_given, shipped_workflows
-from pipeline.specification.parsing import _KEYS, load_spec, parse_spec
+from pipeline.specification.files import shipped_workflows
+from pipeline.specification.parsing import KEYS
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from tests.pipeline.factories import silent
 
@@ -51,12 +51,15 @@ equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda s: s.parameters(A=0.4), r"parameters\.A: .* is given by overrides=\{'A': 0\.4\}"),
-        (lambda s: s.parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides\?"),
-        (lambda s: s.integration(n_transients=4), r"integration\.n_transients: unknown key; did you mean n_transient"),
-        (lambda s: s.axis("A", stap=0.3), r"axis\.stap: unknown key; did you mean st"),
+        (lambda s: s.with_parameters(A=0.4), r"parameters\.A: .* is given by overrides=\{'A': 0\.4\}"),
+        (lambda s: s.with_parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides\?"),
+        (
+            lambda s: s.with_integration(n_transients=4),
+            r"integration\.n_transients: unknown key; did you mean n_transient",
+        ),
+        (lambda s: s.with_axis("A", stap=0.3), r"axis\.stap: unknown key; did you mean st"),
         (lambda s: type(s)("sweep", intergation={}), r"^Spec\.intergation: unknown key; did you mean integration or"),
-        (lambda s: s.extremes(quantites=["x"]), r"extremes\.quantites: unknown key; did you mean quantities\?"),
+        (lambda s: s.with_extremes(quantites=["x"]), r"extremes\.quantites: unknown key; did you mean quantities\?"),
     ],
 )
 def test_methods__say_what_is_right_for_an_unknown_keyword(wrong, message):
@@ -64,34 +67,20 @@ def test_methods__say_what_is_right_for_an_unknown_keyword(wrong, message):
         wrong(magpend.Spec("sweep"))
 
 
-@pytest.mark.parametrize(
-    ("change", "left"),
-    [
-        (lambda s: s.start_grid(x=(-1.0, 1.0, 4)), ["v"]),
-        (lambda s: s.start_grid(x=(-1.0, 1.0, 4), v=0.0), []),
-        (lambda s: s.start_random(n=3, v=(-1.0, 1.0)), ["x"]),
-        (lambda s: s.start_list([[1.0], [2.0]]), ["v"]),
-        (lambda s: s.start_list([[1.0, 0.5]]), []),
-    ],
-)
-def test_starts__that_are_not_given_are_said(change, left):
-    spec = read_given(change(magpend.Spec("sweep", "duffing").parameters(frequency_hz=0.2)))[0]
-    first = initial_states(spec.initial_conditions).at(np.array([0]))[0]
-    units = {s.name: s.unit for s in spec.model.states}
-    assert [line for line in start_remarks(spec.initial_conditions) if line.startswith("starts not given")] == [
-        f"starts not given, so taken as 0: {name} = 0 {units[name]}".rstrip() + " (set in initial_conditions)"
-        for name in left
-    ]
-    assert all(first[spec.model.state_names.index(name)] == 0.0 for name in left)
-
-
 @pytest.mark.slow
 def test_starts__that_are_not_given_are_said_by_run_and_preview(tmp_path):
-    spec = magpend.Spec("sweep", "duffing").parameters(frequency_hz=0.2).start_grid(x=(-1.0, 1.0, 2))
-    spec = spec.axis("amplitude", 0.1, 0.2, 2).integration(n_transient=2, n_keep=2)
-    told = []
+    spec = magpend.Spec("sweep", "duffing").with_parameters(frequency_hz=0.2).with_integration(n_transient=2, n_keep=2)
+    for starts, left in (
+        (spec.with_start_grid(x=(-1.0, 1.0, 2)), ["v"]),
+        (spec.with_start_grid(x=(-1.0, 1.0, 2), v=0.0), []),
+        (spec.with_start_random(n=3, v=(-1.0, 1.0)), ["x"]),
+        (spec.with_start_list([[1.0], [2.0]]), ["v"]),
+    ):
+        lines = start_remarks(Spec.read(starts).initial_conditions)
+        assert [line.partition(": ")[2][0] for line in lines if line.startswith("starts not given")] == left
+    spec, told = spec.with_start_grid(x=(-1.0, 1.0, 2)).with_axis("amplitude", 0.1, 0.2, 2), []
     magpend.run(spec, tmp_path / "run", workers=0, echo=told.append)
-    for lines in (told, repr(spec.preview(tmp_path / "other")).splitlines()):
+    for lines in (told, repr(magpend.preview(spec, tmp_path / "other")).splitlines()):
         assert sum(line.startswith("starts not given, so taken as 0: v = 0") for line in lines) == 1
 
 
@@ -102,14 +91,14 @@ def oscillator():
 def built():
     return (
         magpend.Spec("sweep", oscillator(), "forces")
-        .parameters(frequency_hz=0.2)
-        .axis("A", 0.1, 0.3, 3)
-        .axis("k", values=np.array([1.0, 1.5]))
-        .start_grid(x=(-1, 1, 4), v=0.5)
-        .integration(n_transient=20)
-        .integration(n_keep=np.int64(4))
-        .extremes(quantities=["x"])
-        .smoke({"integration.n_keep": 2})
+        .with_parameters(frequency_hz=0.2)
+        .with_axis("A", 0.1, 0.3, 3)
+        .with_axis("k", values=np.array([1.0, 1.5]))
+        .with_start_grid(x=(-1, 1, 4), v=0.5)
+        .with_integration(n_transient=20)
+        .with_integration(n_keep=np.int64(4))
+        .with_extremes(quantities=["x"])
+        .with_smoke({"integration.n_keep": 2})
     )
 
 
@@ -118,7 +107,7 @@ def identity(spec):
 
 
 def same_run(spec, text):
-    return identity(read_given(spec)[0]) == identity(read_given(text)[0])
+    return identity(Spec.read(spec)) == identity(Spec.read(text))
 
 
 def test_model__is_that_of_the_toml_text():
@@ -145,27 +134,27 @@ def test_spec__is_the_run_of_its_toml_text(tmp_path):
     spec = built()
     assert same_run(spec, TEXT)
     assert same_run(spec.toml(), TEXT)
-    assert identity(load_spec(spec.save(tmp_path / "spec.toml"))) == identity(read_given(spec)[0])
-    assert identity(read_given(spec, smoke=True)[0]) == identity(read_given(TEXT, smoke=True)[0])
+    assert identity(Spec.read(spec.save(tmp_path / "spec.toml"))) == identity(Spec.read(spec))
+    assert identity(Spec.read(spec, smoke=True)) == identity(Spec.read(TEXT, smoke=True))
     assert magpend.Spec.read(spec.toml()) == spec
-    assert magpend.Spec.read(TEXT)["axes"] == tomllib.loads(TEXT)["axes"]
-    assert read_given(spec)[2] == read_given(spec.toml())[2] == read_given(dict(spec))[2]
-    assert not same_run(spec.axis("A", 0.1, 0.4, 3), TEXT)
-    tables = {key: value for key, value in spec.items() if key != "model"}
+    assert magpend.Spec.read(TEXT).tables["axes"] == tomllib.loads(TEXT)["axes"]
+    assert Spec.read(spec).directory == Spec.read(spec.toml()).directory == Spec.read(spec.tables).directory
+    assert not same_run(spec.with_axis("A", 0.1, 0.4, 3), TEXT)
+    tables = {key: value for key, value in spec.tables.items() if key != "model"}
     assert magpend.Spec(**tables, model=oscillator()) == spec
 
 
 def test_spec__is_not_changed_by_its_methods():
     spec = built()
     before = spec.toml()
-    spec.integration(n_keep=1).axis("A", 0, 1, 2).start_list([[0.0, 0.0]]).lyapunov(n_exponents=1)
+    spec.with_integration(n_keep=1).with_axis("A", 0, 1, 2).with_start_list([[0.0, 0.0]]).with_lyapunov(n_exponents=1)
     assert spec.toml() == before
-    assert spec.start_list([[0.0, 0.0]])["initial_conditions"] == {"kind": "list", "points": [[0.0, 0.0]]}
-    assert spec.lyapunov()["products"] == {"extremes": {"quantities": ["x"]}, "lyapunov": {}}
+    assert spec.with_start_list([[0.0, 0.0]]).tables["initial_conditions"] == {"kind": "list", "points": [[0.0, 0.0]]}
+    assert spec.with_lyapunov().tables["products"] == {"extremes": {"quantities": ["x"]}, "lyapunov": {}}
 
 
 def test_spec__reports_all_problems_at_once():
-    wrong = built().integration(n_keep=0).axis("B", 1, 2, 3).start_grid(y=3)
+    wrong = built().with_integration(n_keep=0).with_axis("B", 1, 2, 3).with_start_grid(y=3)
     with pytest.raises(SpecError) as caught:
         wrong.check()
     assert len(caught.value.problems) == 3
@@ -178,21 +167,21 @@ def test_spec__reports_all_problems_at_once():
 def test_spec__has_a_method_for_every_table_and_its_keys():
     """Signatures are explicit, and complete."""
     named = {"axes": "axis", "initial_conditions": "start_grid"}
-    for key in (*_KEYS, *CELL_PRODUCTS):
+    for key in (*KEYS, *CELL_PRODUCTS):
         if key not in ("kind", "title", "model", "products", "measured"):
-            assert callable(getattr(magpend.Spec, named.get(key, key))), key
-    assert "stop_when_closed" in inspect.signature(magpend.Spec.integration).parameters
-    assert "from_" in inspect.signature(magpend.Spec.drift).parameters
-    assert magpend.Spec("sweep").drift("A", from_=0.0, to=1.0)["drift"] == {"A": {"from": 0.0, "to": 1.0}}
-    assert "Relative tolerance of a step" in magpend.Spec.integration.__doc__
+            assert callable(getattr(magpend.Spec, f"with_{named.get(key, key)}")), key
+    assert "stop_when_closed" in inspect.signature(magpend.Spec.with_integration).parameters
+    assert "from_" in inspect.signature(magpend.Spec.with_drift).parameters
+    assert magpend.Spec("sweep").with_drift("A", from_=0.0, to=1.0).tables["drift"] == {"A": {"from": 0.0, "to": 1.0}}
+    assert "Relative tolerance of a step" in magpend.Spec.with_integration.__doc__
 
 
 @pytest.mark.slow
 def test_spec__reads_and_writes_what_ships():
     for name, path in shipped_workflows().items():
-        spec, shipped = magpend.Spec.read(name), load_spec(path)
-        for tables in (spec, tomllib.loads(spec.toml())):
-            again = parse_spec({key: value for key, value in tables.items() if key != "smoke"})
+        spec, shipped = magpend.Spec.read(name), Spec.read(path)
+        for tables in (spec.tables, tomllib.loads(spec.toml())):
+            again = Spec.parse({key: value for key, value in tables.items() if key != "smoke"})
             assert again.as_dict() == shipped.as_dict(), name
             assert again.model.reference == shipped.model.reference, name
 
@@ -208,55 +197,19 @@ def test_spec__names_files_from_where_it_is(tmp_path, monkeypatch):
     assert same_run(spec, TEXT)
     saved = spec.save(other / "spec.toml")
     assert 'model = "../specs/model.toml"' in saved.read_text("utf-8")
-    assert load_spec(saved).model is oscillator()
+    assert Spec.read(saved).model is oscillator()
     assert spec.save(saved) == saved
     with pytest.raises(SpecError, match="exists already and is not overwritten"):
-        spec.parameters(frequency_hz=0.3).save(saved)
+        spec.with_parameters(frequency_hz=0.3).save(saved)
 
 
 @pytest.mark.slow
 def test_preview__is_the_dry_run(tmp_path):
-    found = built().preview(tmp_path / "run", workers=2)
+    found = magpend.preview(built(), tmp_path / "run", workers=2)
     assert (found.n_cells, found.dims) == (24, {"A": 3, "k": 2, "x_0": 4})
-    assert found.n_bytes == make_plan(read_given(TEXT)[0]).n_bytes
+    assert found.n_bytes == make_plan(Spec.read(TEXT)).n_bytes
     assert found.times.core_seconds > 0
-    assert repr(found).splitlines() == list(found.lines)
-    assert "24 cells" in repr(found)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_run__of_a_spec_of_a_dict_and_of_equations(tmp_path, bytes_of):
-    spec = built()
-    (tmp_path / "spec.toml").write_text(TEXT, "utf-8")
-    given = {
-        "spec": spec,
-        "dict": {**spec, "model": oscillator()},
-        "text": tmp_path / "spec.toml",
-        "lines": {**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"},
-    }
-    runs = {name: magpend.run(one, tmp_path / name, workers=0, echo=silent) for name, one in given.items()}
-    assert runs["spec"].complete
-    same = [bytes_of(tmp_path / name) for name in ("spec", "dict", "text")]
-    for files in same:
-        del files["cube.zarr/zarr.json"]  # it has the text as it was given
-    assert same[0] == same[1] == same[2]
-    assert np.array_equal(runs["lines"].cube().section.values, runs["spec"].cube().section.values)
-
-
-@pytest.fixture(scope="module")
-def driven(tmp_path_factory):
-    """A finished run of a table with numpy's arrays and a model as a table."""
-    table = {
-        "kind": "sweep",
-        "title": "three forces",
-        "model": tomllib.loads(TEXT)["model"],
-        "axes": {"A": {"values": np.array([0.1, 0.2, 0.3])}},
-        "parameters": {"frequency_hz": 0.2},
-        "initial_conditions": {"kind": "list", "points": [[0.0, 0.0], (0.5, np.float64(0.1))]},
-        "integration": {"n_transient": 200, "n_keep": 4},
-    }
-    return magpend.run(table, tmp_path_factory.mktemp("made") / "run", workers=0, echo=silent)
 
 
 def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
@@ -270,24 +223,22 @@ def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_repr__tells_what_it_is_and_what_to_do_next(driven):
-    text = repr(driven)
-    assert len(text.splitlines()) <= 20
-    for words in ("three forces", "oscillator", "6: A (3) x initial_condition (2)", "6 of 6", "run.cube()"):
-        assert words in text
-    assert repr(magpend.attractors(driven)) != text
-    assert "<table>" in driven._repr_html_()
-    assert "three forces" in driven._repr_html_()
-
-
-@pytest.mark.slow
-def test_table__has_a_row_per_attractor_and_parameter_point(driven):
-    found = magpend.table(magpend.attractors(driven))
-    assert len(found) == 3
+def test_table__has_a_row_per_attractor_and_parameter_point(tmp_path):
+    """Of a run of a table with numpy's arrays and a model as a table."""
+    table = {
+        "kind": "sweep",
+        "model": tomllib.loads(TEXT)["model"],
+        "axes": {"A": {"values": np.array([0.1, 0.2, 0.3])}},
+        "parameters": {"frequency_hz": 0.2},
+        "initial_conditions": {"kind": "list", "points": [[0.0, 0.0], (0.5, np.float64(0.1))]},
+        "integration": {"n_transient": 200, "n_keep": 4},
+    }
+    run = magpend.run(table, tmp_path / "run", workers=0, echo=silent)
+    found = magpend.table(magpend.attractors(run))
     assert found["A"].tolist() == [0.1, 0.2, 0.3]
     assert set(found["kind"]) == {"periodic_orbit"}
     with pytest.raises(ValueError, match="not the result of an analysis"):
-        magpend.table(driven.cube())
+        magpend.table(run.cube())
 
 
 def test_sections__of_one_set_or_of_many():

@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magpend_core.versions import ENGINE
 from pipeline.products.product import Analysis, Options, option
 from pipeline.products.registry import ANALYSES
 from pipeline.runs import derive as deriving
 from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
+from pipeline.store.commits import withdraw
 from pipeline.store.errors import DamagedError
-from pipeline.store.packing import withdraw
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 QUICK = {"polish": False, "extend": False}
 
@@ -46,14 +45,6 @@ def register(patch, compute):
 def compute(monkeypatch):
     """The function of the analysis ``mean``: counts its calls."""
     return register(monkeypatch, Counted())
-
-
-@pytest.fixture
-def whole(made):
-    """A run directory whose tasks are all committed."""
-    for index in range(made.plan.n_tasks):
-        made.commit(index)
-    return made
 
 
 class Counted:
@@ -85,29 +76,22 @@ def products(made, name="mean"):
 @pytest.mark.slow
 def test_derive__returns_what_was_computed_and_keeps_it_as_plain_zarr(whole, compute):
     said = []
-    expected = compute(Run.open(whole.info.directory), MeanOptions())
+    expected = compute(RunDirectory.open(whole.info.directory), MeanOptions())
     first = derive(whole.info.directory, "mean", {"a": 1}, echo=said.append)
-    second = derive(whole.info.directory, "mean", echo=said.append)
+    xr.testing.assert_identical(first, derive(whole.info.directory, "mean", echo=said.append))
     assert compute.calls == 2  # the first of them here
-    xr.testing.assert_identical(first, second)
     assert "computed in" in said[0]
     assert "taken from" in said[1]
-    assert set(first.coords) == set(expected.coords)
     for name in expected.variables:
         np.testing.assert_array_equal(first[name].values, expected[name].values)
-        assert first[name].dtype.kind == expected[name].dtype.kind
-        assert first[name].dims == expected[name].dims
+        assert (first[name].dtype.kind, first[name].dims) == (expected[name].dtype.kind, expected[name].dims)
     assert first["by_link"].attrs["flag_values"].tolist() == [0, 1]
-    assert first["by_link"].attrs["long_name"] == "by link"
-    assert first["link"].attrs == expected["link"].attrs
     assert first.attrs["number"] == 0.1
     (path,) = products(whole)
     assert first.encoding["source"] == str(path)
     ds = xr.open_zarr(path, consolidated=False)
     assert json.loads(ds.attrs["derived_options"]) == {"a": 1}
-    assert ds.attrs["parameters"]
     assert [ds["row"].attrs["words"][code] for code in ds["row"].values] == ["left", "right", "left"]
-    assert json.loads((path / "mean" / "zarr.json").read_text())["codecs"][-1]["name"] == "crc32c"
 
 
 @pytest.mark.slow
@@ -128,13 +112,6 @@ def test_derive__other_options_cells_and_code_compute_again(made, compute, monke
     monkeypatch.setattr(versions, "version_of", lambda name: "another")
     derive(directory, "mean", {"a": 1})
     assert compute.calls == 4
-
-
-def test_version_of__names_what_an_analysis_builds_on():
-    assert versions.version_of("basins").startswith(f"engine {ENGINE}, ")
-    assert f"attractors {ANALYSES['attractors'].version}" in versions.version_of("basins")
-    assert f"basins {ANALYSES['basins'].version}" in versions.version_of("basins")
-    assert "basins" not in versions.version_of("attractors")
 
 
 def test_builds_on__is_what_the_code_derives():
@@ -158,7 +135,7 @@ def test_run__does_not_see_later_commits(made):
     run = AnalysedRun.of(made.info.directory)
     made.commit(1)
     assert int((run.cube()["status"] > 0).sum()) == made.plan.cells_in(0)
-    assert int((Run.open(made.info.directory).cube()["status"] > 0).sum()) > made.plan.cells_in(0)
+    assert int((RunDirectory.open(made.info.directory).cube()["status"] > 0).sum()) > made.plan.cells_in(0)
 
 
 def flip(path: Path):
@@ -167,23 +144,18 @@ def flip(path: Path):
     path.write_bytes(bytes(data))
 
 
-HARM = {
-    "flipped": lambda path: flip(path / "mean" / "c.0"),
-    "chunk gone": lambda path: (path / "mean" / "c.0").unlink(),
-    "metadata gone": lambda path: (path / "zarr.json").unlink(),
-    "attribute": lambda path: (path / "zarr.json").write_text(
-        (path / "zarr.json").read_text().replace('"number": 0.1', '"number": 0.2')
-    ),
-    "more": lambda path: (path / "more").write_text(""),
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("harm", HARM)
+@pytest.mark.parametrize("harm", ["flipped", "metadata gone", "more"])
 def test_derive__damage_is_said_and_mended(whole, compute, harm):
     said = []
     first = derive(whole.info.directory, "mean")
-    HARM[harm](products(whole)[0])
+    (path,) = products(whole)
+    if harm == "flipped":
+        flip(path / "mean" / "c.0")
+    elif harm == "more":
+        (path / "more").write_text("")
+    else:
+        (path / "zarr.json").unlink()
     again = derive(whole.info.directory, "mean", echo=said.append)
     assert "damaged" in said[0]
     xr.testing.assert_identical(again, first)

@@ -8,15 +8,16 @@ from scipy.optimize import brentq
 
 from magpend_core.status import Status
 from pipeline import open_run
+from pipeline.analysis.tipping.analysis import tipping_table
 from pipeline.analysis.tipping.delay import delay_table, lags, left_at
-from pipeline.analysis.tipping.table import tipping_table
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
 from pipeline.runs.drawing import figure
-from pipeline.specification.parsing import kept_spec, parse_spec
+from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from tests.pipeline.factories import FOLD, FOLD_LENGTH, quietly
 
 LENGTH, SPEC = FOLD_LENGTH, FOLD
@@ -90,7 +91,7 @@ def test_delay__of_a_synthetic_passage():
     """An orbit of period 1 that begins to alternate at section 30, after a start off the orbit."""
     n = np.arange(60)
     x = 0.01 * n + 0.5 * (n < 3) * (-1.0) ** n + 1e-3 * (-1.0) ** n * 1.5 ** np.maximum(n - 30, 0) * (n > 30)
-    model = parse_spec(SPEC).model
+    model = Spec.parse(SPEC).model
     lag = lags(x[None, :, None], 1, model)
     step = np.abs(np.diff(x))
     np.testing.assert_allclose(lag[0, 1:], step)
@@ -115,14 +116,14 @@ def test_derive__refuses_analyses_that_take_parameters_as_constant(moving_fold):
 
 
 def test_spec__comes_back_and_is_the_identity():
-    spec = parse_spec(SPEC)
-    assert kept_spec(spec.as_dict()).as_dict() == spec.as_dict()
+    spec = Spec.parse(SPEC)
+    assert Spec.parse(spec.as_dict(), KEPT).as_dict() == spec.as_dict()
     plan = make_plan(spec)
     one = identity_of(spec, plan)
-    other = identity_of(parse_spec(with_changes(drift={"l": {"to": 21.0}})), plan)
+    other = identity_of(Spec.parse(with_changes(drift={"l": {"to": 21.0}})), plan)
     assert one["spec"]["drift"] == {"l": {"to": LENGTH, "shape": "linear"}}
     assert one["spec"]["drift"] != other["spec"]["drift"]
-    plain = parse_spec({k: v for k, v in SPEC.items() if k not in ("drift", "axes")})
+    plain = Spec.parse({k: v for k, v in SPEC.items() if k not in ("drift", "axes")})
     without = identity_of(plain, make_plan(plain))
     assert "drift" not in without["spec"]
 
@@ -149,17 +150,17 @@ PROBLEMS = [
 def test_spec__says_what_is_wrong():
     for changes, problem in PROBLEMS:
         with pytest.raises(SpecError) as error:
-            parse_spec({key: value for key, value in with_changes(**changes).items() if value is not None})
+            Spec.parse({key: value for key, value in with_changes(**changes).items() if value is not None})
         assert any(problem in p for p in error.value.problems), error.value.problems
 
 
 def test_spec__reads_a_file(tmp_path):
     (tmp_path / "l.csv").write_text("time_s,value\n# a comment\n5,0\n6,1\n9,0.5\n", "utf-8")
     data = {k: v for k, v in SPEC.items() if k != "axes"}
-    spec = parse_spec({**data, "drift": {"l": {"file": "l.csv", "start_s": 2.0}}}, tmp_path)
+    spec = Spec.parse({**data, "drift": {"l": {"file": "l.csv", "start_s": 2.0}}}, tmp_path)
     (ramp,) = spec.ramps
     assert (ramp.times_s, ramp.values) == ((0.0, 1.0, 4.0), (0.0, 1.0, 0.5))
-    assert kept_spec(spec.as_dict()).ramps == spec.ramps
+    assert Spec.parse(spec.as_dict(), KEPT).ramps == spec.ramps
     for text, problem in (
         ("t,v\n", "must begin with"),
         ("time_s,value\n1,2\n1,3\n", "time must rise"),
@@ -167,4 +168,4 @@ def test_spec__reads_a_file(tmp_path):
     ):
         (tmp_path / "l.csv").write_text(text, "utf-8")
         with pytest.raises(SpecError, match=problem):
-            parse_spec({**data, "drift": {"l": {"file": "l.csv"}}}, tmp_path)
+            Spec.parse({**data, "drift": {"l": {"file": "l.csv"}}}, tmp_path)

@@ -1,11 +1,11 @@
-"""What a dry run says of the time, and what it measures for it."""
+"""What a dry run says of the time, and what a run says of its progress and of its cells."""
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 import tomllib
-from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,14 +16,15 @@ from pipeline.compute import task
 from pipeline.compute.task import warm_up
 from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan
+from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs import estimate as estimates
 from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
-from pipeline.runs.preview import describe_plan
-from pipeline.specification.parsing import parse_spec
+from pipeline.runs.progress import LINE_EVERY_S, Progress
+from pipeline.runs.status import outcomes_of
+from pipeline.specification.spec import Spec
 from pipeline.store import commits
-from tests.pipeline.factories import duffing, quietly
-
-sections = import_module("magpend_core.sections")  # `magpend_core.sections` is a function
+from pipeline.store.run import RunDirectory
+from tests.pipeline.factories import duffing
 
 CLOSING = duffing(
     "frequency_hz = { start = 0.15, stop = 0.25, num = 5 }",
@@ -34,7 +35,7 @@ CLOSING = duffing(
 
 
 def read(text):
-    spec = parse_spec(tomllib.loads(text))
+    spec = Spec.parse(tomllib.loads(text))
     return spec, make_plan(spec)
 
 
@@ -76,45 +77,79 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
 @pytest.mark.slow
 def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_text, tmp_path, monkeypatch):
     spec, plan = read(sweep_text)
-    written, original = [], commits.write_task
-
-    def slow(info, plan, index, *rest):
-        written.append(index)
-        time.sleep(0.2)
-        original(info, plan, index, *rest)
-
-    monkeypatch.setattr(commits, "write_task", slow)
+    original = commits.write_task
+    monkeypatch.setattr(commits, "write_task", lambda *given: (time.sleep(0.2), original(*given)))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     assert writing_seconds(spec, plan) >= 0.2
-    assert len(written) <= 3
     assert list(tmp_path.iterdir()) == []
     # many cells are not tried: by the rule
     monkeypatch.setattr(estimates, "MOST_WRITTEN_CELLS", plan.n_cells - 1)
     assert writing_seconds(spec, plan) == pytest.approx((len(plan.variables) + 1) * estimates.FILE_S)
 
 
+# ---- progress --------------------------------------------------------------------------------------------
+
+
+def test_progress__rate_and_time_left_count_this_session_only():
+    now = [0.0]
+    lines: list[str] = []
+    with Progress(1000, 500, terminal=False, echo=lines.append, clock=lambda: now[0]) as progress:
+        progress.add(10)
+        assert lines == []
+        now[0] = LINE_EVERY_S
+        progress.add(90)
+        assert lines == ["600/1000 cells (60 %), 10 cells/s, 40 s left"]
+        progress.add(400)
+    assert lines[-1].startswith("1000/1000 cells (100 %)")
+
+
+# ---- how its cells ended ---------------------------------------------------------------------------------
+
+AMPLIFIED = """
+kind = "sweep"
+[axes]
+a = { start = -0.5, stop = 0.5, num = 11 }
+[parameters]
+frequency_hz = 0.3
+[initial_conditions]
+kind = "list"
+points = [[0.1, 0.0], [0.2, 0.0]]
+[integration]
+rtol = 1e-6
+atol = 1e-6
+n_transient = 40
+n_keep = 4
+[products]
+lyapunov = { n_exponents = 2 }
+[model]
+name = "amplified"
+states = { x = { unit = "m", escape = 1e6 }, v = { unit = "m/s" } }
+parameters = { a = { value = -0.2, unit = "1/s", meaning = "gain" } }
+equations = { x = "v", v = "a*v - x + 0.1*cos(2*pi*f*t)" }
+"""
+
+
 @pytest.mark.slow
-def test_describe_plan__says_what_the_time_rests_on_and_what_is_left(write_spec, sweep_text, tmp_path):
-    path = write_spec(sweep_text)
-    first, *_, last = describe_plan(path, tmp_path / "run")
-    assert first == "small sweep"
-    assert "measured: 24 of its cells" in last
-    assert not (tmp_path / "run").exists()
-    quietly(path, tmp_path / "run")
-    assert list(describe_plan(path, tmp_path / "run"))[-1] == "time: nothing is left to compute"
-
-
-@pytest.mark.parametrize("stops", [True, False])
-def test_estimate__compiles_no_kernel_that_the_run_does_not_need(monkeypatch, stops):
-    asked = []
-    original = sections.run_branches
-
-    def run_branches(*arguments, **options):
-        asked.append((options["stop_when_closed"], options.get("quantities")))
-        return original(*arguments, **options)
-
-    monkeypatch.setattr(sections, "run_branches", run_branches)
-    text = CLOSING if stops else CLOSING.replace("= true", "= false")
-    estimate(*read(text))
-    assert set(asked) == {(stops, None)}
-    assert len(asked) > 3
+def test_run__says_how_its_cells_ended_and_what_to_do_next(main, tmp_path):
+    """The amplitude exceeds 1e6 within 43 periods (900 rad) where e^(a t/2) does: for a = 0.3 and above."""
+    (tmp_path / "spec.toml").write_text(AMPLIFIED, "utf-8")
+    code, out, err = main("run", "spec.toml", "--workers", 0)
+    assert code == 0, err
+    at_end = 43 / 0.3
+    gains = np.linspace(-0.5, 0.5, 11)
+    gone = [a for a in gains if 0.1 * math.exp(a / 2 * at_end) > 1e8]
+    stay = [a for a in gains if math.exp(a / 2 * at_end) < 1e5]
+    found = {o.status: o for o in outcomes_of(RunDirectory.open(tmp_path / "runs" / "spec"))}
+    ((name, low, high, unit),) = found[DIVERGED].where
+    assert (name, high, unit) == ("a", 0.5, "1/s")
+    assert max(stay) < low <= min(gone)
+    assert sum(o.n_cells for o in found.values()) == 22
+    assert f"a = {low:g} to 0.5 1/s" in out
+    assert "cells (27.3 %) diverged or failed" in err
+    assert "a state left the bounds" in err
+    # the command that it names works
+    (line,) = [line for line in out.splitlines() if "magpend zoom" in line]
+    assert f"magpend zoom runs/spec --axis a={low:g}:0.5 --out closer.toml" in line
+    code, _, err = main(*line.partition("magpend ")[2].split())
+    assert code == 0, err
+    assert "start = 0.3" in (tmp_path / "closer.toml").read_text("utf-8").replace("0.30000000000000004", "0.3")

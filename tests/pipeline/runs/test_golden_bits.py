@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.layout.first_versions import numbered
+from pipeline.layout.identity import numbered
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.runs.versions import version_of
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import silent
 
 STORED = Path(__file__).with_name("golden_bits.json")
@@ -85,6 +85,9 @@ RUNS = {
     "extremes": f'{SWEEP}[products]\nextremes = {{ quantities = ["energy", "psi1"] }}\n',
     "exponents": f"{DUFFING}[products]\nlyapunov = {{ n_transient = 8, n_periods = 32, n_blocks = 4 }}\n",
 }
+ROUNDING = ("normal_form_error", "residual")
+"""What differs between CPUs: sizes of rounding errors."""
+
 SUMS = ("exponents", "torus")
 """Runs with products that are sums over periods."""
 
@@ -107,6 +110,8 @@ def told(ds, exact):
     """Hash of each variable of a dataset, or its digits."""
     found = {}
     for name in sorted(map(str, ds.data_vars)):
+        if name in ROUNDING:
+            continue
         values = np.ascontiguousarray(ds[name].values)
         is_exact = exact or values.dtype.kind not in "fc"
         found[name] = hashlib.sha256(values.tobytes()).hexdigest()[:16] if is_exact else digits(values)
@@ -122,7 +127,7 @@ def made(name, folder):
 
 def of_run(name, folder):
     directory = made(name, folder)
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     return {"versions": numbered(opened.info.identity)["versions"], "values": told(opened.cube(), name not in SUMS)}
 
 

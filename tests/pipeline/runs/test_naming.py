@@ -10,12 +10,12 @@ from pipeline.products.branches import BranchOptions
 from pipeline.products.product import FigureOptions, StateOptions
 from pipeline.runs.naming import named, place
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 
 @pytest.fixture
 def run(made):
-    return Run.open(made.info.directory)
+    return RunDirectory.open(made.info.directory)
 
 
 @pytest.mark.slow

@@ -17,9 +17,9 @@ from pipeline.runs.derive import derive
 from pipeline.runs.extend import extend
 from pipeline.runs.noise import warn_of_steps
 from pipeline.runs.run import run
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
-from pipeline.store.places import open_files
+from pipeline.specification.spec import Spec
+from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import WELL, finished, quietly
 
 S = (0.45, 0.55, 0.7)
@@ -54,7 +54,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_escapes__mean_first_passage_time_by_quadrature(directory: Path) -> None:
+def test_escapes__mean_first_passage_time_by_quadrature(directory):
     ds = derive(directory, "escapes", {"high": {"x": 0.8}})
     for s in S:
         one = ds.sel(noise_x=s).isel(set=0)
@@ -70,7 +70,7 @@ def test_escapes__mean_first_passage_time_by_quadrature(directory: Path) -> None
         assert list(one["n_to"].values) == [0, int(one["n_left"])]
 
 
-def test_escapes__kramers_fit_has_the_barrier(directory: Path) -> None:
+def test_escapes__kramers_fit_has_the_barrier(directory):
     ds = derive(directory, "escapes", {"high": {"x": 0.8}}).isel(set=0)
     # U = -x^2/2 + x^4/4 has a barrier of 1/4, and the exponent is twice that; the prefactor's own change with the
     # strength, 1 - 3 s^2/4 to first order, tilts the line by some .06 between these strengths
@@ -85,7 +85,7 @@ def test_escapes__kramers_fit_has_the_barrier(directory: Path) -> None:
 
 
 @pytest.mark.slow
-def test_density__of_the_double_well(directory: Path) -> None:
+def test_density__of_the_double_well(directory):
     ds = derive(directory, "density", {"skip": 250, "bandwidth": 0.3}).sel(noise_x=0.7)
     value = ds["value"].values
     exact = np.exp(2.0 * (0.5 * value**2 - 0.25 * value**4) / 0.49)
@@ -97,7 +97,7 @@ def test_density__of_the_double_well(directory: Path) -> None:
     assert float(ds["variance"]) == pytest.approx(float((exact * value**2).sum() / exact.sum()), rel=0.05)
 
 
-def test_run__stores_noise_and_errors(directory: Path) -> None:
+def test_run__stores_noise_and_errors(directory):
     cube = open_run(directory)
     assert cube["strong_error"].notnull().all()
     assert float(cube["strong_error"].max()) < 0.01
@@ -115,7 +115,7 @@ SMALL: dict[str, Any] = {
 
 
 @pytest.mark.slow
-def test_extend__gives_the_bytes_of_a_longer_run(tmp_path: Path, bytes_of: Any) -> None:
+def test_extend__gives_the_bytes_of_a_longer_run(tmp_path, bytes_of):
     short = WELL.replace("[0.45, 0.55, 0.7]", "[0.2]").replace("stop = 199", "stop = 19")
     short = short.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 5")
     longer = short.replace("[0.2]", "[0.2, 0.3]").replace("stop = 19", "stop = 24").replace("n_keep = 5", "n_keep = 9")
@@ -132,7 +132,7 @@ def test_extend__gives_the_bytes_of_a_longer_run(tmp_path: Path, bytes_of: Any) 
 
 
 @pytest.mark.slow
-def test_run__tasks_do_not_change_the_numbers(tmp_path: Path) -> None:
+def test_run__tasks_do_not_change_the_numbers(tmp_path):
     for n in (3, 20):
         quietly(spec(**SMALL, execution={"trajectories_per_task": n}), tmp_path / str(n))
     few, all_ = (open_run(tmp_path / str(n)) for n in (3, 20))
@@ -140,7 +140,7 @@ def test_run__tasks_do_not_change_the_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_derive__refuses_analyses_of_the_other_kind(directory: Path, tmp_path: Path) -> None:
+def test_derive__refuses_analyses_of_the_other_kind(directory, tmp_path):
     with pytest.raises(SpecError, match="its cells have noise; attractors needs a run without"):
         derive(directory, "attractors")
     plain = {k: v for k, v in spec(**SMALL).items() if k != "noise"}
@@ -154,7 +154,7 @@ def test_derive__refuses_analyses_of_the_other_kind(directory: Path, tmp_path: P
         derive(directory, "escapes", {"high": {"y": 0.8}})
 
 
-def test_run__refuses_steps_that_are_too_long(tmp_path: Path) -> None:
+def test_run__refuses_steps_that_are_too_long(tmp_path):
     with pytest.raises(SpecError, match=r"noise.steps_per_period = 1: halving .* set steps_per_period = \d"):
         run(spec(**SMALL, noise={"steps_per_period": 1}, parameters={"frequency_hz": 1.0}), tmp_path / "a", workers=0)
     stiff = {"equations": {"x": "-x - tanh(2000*x)"}, "name": "dry", "parameters": {}}
@@ -164,10 +164,10 @@ def test_run__refuses_steps_that_are_too_long(tmp_path: Path) -> None:
     assert not (tmp_path / "b").exists()
 
 
-def test_warn_of_steps__counts_the_cells_above_the_tolerance(directory: Path) -> None:
+def test_warn_of_steps__counts_the_cells_above_the_tolerance(directory):
     lines: list[str] = []
     for tolerance in (0.01, 1e-9):
-        warn_of_steps(parse_spec(spec(noise={"tolerance": tolerance})), open_files(directory), lines.append)
+        warn_of_steps(Spec.parse(spec(noise={"tolerance": tolerance})), RunDirectory.open(directory), lines.append)
     assert len(lines) == 1
     assert lines[0].startswith("warning: in 600 of 600 cells the last period changes by more than noise.tolerance")
 
@@ -186,24 +186,18 @@ PROBLEMS = [
 ]
 
 
-def test_parse_spec__noise_problems() -> None:
+def test_parse_spec__noise_problems():
     for changes, problem in PROBLEMS:
         with pytest.raises(SpecError, match=problem) as caught:
-            parse_spec(spec(**changes))
+            Spec.parse(spec(**changes))
         if "noise" in changes:  # what only follows from it is not said
             assert not any("axes." in p for p in caught.value.problems)
 
 
-def test_parse_spec__reads_back_what_it_writes() -> None:
-    parsed = parse_spec(spec(noise={"strengths": {"x": "0.1*a*x"}, "interpretation": "ito"}))
-    again = parse_spec(parsed.as_dict(), None)
+def test_parse_spec__reads_back_what_it_writes():
+    parsed = Spec.parse(spec(noise={"strengths": {"x": "0.1*a*x"}, "interpretation": "ito"}))
+    again = Spec.parse(parsed.as_dict(), None)
     assert again.noise == parsed.noise
     assert again.model.digest == parsed.model.digest
-    assert again.model.digest != parse_spec(spec()).model.digest
+    assert again.model.digest != Spec.parse(spec()).model.digest
     assert parsed.values["noise_x"] == 1.0
-
-
-def test_steps_at__divides_the_period() -> None:
-    noise = parse_spec(spec(noise={"steps_per_period": None, "step": 0.01})).noise
-    assert noise is not None
-    assert noise.steps_at(np.array([5.0, 4.9, 100.0, 1000.0])).tolist() == [20, 21, 1, 1]

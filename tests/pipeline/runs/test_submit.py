@@ -1,18 +1,24 @@
-"""Batch scripts of coordinators, as text, and what is refused before one is sent."""
+"""Batch jobs: their scripts as text, their sizes, the batch systems that are here, and what is refused."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from pipeline.runs.batch import coordinator_script
-from pipeline.runs.workflows import find_spec
-from pipeline.specification.batch_systems import SYSTEMS
-from pipeline.specification.clusters import load_cluster
+from pipeline.compute.jobqueue import settings
+from pipeline.runs.batch_systems import find_systems
+from pipeline.runs.jobs import Work, complete, coordinator_script, remarks
+from pipeline.runs.submit import prepare
+from pipeline.specification.clusters import QUEUES, SYSTEMS, cluster_of, load_cluster, seconds_of
+from pipeline.specification.files import find_spec
+from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import duffing, quietly
 
 CLUSTER = """
@@ -28,8 +34,7 @@ directives = ["-pe smp 4", "--exclusive"]
 coordinator_walltime = "48:00:00"
 """
 SMALL = duffing("frequency_hz = { values = [0.2] }", 'kind = "list"\npoints = [[0.5, 0.0]]', n_transient=1, n_keep=1)
-WHOLE = {
-    "slurm": """
+SLURM = """#!/usr/bin/env bash
 #SBATCH --job-name=magpend-out
 #SBATCH --output=/logs/coordinator-%j.out
 #SBATCH --open-mode=append
@@ -43,48 +48,16 @@ WHOLE = {
 #SBATCH --time=04:00:00
 #SBATCH -pe smp 4
 #SBATCH --exclusive
-""",
-    "pbs": """
-#PBS -N magpend-out
-#PBS -o /logs/coordinator.out
-#PBS -j oe
-#PBS -r y
-#PBS -V
-#PBS -q short
-#PBS -A p-42
-#PBS -l select=1:ncpus=4:mem=7630mb
-#PBS -l walltime=04:00:00
-#PBS -pe smp 4
-#PBS --exclusive
-""",
-    "sge": """
-#$ -N magpend-out
-#$ -o /logs/coordinator.out
-#$ -j y
-#$ -r y
-#$ -V
-#$ -S /bin/bash
-#$ -q short
-#$ -P p-42
-#$ -l h_rt=04:00:00
-#$ -pe smp 4
-#$ --exclusive
-""",
-    "lsf": """
-#BSUB -J magpend-out
-#BSUB -o /logs/coordinator-%J.out
-#BSUB -r
-#BSUB -q short
-#BSUB -P "p-42"
-#BSUB -n 4
-#BSUB -R "span[hosts=1]"
-#BSUB -M 8000
-#BSUB -W 04:00
-#BSUB -pe smp 4
-#BSUB --exclusive
-""",
+"""
+# lines of a job that holds all, and of a coordinator of other jobs: one core, whatever they need, and a longer life
+LINES = {
+    "slurm": ("--cpus-per-task=4; --mem=7630M", "--cpus-per-task=1; --mem=3815M; --time=48:00:00"),
+    "pbs": ("-N magpend-out; -q short; -l select=1:ncpus=4:mem=7630mb", "-l select=1:ncpus=1:mem=3815mb"),
+    "torque": ("-q short; -A p-42; -l nodes=1:ppn=4,mem=7630mb", "-l nodes=1:ppn=1,mem=3815mb; -l walltime=48:00:00"),
+    "sge": ("-q short; -P p-42; -l h_rt=04:00:00; -o /logs/coordinator.out", "-l h_rt=48:00:00"),
+    "lsf": ('-q short; -P "p-42"; -n 4; -R "span[hosts=1]"; -M 8000; -W 04:00', "-n 1; -M 4000; -W 48:00"),
 }
-WHOLE["torque"] = WHOLE["pbs"].replace("select=1:ncpus=4:mem", "nodes=1:ppn=4,mem")
+MARK = {"slurm": "#SBATCH", "pbs": "#PBS", "torque": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 BODY = """
 set -eo pipefail
 cd '/my folder'
@@ -108,30 +81,18 @@ def script(path):
     return coordinator_script(load_cluster(path), "magpend-out", "/logs/coordinator", "/my folder", command)
 
 
-@pytest.mark.parametrize("kind", WHOLE)
-def test_script__one_job_holds_all(cluster, kind):
-    found = script(cluster(kind))
-    assert found == "#!/usr/bin/env bash" + WHOLE[kind] + BODY
-    done = subprocess.run(["bash", "-n"], input=found, text=True, capture_output=True, check=False)
+@pytest.mark.parametrize("kind", LINES)
+def test_script__one_job_holds_all_or_coordinates_others(cluster, kind):
+    one, other = script(cluster(kind)), script(cluster(kind, "max_jobs = 8\n"))
+    for found, lines in zip((one, other), LINES[kind], strict=True):
+        assert {f"{MARK[kind]} {words}" for words in lines.split("; ")} <= set(found.splitlines())
+        assert found.endswith(BODY)
+        assert "--exclusive" in found
+    assert "-pe smp" in one
+    assert "-pe smp" not in other
+    assert one == SLURM + BODY or kind != "slurm"
+    done = subprocess.run(["bash", "-n"], input=one, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.parametrize(
-    ("kind", "lines"),
-    [
-        ("slurm", ("#SBATCH --cpus-per-task=1", "#SBATCH --mem=3815M", "#SBATCH --time=48:00:00")),
-        ("pbs", ("#PBS -l select=1:ncpus=1:mem=3815mb", "#PBS -l walltime=48:00:00")),
-        ("torque", ("#PBS -l nodes=1:ppn=1,mem=3815mb", "#PBS -l walltime=48:00:00")),
-        ("sge", ("#$ -l h_rt=48:00:00",)),
-        ("lsf", ("#BSUB -n 1", "#BSUB -M 4000", "#BSUB -W 48:00")),
-    ],
-)
-def test_script__coordinator_of_other_jobs(cluster, kind, lines):
-    """It needs one core, whatever the others need, and lives longer."""
-    found = script(cluster(kind, "max_jobs = 8\n"))
-    assert set(lines) <= set(found.splitlines())
-    assert "-pe smp" not in found
-    assert "--exclusive" in found
 
 
 @pytest.mark.parametrize(
@@ -180,53 +141,45 @@ def test_submit__dry_run(main, tmp_path, write_spec, cluster):
 
 def test_submit__dry_run_with_workers(main, tmp_path, write_spec, cluster):
     """Job files of coordinator and workers are printed; with changes, also the table that the coordinator reads."""
-    path, several = write_spec(SMALL), cluster("pbs", "max_jobs = 3\n")
-    words = ("submit", path, "--cluster", several, "--out", "out", "--dry-run")
+    several = cluster("pbs", "max_jobs = 3\n")
+    words = ("submit", write_spec(SMALL), "--cluster", several, "--out", "out", "--dry-run")
     code, out, _ = main(*words)
     assert code == 0
     assert shlex.split(job_file(out).splitlines()[-1])[-4:] == ["--scheduler", "pbs", "--cluster", str(several)]
     assert "it sends 1 to 3 jobs of workers, each of 4 cores, 8.0 GB, at most 4 h" in out
-    assert "#PBS -l select=1:ncpus=4:mem=7630MB" in out
     assert "dask_worker tls://COORDINATOR:PORT" in out
     assert "cluster.toml" not in out
-    code, out, _ = main(*words, "--job", "walltime=02:00:00", "--job", "max_jobs=2", "--json")
-    found = json.loads(out)
+    found = json.loads(main(*words, "--job", "walltime=02:00:00", "--job", "max_jobs=2", "--json")[1])
     table = tmp_path / "out.jobs" / "cluster.toml"
     assert shlex.split(found["jobs"][0]["script"].splitlines()[-1])[-1] == str(table)
-    assert [job["role"] for job in found["jobs"]] == ["coordinator", "workers"]
-    assert found["jobs"][0]["walltime_s"] == 48 * 3600
-    assert found["jobs"][1]["walltime_s"] == 2 * 3600
+    assert [(job["role"], job["walltime_s"]) for job in found["jobs"]] == [("coordinator", 172800), ("workers", 7200)]
     assert found["reasons"]["walltime"] == "from --job"
-    assert found["cells"] == found["cells_left"] == 1
-    assert found["sent"] is None
+    assert (found["cells"], found["cells_left"], found["sent"]) == (1, 1, None)
     assert sorted(path.name for path in tmp_path.iterdir() if path.suffix != ".toml") == []
 
 
 def test_submit__needs_no_file(main, tmp_path, write_spec, command_of):
     """The batch system that is here and the measured work are enough; the dry run shows its own list of queues."""
-    path = write_spec(SMALL)
+    words = ("submit", write_spec(SMALL), "--out", "out")
     command_of("sbatch", "echo 7")
     command_of("sinfo", "echo 'PARTITION AVAIL TIMELIMIT'; echo 'short* up 1:00:00'")
-    code, out, _ = main("submit", path, "--out", "out", "--dry-run")
+    code, out, _ = main(*words, "--dry-run")
     assert code == 0
-    assert f"batch system: SLURM ({tmp_path}/bin/sbatch is here; looked for sbatch (SLURM), bsub (LSF), qsub" in out
-    assert "queue: the default of SLURM; 'sinfo -s' lists:\n  PARTITION AVAIL TIMELIMIT\n  short* up 1:00:00\n" in out
-    assert "jobs: 1 job of 1 core, 1.5 GB, at most 15 min" in out
+    for line in (
+        f"batch system: SLURM ({tmp_path}/bin/sbatch is here; looked for sbatch (SLURM), bsub (LSF), qsub",
+        "queue: the default of SLURM; 'sinfo -s' lists:\n  PARTITION AVAIL TIMELIMIT\n  short* up 1:00:00\n",
+        "jobs: 1 job of 1 core, 1.5 GB, at most 15 min",
+    ):
+        assert line in out
     assert "--partition" not in job_file(out)
-    code, out, _ = main(
-        "submit", path, "--out", "out", "--job", "queue=long", "--job", "cores=99", "--job", "account=p-1"
-    )
-    assert code == 0
-    assert "sent: job 7 to SLURM; 1 job of 99 cores" in out
-    lines = (tmp_path / "out.jobs" / "job.sh").read_text().splitlines()
-    assert {"#SBATCH --partition=long", "#SBATCH --account=p-1", "#SBATCH --cpus-per-task=99"} <= set(lines)
     # a file may leave sizes out
     (tmp_path / "mine.toml").write_text('[cluster]\naccount = "p-9"\n')
     command_of("sinfo", "exit 1")
-    code, out, errors = main("submit", path, "--cluster", "mine.toml", "--out", "other", "--dry-run")
+    code, out, errors = main(*words, "--cluster", "mine.toml", "--job", "queue=long", "--job", "cores=99")
     assert code == 0, errors
-    assert "#SBATCH --account=p-9" in job_file(out)
-    assert "'sinfo -s', which lists queues and their limits, gave no answer here" in out
+    assert "sent: job 7 to SLURM; 1 job of 99 cores" in out
+    lines = (tmp_path / "out.jobs" / "job.sh").read_text().splitlines()
+    assert {"#SBATCH --partition=long", "#SBATCH --account=p-9", "#SBATCH --cpus-per-task=99"} <= set(lines)
 
 
 def test_submit__writes_a_job_file(main, tmp_path, write_spec, command_of):
@@ -234,15 +187,12 @@ def test_submit__writes_a_job_file(main, tmp_path, write_spec, command_of):
     words = ("submit", write_spec(SMALL), "--out", "out", "--cluster", "pbs", "--write")
     code, out, errors = main(*words, "job.sh")
     assert code == 0, errors
-    assert "written: job.sh, for PBS: 1 job of 1 core" in out
     assert "send it: qsub job.sh" in out
-    text = (tmp_path / "job.sh").read_text()
-    assert "#PBS -l select=1:ncpus=1:mem=1431mb" in text
+    assert "#PBS -l select=1:ncpus=1:mem=1431mb" in (tmp_path / "job.sh").read_text()
     assert (tmp_path / "out.jobs").is_dir()  # PBS puts no log into a folder that is not there
-    assert main(*words, "job.sh")[0] == 0
     (tmp_path / "notes.txt").write_text("mine")
-    assert main(*words, "notes.txt")[0] == 2
-    assert main(*words, "job.sh", "--dry-run")[0] == 2
+    for code, more in ((0, ["job.sh"]), (2, ["notes.txt"]), (2, ["job.sh", "--dry-run"])):
+        assert main(*words, *more)[0] == code
 
 
 def test_submit__no_batch_system_or_several(main, tmp_path, write_spec, cluster, command_of, monkeypatch):
@@ -289,38 +239,32 @@ def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, cluster,
     code, _, errors = main(*words)
     assert code == 4
     assert "sbatch did not take the job: error: invalid account.\nChange what it names by --job KEY=VALUE" in errors
-    assert "'sinfo -s' lists queues and their limits, sacctmgr show associations" in errors
     assert f"The script is {tmp_path / 'out.jobs' / 'job.sh'}." in errors
     command_of("sbatch", "true")
     assert "sbatch did not take the job: exit code 0" in main(*words)[2]
     command_of("sbatch", "echo 7")
     command_of("squeue", "echo PENDING")
     assert main(*words)[0] == 0
-    assert json.loads((tmp_path / "out.jobs" / "job.json").read_text()) == {"kind": "slurm", "job": "7"}
+    job = tmp_path / "out.jobs" / "job.json"
+    assert json.loads(job.read_text()) == {"kind": "slurm", "job": "7"}
     code, _, errors = main(*words)
     assert code == 3
     assert "job 7 of this run exists already (PENDING)" in errors
     command_of("squeue", "exit 1")
     assert main(*words)[0] == 0
-    (tmp_path / "out.jobs" / "job.json").write_text('{"kind": "slurm", "job": "--help; rm"}')
+    job.write_text('{"kind": "slurm", "job": "--help; rm"}')
     assert main(*words)[0] == 0
-
-
-@pytest.mark.slow
-def test_submit__torque_lists_a_job_that_has_ended(main, tmp_path, write_spec, command_of):
-    words = ("submit", write_spec(SMALL), "--cluster", "torque", "--out", "out")
+    # Torque lists a job that has ended
+    words = ("submit", tmp_path / "spec.toml", "--cluster", "torque", "--out", "other")
     command_of("qsub", "echo 12.head")
-    assert main(*words)[0] == 0
-    command_of("qstat", "echo 'Job Id: 12.head'; echo '    job_state = R'")
-    assert main(*words)[0] == 3
-    command_of("qstat", "echo 'Job Id: 12.head'; echo '    job_state = C'; echo '    exit_status = 0'")
-    assert main(*words)[0] == 0
+    for code, state in ((0, ""), (3, "job_state = R"), (0, "job_state = C'; echo '    exit_status = 0")):
+        command_of("qstat", f"echo 'Job Id: 12.head'; echo '    {state}'")
+        assert main(*words)[0] == code
 
 
 def test_submit__nothing_to_send(main, tmp_path, write_spec, cluster):
-    path = write_spec(SMALL)
-    quietly(path, tmp_path / "out")
-    words = ("submit", path, "--cluster", cluster("slurm"), "--out", "out")
+    words = ("submit", write_spec(SMALL), "--cluster", cluster("slurm"), "--out", "out")
+    quietly(tmp_path / "spec.toml", tmp_path / "out")
     assert main(*words)[:2] == (0, "out is complete; nothing to send.\n")
     assert "out is complete; nothing would be sent." in main(*words, "--dry-run")[1]
 
@@ -331,3 +275,129 @@ def test_templates__are_in_order():
     files = sorted(folder.glob("*.toml"))
     assert [load_cluster(file).kind for file in files] == [file.stem for file in files]
     assert {file.stem for file in files} == set(SYSTEMS)
+
+
+MARKS = ["#SBATCH --uid=0", "#PBS -l walltime=99:00:00", "#$ -l h_rt=99:00:00", "#BSUB -W 99:00"]
+
+
+@pytest.mark.parametrize("kind", QUEUES)
+def test_scripts__no_name_puts_a_line_of_its_own_into_them(kind, tmp_path, write_spec, monkeypatch):
+    cluster = cluster_of({"kind": kind, "cores": 1, "memory": "1 GB", "walltime": "01:00:00"})
+    names = ["magpend-a", "/logs/coordinator", "/home/me", "/home/me/a.toml"]
+    assert coordinator_script(cluster, *names[:3], ["run", names[3]])
+    assert settings(cluster, Path("/logs"))
+    for mark, control, place in itertools.product(MARKS, "\n\r\x00\x1b\u2028", range(4)):
+        words = [*names[:place], f"a{control}{mark}", *names[place + 1 :]]
+        with pytest.raises(SpecError, match="line breaks"):
+            coordinator_script(cluster, *words[:3], ["run", words[3]])
+    with pytest.raises(SpecError, match="line breaks"):
+        settings(cluster, Path(f"/logs/a\n{MARKS[0]}"))
+    # also of the folder in which it is sent
+    monkeypatch.setenv("PATH", str(tmp_path))  # no batch system of this machine is asked
+    spec, place = write_spec(SMALL), tmp_path / f"a\n{MARKS[1]}"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    with pytest.raises(SpecError, match="line breaks"):
+        prepare(spec, tmp_path / "out", "pbs", ["walltime=01:00:00", "cores=1", "memory=1 GB"])
+    assert not (tmp_path / "out.jobs").exists()
+
+
+# ---- cores, memory and time by the work ------------------------------------------------------------------
+
+HOUR = 3600.0
+WORK = Work(
+    n_cells=100_000,
+    n_left=100_000,
+    n_tasks=2000,
+    n_tasks_left=2000,
+    n_parallel=2000,
+    periods=1e7,
+    seconds=10 * HOUR,
+    how="measured",
+    n_bytes=10**9,
+    task_bytes=500_000,
+)
+
+
+def sized(work=WORK, **given):
+    table, reasons = complete({"kind": "slurm", **given}, work)
+    return cluster_of(table), reasons
+
+
+def test_complete__what_is_asked_for():
+    """Ten hours of one core would be half an hour of 20; more than 16 cores are not asked for by themselves."""
+    found, reasons = sized()
+    assert found.cores == 16
+    assert "no more are asked for" in reasons["cores"]
+    assert found.memory_bytes == 10**9 + 16 * (5 * 10**8 + 1_500_000)
+    wall = WORK.wall(16)
+    assert wall == pytest.approx(10 * HOUR / 16, rel=0.01)
+    # twice the estimate
+    assert 2 * wall + 600 <= seconds_of(found.walltime) < 2 * wall + 600 + 300
+
+
+@pytest.mark.parametrize(
+    ("change", "cores", "why"),
+    [
+        ({"seconds": 5.0}, 1, "a job aims at 30 min or less"),
+        ({"seconds": 5 * HOUR}, 10, "a job aims at 30 min or less"),
+        ({"n_parallel": 7}, 7, "no more tasks can run at a time"),
+    ],
+)
+def test_complete__the_least_bound_decides(change, cores, why):
+    found, reasons = sized(replace(WORK, **change))
+    assert found.cores == cores
+    assert why in reasons["cores"]
+
+
+def test_complete__grid_engine_needs_a_parallel_environment():
+    assert complete({"kind": "sge"}, WORK)[0]["cores"] == 1
+    assert complete({"kind": "sge", "directives": ["-pe smp 16"]}, WORK)[0]["cores"] == 16
+
+
+def test_complete__what_is_given_stays():
+    found, reasons = sized(cores=2, memory="3 GB", walltime="00:05:00")
+    assert (found.cores, found.memory, found.walltime, reasons) == (2, "3 GB", "00:05:00", {})
+
+
+def test_remarks():
+    assert remarks(sized()[0], WORK) == []
+    often, nodes = remarks(sized(cores=4, walltime="01:00:00")[0], WORK)
+    assert "2 h 30 min on 4 cores, and the job ends after 60 min: send it about 3 times" in often
+    assert "--job max_jobs=5" in nodes
+
+
+# ---- batch systems found by their commands ---------------------------------------------------------------
+
+
+def kinds():
+    return [system.kind for system in find_systems()]
+
+
+@pytest.mark.parametrize(
+    ("version", "kind"),
+    [
+        ("pbs_version = 20.0.1", "pbs"),
+        ("pbs_version = 2020.1.0.20200711141213", "pbs"),
+        ("Version: 6.1.2\nCommit: 661e092552de43a785c15d39a3634a541d86898e", "torque"),
+        ("version: 2.4.16", "torque"),
+        ("something else", "pbs"),
+    ],
+)
+def test_find_systems__qsub_has_several_makers(command_of, version, kind):
+    command_of("qsub", "true")
+    command_of("qstat", f"echo '{version}' >&2")
+    assert kinds() == [kind]
+
+
+def test_find_systems__several_and_the_qsub_of_slurm_is_none_of_them(command_of):
+    """Debian's slurm-wlm-torque has a qsub in Perl, which calls sbatch; that of Grid Engine has qconf beside it."""
+    assert find_systems() == []
+    path = command_of("sbatch", "true")
+    command_of("qsub", "# This file is part of Slurm, a resource management program.", "#! /usr/bin/perl -w")
+    (found,) = find_systems()
+    assert (found.kind, found.command, found.named) == ("slurm", path, f"SLURM ({path})")
+    command_of("qstat", "exit 1")
+    for name in ("bsub", "qsub", "qconf"):
+        command_of(name, "true")
+    assert kinds() == ["slurm", "lsf", "sge"]

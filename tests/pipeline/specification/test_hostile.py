@@ -4,15 +4,15 @@ import os
 import time
 import tomllib
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import Range, load_spec, parse_spec
-from pipeline.specification.problems import SpecError, shown
-from pipeline.specification.toml import toml_key, toml_value
+from pipeline.specification.files import toml_key, toml_value
+from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
+from pipeline.specification.tables import Range
 from tests.pipeline.factories import duffing
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
@@ -87,10 +87,10 @@ def test_load_spec__endless_files_and_arrays(tmp_path):
         file.truncate(40_000_000)
     for endless in (path, "/dev/zero"):
         with pytest.raises(SpecError, match="has more than 1 MB, the limit of a specification"):
-            load_spec(endless)
+            Spec.read(endless)
     path.write_text(f"[axes]\namplitude = [{'0,' * 100_001}]")
     with pytest.raises(SpecError, match=r"axes\.amplitude: has 100001 elements; the limit is 100000"):
-        load_spec(path)
+        Spec.read(path)
 
 
 # ---- mutations --------------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def spelled(value):
 def outcome(path, smoke):
     """Whether a specification can be planned, in its own size or in its small one."""
     try:
-        make_plan(load_spec(path, smoke=smoke))
+        make_plan(Spec.read(path, smoke=smoke))
     except SpecError:
         return False
     return True
@@ -174,10 +174,6 @@ def held(refused, path, content):
     for smoke, options in ((False, ()), (True, ("--smoke",))):
         if not outcome(path, smoke):
             refused(content, *options, ways=[["--dry-run"]])
-
-
-def test_outcome__what_is_mutated_can_be_planned(write_spec):
-    assert all(outcome(write_spec(BASE), smoke) for smoke in (False, True))
 
 
 @pytest.mark.slow
@@ -258,7 +254,7 @@ def test_parse_spec__many_axes_take_a_moment():
         "axes": {name: {"values": [0.1, 0.2]} for name in names},
         "initial_conditions": {"kind": "list", "points": [[0.0, 0.0]]},
     }
-    assert seconds_of(lambda: parse_spec(data)) < 2
+    assert seconds_of(lambda: Spec.parse(data)) < 2
 
 
 def test_parse_spec__corners_of_related_parameters_are_looked_at():
@@ -276,14 +272,6 @@ def test_parse_spec__corners_of_related_parameters_are_looked_at():
         "initial_conditions": {"kind": "list", "points": [[0.0, 0.0]]},
     }
     with pytest.raises(SpecError, match="magnets can meet"):
-        parse_spec(data)
+        Spec.parse(data)
     del data["axes"]["l2"]
-    parse_spec(data)
-
-
-def test_shown__is_short_whatever_is_given():
-    endless = []
-    endless.append(endless)
-    for value in ("x" * 1000, 10**5000, endless, np.zeros(10_000), {"a": 10**5000}):
-        assert len(shown(value)) <= 130
-    assert shown("no") == "'no'"
+    Spec.parse(data)

@@ -11,8 +11,8 @@ import pytest
 from pipeline.layout.cells import CellMap, coordinates
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from tests.core.flows import VAN_DER_POL
 
 SPEC = {
@@ -27,26 +27,26 @@ SPEC = {
 def problems(**changes):
     data = {k: v for k, v in {**copy.deepcopy(SPEC), **changes}.items() if v is not None}
     with pytest.raises(SpecError) as error:
-        parse_spec(data)
+        Spec.parse(data)
     return error.value.problems
 
 
 def test_parse_spec__section():
-    spec = parse_spec(SPEC)
+    spec = Spec.parse(SPEC)
     assert spec.model.crossing.sentence == "v = 0.5 going down"
     assert spec.values.as_dict() == {"mu": 1.0, "section_value": 0.5}
     assert spec.frequency_hz == 1.0 / 50.0
-    again = parse_spec(spec.as_dict())
+    again = Spec.parse(spec.as_dict())
     assert again == spec
     assert again.model is spec.model
     assert pickle.loads(pickle.dumps(spec.values)) == spec.values
-    default = parse_spec({**SPEC, "section": {"of": "x"}}).section
+    default = Spec.parse({**SPEC, "section": {"of": "x"}}).section
     assert default.model_dump() == {"of": "x", "value": 0.0, "direction": "up", "longest": 100.0}
 
 
 def test_cells__no_frequency():
     """The cube has no drive, the engine gets the longest wait and the level."""
-    spec = parse_spec(SPEC)
+    spec = Spec.parse(SPEC)
     names = [c.name for c in coordinates(spec)]
     assert "frequency" not in names
     plan = make_plan(spec)
@@ -59,14 +59,14 @@ def test_cells__no_frequency():
 
 
 def test_identity__every_key_of_the_section():
-    spec = parse_spec(SPEC)
+    spec = Spec.parse(SPEC)
     for change in ({"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}):
-        other = parse_spec({**SPEC, "section": {**SPEC["section"], **change}})
+        other = Spec.parse({**SPEC, "section": {**SPEC["section"], **change}})
         assert identity_of(spec, make_plan(spec)) != identity_of(other, make_plan(other)), change
 
 
 def test_parse_spec__swept_level():
-    spec = parse_spec({**SPEC, "axes": {"section_value": {"values": [-0.5, 0.5]}}})
+    spec = Spec.parse({**SPEC, "axes": {"section_value": {"values": [-0.5, 0.5]}}})
     inputs = CellMap(spec).inputs((slice(0, 2), slice(0, 1)))
     np.testing.assert_array_equal(inputs.parameters[:, 0, 1], [-0.5, 0.5])
 
@@ -79,7 +79,7 @@ def test_parse_spec__neither_section_nor_frequency():
 
 def test_parse_spec__strobed_flow():
     data = {k: v for k, v in SPEC.items() if k != "section"} | {"parameters": {"frequency_hz": 0.15}}
-    spec = parse_spec(data)
+    spec = Spec.parse(data)
     assert spec.section is None
     assert "frequency" in [c.name for c in coordinates(spec)]
 

@@ -10,21 +10,26 @@ import pytest
 
 import magpend
 from magpend_core.models import load_model
+from pipeline.compute.task import compute
+from pipeline.layout.cells import CellMap
+from pipeline.layout.plan import make_plan
 from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
-from pipeline.specification.parsing import Range, load_spec, parse_spec
+from pipeline.runs.zoom import Changes, read_source, write_zoom
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
+from pipeline.specification.tables import Range
 
 
 def problems_of(text: str) -> list[str]:
     with pytest.raises(SpecError) as caught:
-        parse_spec(tomllib.loads(text))
+        Spec.parse(tomllib.loads(text))
     return caught.value.problems
 
 
 def test_parse_spec__reads_back_what_as_dict_says(sweep_text, walk_text):
     for text in (sweep_text, walk_text):
-        spec = parse_spec(tomllib.loads(text))
-        assert parse_spec(spec.as_dict()) == spec
+        spec = Spec.parse(tomllib.loads(text))
+        assert Spec.parse(spec.as_dict()) == spec
 
 
 def test_parse_spec__all_errors_at_once():
@@ -116,19 +121,19 @@ def test_parse_spec__what_must_be_there(sweep_text, walk_text):
 def test_load_spec__unreadable(tmp_path, write_spec):
     for path, words in [(tmp_path / "absent.toml", "cannot be read"), (write_spec("kind = \n"), "not valid TOML")]:
         with pytest.raises(SpecError) as caught:
-            load_spec(path)
+            Spec.read(path)
         assert len(caught.value.problems) == 1
         assert words in str(caught.value)
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe")
     with pytest.raises(SpecError, match="UTF-8"):
-        load_spec(binary)
+        Spec.read(binary)
 
 
 @pytest.mark.parametrize("form", ["axes.frequency_hz.num = 2", '"axes.frequency_hz.num" = 2'])
 def test_load_spec__smoke_replaces_leaves(write_spec, sweep_text, form):
     path = write_spec(f"{sweep_text}\n[smoke]\n{form}\nintegration.n_transient = 0\n")
-    full, small = load_spec(path), load_spec(path, smoke=True)
+    full, small = Spec.read(path), Spec.read(path, smoke=True)
     assert len(full.axes["frequency_hz"].array()) == 5
     assert small.axes["frequency_hz"].array().tolist() == [2.0, 3.0]
     assert (small.integration.n_transient, small.integration.n_keep) == (0, 3)
@@ -137,7 +142,7 @@ def test_load_spec__smoke_replaces_leaves(write_spec, sweep_text, form):
 def test_load_spec__bad_smoke(write_spec, sweep_text):
     path = write_spec(f"{sweep_text}\n[smoke]\nintegration.n_kep = 0\n")
     with pytest.raises(SpecError, match=r"with \[smoke\]: integration.n_kep.*n_keep"):
-        load_spec(path)
+        Spec.read(path)
 
 
 def test_range__values_are_the_decimals_a_person_would_write():
@@ -158,7 +163,7 @@ def test_spec__degrees_convert_once():
     kind = "list"
     points_deg = [[90, -45], [180, 0, 360, -180]]
     """
-    states = initial_states(parse_spec(tomllib.loads(text)).initial_conditions).at(np.arange(2))
+    states = initial_states(Spec.parse(tomllib.loads(text)).initial_conditions).at(np.arange(2))
     expected = [[math.pi / 2, -math.pi / 4, 0, 0], [math.pi, 0, 2 * math.pi, -math.pi]]
     assert np.allclose(states, expected, rtol=1e-15)
 
@@ -169,9 +174,85 @@ def test_model__as_lines_of_equations():
         f'kind = "sweep"\nmodel = """\n{text}\n"""\nparameters.frequency_hz = 0.2\n'
         'initial_conditions = { kind = "list", points = [[0.1, 0.0]] }\nintegration.n_keep = 2\n'
     )
-    assert parse_spec(tables).model is load_model(magpend.model(text).reference)
+    assert Spec.parse(tables).model is load_model(magpend.model(text).reference)
 
 
 @pytest.mark.parametrize(("given", "used"), [(150, 160), (160, 160), (3, 16)])
 def test_lyapunov__rounds_up_to_whole_blocks(given, used):
     assert LYAPUNOV.settle(LyapunovOptions(n_periods=given), load_model("duffing")).n_periods == used
+
+
+# ---- small runs ------------------------------------------------------------------------------------------
+
+
+def test_smoke__fewest_points_and_starts(write_spec, sweep_text, walk_text):
+    small = Spec.read(write_spec(sweep_text), smoke=True)
+    assert [axis.array().tolist() for axis in small.axes.values()] == [[2.0, 3.0], [1.5, 1.6]]
+    assert make_plan(small).shape == (2, 2, 2, 2)
+    assert small.integration == Spec.read(write_spec(sweep_text)).integration
+    walk = Spec.read(write_spec(walk_text), smoke=True)
+    assert make_plan(walk).n_cells == 2 * 2 * 2  # frequencies, starts, directions
+    rows = sweep_text.replace('kind = "grid"', 'kind = "list"\npoints = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0]]')
+    rows = "\n".join(line for line in rows.splitlines() if not line.startswith("psi"))
+    assert make_plan(Spec.read(write_spec(rows), smoke=True)).shape == (2, 2, 2)
+
+
+def test_smoke__a_refined_grid_and_a_fixed_axis(write_spec, sweep_text):
+    text = sweep_text.replace('kind = "grid"', 'kind = "grid"\nrefine = 2').replace("[1.5, 1.6]", "[1.5]")
+    small = Spec.read(write_spec(text), smoke=True)
+    assert small.refine is None
+    assert make_plan(small).shape == (2, 1, 2, 2)
+
+
+def test_zoom__keeps_the_smoke_table(write_spec, sweep_text, tmp_path):
+    smoke = "[smoke]\naxes.frequency_hz.num = 3\ninitial_conditions.psi1_deg.num = 2\n"
+    source = read_source(write_spec(sweep_text + smoke))
+    assert write_zoom(source, Changes({"frequency_hz": (2.2, 2.4)}), tmp_path / "a.toml") == []
+    assert make_plan(Spec.read(tmp_path / "a.toml", smoke=True)).shape == (3, 2, 2, 4)
+    assert make_plan(Spec.read(tmp_path / "a.toml")).shape == (5, 2, 3, 4)
+    notes = write_zoom(source, Changes({"q": (1.5, 1.55)}, {"frequency_hz": 2.2}), tmp_path / "b.toml")
+    assert any("[smoke]" in note for note in notes)
+    Spec.read(tmp_path / "b.toml", smoke=True)
+
+
+# ---- methods of integration ------------------------------------------------------------------------------
+
+
+def spec_of(method, **more):
+    return Spec.parse(
+        {
+            "kind": "sweep",
+            "model": "duffing",
+            "parameters": {"preset": "hardening", "frequency_hz": 0.2},
+            "initial_conditions": {"kind": "list", "points": [[0.3, 0.1], [-0.2, 0.5]]},
+            "integration": {"method": method, "n_transient": 20, "n_keep": 4, "rtol": 1e-10, "atol": 1e-10},
+            **more,
+        }
+    )
+
+
+def cells_of(spec):
+    cells = CellMap(spec)
+    return compute(spec, cells, tuple(slice(0, n) for n in cells.shape))
+
+
+@pytest.mark.slow
+def test_method__of_order_8_gives_the_same_motion_in_fewer_steps():
+    fifth, eighth = (cells_of(spec_of(m, products={"lyapunov": {}})) for m in ("dopri5", "dop853"))
+    np.testing.assert_allclose(eighth["section"], fifth["section"], atol=1e-6)
+    np.testing.assert_allclose(eighth["lyapunov"], fifth["lyapunov"], atol=1e-3)
+    assert (3 * eighth["n_steps"] < fifth["n_steps"]).all()
+
+
+def test_method__is_one_of_two_and_order_8_goes_with_nothing_that_looks_into_steps():
+    with pytest.raises(SpecError, match=r"integration.method = 'rk4'"):
+        spec_of("rk4")
+    extremes = {"extremes": {"quantities": ["energy"]}}
+    assert spec_of("dopri5", products=extremes).products
+    with pytest.raises(SpecError) as caught:
+        spec_of("dop853", products=extremes)
+    (problem,) = caught.value.problems
+    assert problem == (
+        'integration.method = "dop853": products.extremes looks within steps; drop one of the two, or set '
+        'method = "dopri5".'
+    )

@@ -174,18 +174,11 @@ class File:
 
 @dataclass
 class Disk:
-    """A file system without any order but that of syncs: what is not synced may be there, or not.
+    """A file system without any order but that of syncs: what is not synced may be there, or not."""
 
-    Attributes
-    ----------
-    top : Path
-        A folder that is there from the begin, whose own entry is on the disk.
-    names, kept_names : dict
-        Entries by folder: those that programs see, and those that are on the disk. A file is a `File`; a
-        folder is None.
-    """
-
+    # there from the begin, with its own entry on the disk
     top: Path
+    # entries by folder, as programs see them and as they are on the disk; a folder is None
     names: dict[Path, dict[str, File | None]] = field(default_factory=dict)
     kept_names: dict[Path, dict[str, File | None]] = field(default_factory=dict)
 

@@ -17,12 +17,8 @@ KEY_ID, SECRET = "AKIDOFATEST", "the-secret-of-a-test"
 class Server:
     """moto's S3 behind a layer that counts requests and does harm.
 
-    Attributes
-    ----------
-    harm : callable
-        Takes method, path and the number of the request, and returns what becomes of it: None, ``500``,
-        ``503``, ``409``, ``403`` (answers instead of the server's), ``lost`` (done, and the connection is
-        cut) or ``late`` (done, and answered after `late_s`).
+    `harm` takes method, path and number of a request, and returns None, a code that is answered instead of the
+    server's, ``lost`` (done, and the connection is cut) or ``late`` (done, and answered after `late_s`).
     """
 
     late_s = 1.0

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import random
 import shutil
 from types import SimpleNamespace
 
@@ -18,15 +19,17 @@ import xarray as xr
 
 from pipeline import open_run
 from pipeline.compute import task
+from pipeline.layout.identity import digest_of
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
-from pipeline.store import commits, packing, records
-from pipeline.store.checksums import seal, unseal
+from pipeline.store import commits, products, records
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
+from pipeline.store.objects import open_files
 from pipeline.store.products import write_product
-from pipeline.store.run import Run
-from tests.pipeline.factories import duffing, finished, quietly, silent
+from pipeline.store.run import RunDirectory
+from pipeline.store.stored_json import seal, unseal
+from tests.pipeline.factories import contents, duffing, finished, quietly, silent
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
 PLACES = 20 if LONG else 4
@@ -44,7 +47,7 @@ def values_of(directory):
 def sound(tmp_path_factory):
     """A finished run of two packs, a record of its own and the copy of that, with a product beside it."""
     folder, patch = tmp_path_factory.mktemp("damage"), pytest.MonkeyPatch()
-    for module in (records, commits, packing):
+    for module in (records, commits):
         patch.setattr(module, "BLOCK", 2)
     directory = finished(folder, SPEC)
     names = sorted(f.name for f in (directory / "commits").iterdir())
@@ -264,7 +267,7 @@ CASES = {
     "record of another run": (record_of_another_run, "record"),
     "run.json and a chunk": (run_file_and_chunk, "run.json"),
 }
-MOST_COMPUTED = {"swap chunks": 2, "swap packs": 4, "run.json and a chunk": 1, "foreign file": 0}
+MOST_COMPUTED = {"flip pack": 1, "swap chunks": 2, "swap packs": 4, "run.json and a chunk": 1, "foreign file": 0}
 
 
 # ---- what must hold ----------------------------------------------------------------------------
@@ -299,8 +302,9 @@ def wrong(directory, sound):
     return names
 
 
-def content_of(folder):
-    return {f: f.read_bytes() for f in folder.rglob("*") if f.is_file()} if folder.is_dir() else folder.read_bytes()
+def bytes_at(path):
+    """What is at a path, file or folder."""
+    return contents(path) if path.is_dir() else path.read_bytes() if path.exists() else None
 
 
 @pytest.fixture
@@ -308,10 +312,9 @@ def whole(sound, tmp_path):
     """Copies to damage, one after the other in one place."""
 
     def copy():
-        shutil.rmtree(tmp_path / "run", ignore_errors=True)
-        elsewhere = tmp_path / "elsewhere"
-        if elsewhere.exists():
-            delete(elsewhere, None)
+        for path in (tmp_path / "run", tmp_path / "elsewhere"):
+            if path.exists():
+                delete(path, None)
         return shutil.copytree(sound.run, tmp_path / "run")
 
     return copy
@@ -367,13 +370,13 @@ def mended(directory, case, place, sound, bytes_of, computed):
     """The same command gives the very bytes again, and computes no task that was sound."""
     computed.clear()
     elsewhere = directory.with_name("elsewhere")
-    linked = content_of(elsewhere) if elsewhere.exists() else None
+    linked = bytes_at(elsewhere)
     refusal = None
     try:
         assert run(sound.spec, directory, workers=0, echo=silent).complete
     except RefusedError as error:
         refusal = str(error)
-    assert linked is None or content_of(elsewhere) == linked
+    assert bytes_at(elsewhere) == linked
     if refusal is not None:
         assert case.startswith("link") and "is a link" in refusal, refusal  # noqa: PT018
         return
@@ -422,7 +425,7 @@ def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(wh
     """The record's digest, and the checksum in the chunk, for readers that know no records."""
     directory = whole()
 
-    opened = Run.open(directory)
+    opened = RunDirectory.open(directory)
     chunk = next(path for path in chunks(directory) if path.parent.name == name)
     content = chunk.read_bytes()
     for i in range(20):
@@ -435,3 +438,84 @@ def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(wh
     chunk.unlink()
     with pytest.raises(DamagedError, match=rf"{name}/{chunk.name}: is missing"):
         opened.cube()[name].load()
+
+
+# ---- values of other types, under checksums that fit -------------------------------------------------
+
+FORGED = [7, "12", None, True, [1, "a"], {"a\0b": 1}, float("nan"), -(10**400), [[[]]] * 3]
+
+
+def leaves(data, path=()):
+    """Paths of all values below the top."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        yield (*path, key)
+        if isinstance(value, dict | list):
+            yield from leaves(value, (*path, key))
+
+
+def forged(path, at, value):
+    """The content of a file with another value at a path of its JSON, or of its last line, and checksums that fit."""
+    *body, last = path.read_bytes().splitlines(keepends=True)
+    place = data = json.loads(last if path.suffix == ".jsonl" else path.read_bytes())
+    for key in at[:-1]:
+        place = place[key]
+    place[at[-1]] = value
+    if "derived" in path.parts:  # a result is sealed in its attributes
+        if isinstance(own := data["attributes"], dict) and products.SEAL in own:
+            own[products.SEAL] = products._seal(own, products._digests(open_files(path.parent)))
+        return json.dumps(data).encode()
+    data.pop("checksum", None)
+    with contextlib.suppress(ValueError):  # an identity without a digest: NaN
+        data.update(digest=digest_of(data["identity"]) if "identity" in data else data["digest"])
+    before = b"".join(body) if path.suffix == ".jsonl" else b""
+    return before + seal(json.dumps(data).replace('"NESTED"', "[" * 100_000 + "]" * 100_000), before).encode()
+
+
+def seen(directory):
+    """What commands see: the text of a refusal, or whether the run is sound."""
+    try:
+        state(directory)
+        for product in (directory / "derived").iterdir():
+            products.read_product_attrs(product)
+        return verify_run(directory).sound
+    except (DamagedError, RefusedError) as error:  # anything else is a traceback
+        return str(error)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "key", ["run.json", "commits/000004.json", "commits/000000-000001.jsonl", "derived/mean-12345678.zarr/zarr.json"]
+)
+def test_forged__is_one_error_that_names_the_place_or_nothing_wrong_is_read(key, whole, sound):
+    directory, found = whole(), []
+    path = directory / key
+    content = path.read_bytes()
+    for at in leaves(json.loads(content.splitlines()[-1] if path.suffix == ".jsonl" else content)):
+        for value in random.Random(repr(at)).sample(FORGED, 2):
+            path.write_bytes(forged(path, at, value))
+            found.append(seen(directory))
+            assert found[-1] in (True, False) or str(directory) in found[-1]
+            assert not wrong(directory, sound)
+            path.write_bytes(content)
+    assert len([one for one in found if one is not True]) > len(found) / 4
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named"),
+    [
+        (("title",), 7, "title = 7"),
+        (("skeleton", "zarr.json", "size"), "12", "skeleton.zarr.json.size = '12'"),
+        (("skeleton", "a\0b"), {"size": 1, "sha256": "0" * 64}, "is not the path of a file"),
+        (("spec", "axes"), float("nan"), "axes"),
+        (("versions",), "NESTED", ""),
+    ],
+)
+def test_forged_run_file__the_command_names_what_is_wrong(whole, main, key, value, named):
+    directory = whole()
+    path = directory / "run.json"
+    path.write_bytes(forged(path, key, value))
+    for command in ("status", "verify"):
+        code, _, err = main(command, directory)
+        assert code == 5
+        assert f"{path}: " in err
+        assert named in err

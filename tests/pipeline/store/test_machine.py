@@ -23,17 +23,17 @@ from magpend_core.status import Status
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
-from pipeline.runs.mending import sound_commits
+from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.specification.parsing import load_spec
-from pipeline.store import commits, packing, records
-from pipeline.store.commits import read_commits, write_task
+from pipeline.specification.spec import Spec
+from pipeline.store import commits, records
+from pipeline.store.commits import Packer, pack_block, read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
-from pipeline.store.packing import Packer, pack_block
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
-from tests.pipeline.factories import duffing, finished, silent
+from tests.pipeline.factories import RESULT, duffing, finished, result_of, silent
+from tests.pipeline.store.test_damage import delete, flip, truncate, zero
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
 
@@ -54,17 +54,12 @@ class KilledError(Exception):
     """Stands for SIGKILL."""
 
 
-def bytes_of(run: Path) -> dict[str, bytes]:
-    files = [f for top in ("cube.zarr", "commits") for f in (run / top).rglob("*") if f.is_file()]
-    return {f.relative_to(run).as_posix(): f.read_bytes() for f in files}
-
-
 @cache
 def computed(n: int) -> tuple[dict[str, bytes], xr.Dataset]:
     """Bytes and cube of a run that nothing happens to."""
     with tempfile.TemporaryDirectory(prefix="life-") as folder:
         directory = finished(Path(folder), spec_of(n))
-        return bytes_of(directory), Run.open(directory).cube().load()
+        return result_of(directory, RESULT), RunDirectory.open(directory).cube().load()
 
 
 class Directory:
@@ -74,7 +69,7 @@ class Directory:
         self.path = folder / "run"
         text = spec_of(N_TASKS)
         (folder / "spec.toml").write_text(text)
-        self.spec = load_spec(folder / "spec.toml")
+        self.spec = Spec.read(folder / "spec.toml")
         self.plan = make_plan(self.spec)
         self.identity = identity_of(self.spec, self.plan)
         self.info = create(self.path, self.spec, self.plan, self.identity, text)
@@ -104,7 +99,7 @@ class Life(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.patches = [patch.object(module, "BLOCK", 2) for module in (records, commits, packing)]
+        self.patches = [patch.object(module, "BLOCK", 2) for module in (records, commits)]
         for block in self.patches:
             block.start()
         self.folder = Path(tempfile.mkdtemp(prefix="life-"))
@@ -164,26 +159,18 @@ class Life(RuleBasedStateMachine):
             except KilledError:
                 return
 
-    @rule(seed=SEEDS, way=st.sampled_from(["flip", "cut", "zero", "delete", "swap", "foreign"]))
+    @rule(seed=SEEDS, way=st.sampled_from([flip, truncate, zero, delete, "swap", "foreign"]))
     def damage(self, seed, way):
         """Something happens to a file."""
         rng = np.random.default_rng(seed)
-        files = sorted(f for f in self.run.path.rglob("*") if f.is_file() and f.name != "lock")
-        file = files[int(rng.integers(len(files)))]
-        content = file.read_bytes()
-        if way == "flip" and content:
-            place = int(rng.integers(len(content)))
-            file.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-        elif way == "cut":
-            file.write_bytes(content[: len(content) // 2])
-        elif way == "zero":
-            file.write_bytes(bytes(len(content)))
-        elif way == "delete":
-            file.unlink()
+        files = sorted(f for f in self.run.path.rglob("*") if f.is_file() and f.stat().st_size and f.name != "lock")
+        file, other = (files[int(i)] for i in rng.integers(len(files), size=2))
+        if callable(way):
+            way(file, rng)
         elif way == "swap":
-            other = files[int(rng.integers(len(files)))]
-            file.write_bytes(other.read_bytes())
-            other.write_bytes(content)
+            first, second = file.read_bytes(), other.read_bytes()
+            file.write_bytes(second)
+            other.write_bytes(first)
         else:
             (self.run.path / "cube.zarr/status").mkdir(exist_ok=True, parents=True)
             (self.run.path / "cube.zarr/status/c.77").write_bytes(b"stray")
@@ -207,7 +194,7 @@ class Life(RuleBasedStateMachine):
                 raise
             shutil.rmtree(self.run.path)
             self.run.go_on()
-        assert bytes_of(self.run.path) == self.wanted
+        assert result_of(self.run.path, RESULT) == self.wanted
         found = verify_run(self.run.path)
         assert (found.sound, found.n_committed, found.leftovers) == (True, N_TASKS, [])
         assert state(self.run.path).complete
@@ -222,13 +209,13 @@ class Life(RuleBasedStateMachine):
         except StoreError:  # no cell is there to be taken, or run.json or metadata are not what they were
             self.finish()
             extend(self.run.path, finer, wide, workers=0, echo=silent)
-        assert bytes_of(wide) == computed(N_WIDE)[0]
+        assert result_of(wide, RESULT) == computed(N_WIDE)[0]
         shutil.rmtree(wide)
 
     @invariant()
     def is_read_as_written_or_not_at_all(self):
         try:
-            opened = Run.open(self.run.path)
+            opened = RunDirectory.open(self.run.path)
             cube = opened.cube().load()
         except StoreError:
             return

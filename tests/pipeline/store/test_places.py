@@ -1,71 +1,45 @@
-"""Places that no run may take, disks that fail, set-ups that stopped: nothing is lost without a word."""
+"""Places that no run may take, links, disks that fail, set-ups that stopped: nothing is lost without a word."""
 
 from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
+import platform
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.compute import execute, task
+from pipeline.runs.derive import prune
+from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits, local
-from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, sweep
-from pipeline.store.errors import IncompleteError, RefusedError, UnreadableError
+from pipeline.store.errors import IncompleteError, LockedError, RefusedError, StoreError, UnreadableError
 from pipeline.store.files import RECORD_COPY
-from pipeline.store.run import Run
+from pipeline.store.local import writer_lock
+from pipeline.store.products import open_product
+from pipeline.store.run import RunDirectory, open_run
 from pipeline.store.setup import check, establish
-from pipeline.store.skeleton import skeleton_files
-from tests.pipeline.factories import duffing, finished, quietly, silent
-
-SPEC = duffing(execution="trajectories_per_task = 2", tolerance=1e-5)
-
-
-def everything(directory):
-    """Content of all files below a folder."""
-    files = [f for f in directory.rglob("*") if f.is_file() and f.name != "lock"]
-    return {f.relative_to(directory).as_posix(): f.read_bytes() for f in files}
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("places")
-    finished(folder, SPEC)
-    return folder
-
-
-@pytest.fixture
-def place(sound, tmp_path):
-    """A copy of a finished run, beside its specification."""
-    shutil.copytree(sound, tmp_path, dirs_exist_ok=True)
-    return tmp_path / "run"
-
-
-@pytest.fixture
-def whole(made):
-    """A run directory whose tasks are all committed."""
-    for index in range(made.plan.n_tasks):
-        made.commit(index)
-    return made
-
-
-def establish_again(made, echo=silent):
-    return establish(made.info.directory, made.spec, made.plan, made.identity, made.info.spec_text, echo)
-
+from pipeline.store.stored_json import seal, unseal
+from tests.pipeline.factories import contents, duffing, quietly, silent
 
 # ---- places that no run may take ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("below", ["cube.zarr/new", "commits/new", "new", "cube.zarr", "derived/a/b"])
 def test_run__refuses_a_place_inside_of_another_run(place, below):
-    before = everything(place)
+    before = contents(place)
     with pytest.raises(RefusedError, match=r"lies inside of the run directory .*; give another --out"):
         quietly(place.with_name("spec.toml"), place / below)
-    assert everything(place) == before
+    assert contents(place) == before
 
 
 FOREIGN = {
@@ -98,15 +72,112 @@ def test_check__a_folder_with_a_file_of_somebody_else_stays(made, tmp_path, what
         check(link, made.identity)
 
 
-def test_check__another_run_stays_and_the_difference_is_named(whole):
+def test_check__another_run_stays(whole):
     directory, other = whole.info.directory, {**whole.identity, "versions": {"engine": 1000}}
     assert check(directory, whole.identity) == whole.info
-    with pytest.raises(RefusedError, match=r"versions.engine: \d+ in the directory, 1000 now"):
-        check(directory, other)
     (directory / "run.json").unlink()
     with pytest.raises(RefusedError, match="what another run has left"):
         check(directory, other)
     assert check(directory, whole.identity) is None
+
+
+# ---- links: what they lead to is never touched ---------------------------------------------------
+
+RUN = ("run", "spec.toml", "--out", "run", "--workers", 0)
+VERIFY = ("verify", "--repair", "run")
+EXTEND = ("extend", "run", "--axis", "amplitude=0.2:0.3:5", "--workers", 0)
+PLOT = ("plot", "bifurcation", "run")
+ANALYSE = ("analyse", "attractors", "run", "--no-polish", "--no-extend")
+WRITERS, DRAWERS, ANALYSTS = (RUN, VERIFY, EXTEND), (PLOT,), (ANALYSE,)
+
+PLACES = {
+    "lock": WRITERS,
+    "lock.json": WRITERS,
+    "timings.jsonl": WRITERS,
+    "extended.json": WRITERS,
+    "run.json": (RUN, VERIFY),
+    "commits": WRITERS,
+    "commits/000000.json": WRITERS,
+    "cube.zarr": WRITERS,
+    "cube.zarr/zarr.json": WRITERS,
+    "cube.zarr/section": WRITERS,
+    "cube.zarr/section/zarr.json": WRITERS,
+    "cube.zarr/section/c.0.0.0.0.0": WRITERS,
+    "cube.zarr/x_0/c.0": WRITERS,
+    "figures": DRAWERS,
+    "figures/{figure}.png": DRAWERS,
+    "figures/{figure}.nc": DRAWERS,
+    "derived": ANALYSTS,
+    "derived/{product}": ANALYSTS,
+    "derived/{product}/zarr.json": ANALYSTS,
+}
+
+
+IN_TABLE = ("run.json", "commits", "cube.zarr")
+"""Links from these places to the same content: `test_damage`."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("below", "kind"),
+    [(p, k) for p in PLACES for k in ("same", "dangling") if k == "dangling" or not p.startswith(IN_TABLE)],
+)
+def test_commands__write_through_no_link(place, main, tmp_path, below, kind):
+    commands = PLACES[below]
+    if commands is ANALYSTS:
+        below = below.format(product=next((place / "derived").iterdir()).name)
+    if commands is DRAWERS:
+        assert main(*PLOT)[0] == 0
+        below = below.format(figure=next((place / "figures").iterdir()).stem)
+    elsewhere, path = tmp_path / "elsewhere", place / below
+    outside = elsewhere / "outside"
+    elsewhere.mkdir()
+    if path.exists():
+        path.rename(outside)
+    else:
+        outside.write_text("somebody's\n")
+    if kind == "dangling":
+        shutil.rmtree(outside) if outside.is_dir() else outside.unlink()
+    path.symlink_to(outside)
+    before = contents(elsewhere)
+    for command in commands:
+        code, _, said = main(*command)
+        assert contents(elsewhere) == before, (command, said)
+        assert "Traceback" not in said
+        if path.is_symlink() and command in (RUN, PLOT):
+            assert code == 2, (command, said)
+            assert f"{below}: is a link" in said
+
+
+@pytest.mark.parametrize("what", ["chunk", "chunk later", "zarr.json", "folder", "product file", "product"])
+def test_open_run__links_are_not_followed_out(place, tmp_path, what):
+    """Whatever is behind a link, with the same bytes or not: it is not read as a part of the run."""
+    product, section = next((place / "derived").glob("attractors-*.zarr")), place / "cube.zarr" / "section"
+    paths = {"zarr.json": section / "zarr.json", "folder": section, "product": product}
+    path = (paths | {"product file": product / "zarr.json"}).get(what, section / "c.0.0.0.0.0")
+    opened = open_run(place)
+    path.rename(tmp_path / "outside")
+    path.symlink_to(tmp_path / "outside")
+    if what == "chunk":  # nothing vouches for a link: its cells are pending
+        assert np.isnan(open_run(place).section.values[0]).all()
+        return
+    use = open_run if what in ("zarr.json", "folder") else lambda _: open_product(product)
+    with pytest.raises((StoreError, OSError), match=r"link|is missing"):
+        opened.section.load() if what == "chunk later" else use(place)
+
+
+def test_prune__links_are_not_followed(place, tmp_path):
+    derived, outside = place / "derived", tmp_path / "outside"
+    (outside / "x.zarr").mkdir(parents=True)
+    (outside / "x.zarr/kept").write_text("x")
+    (derived / "mean-1.zarr").symlink_to(outside / "x.zarr")
+    prune(place)
+    assert not (derived / "mean-1.zarr").is_symlink()
+    shutil.rmtree(derived)
+    derived.symlink_to(outside)
+    with pytest.raises(RefusedError, match="derived: is a link"):
+        prune(place)
+    assert (outside / "x.zarr/kept").read_text() == "x"
 
 
 # ---- disks that fail ---------------------------------------------------------------------------
@@ -114,7 +185,7 @@ def test_check__another_run_stays_and_the_difference_is_named(whole):
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.ESTALE])
 def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch, number):
-    before, original = everything(place), local.open_plain
+    before, original = contents(place), local.open_plain
 
     def open_plain(path, mode, **options):
         if path.name == "000001.json":
@@ -122,15 +193,15 @@ def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch
         return original(path, mode, **options)
 
     monkeypatch.setattr(local, "open_plain", open_plain)
-    for use in (Run.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
+    for use in (RunDirectory.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
         with pytest.raises(UnreadableError, match=r"000001\.json: cannot be read .* Nothing was removed"):
             use(place)
-    assert everything(place) == before
+    assert contents(place) == before
 
 
 def test_scan__commits_that_never_stay_the_same_stop(place, monkeypatch):
     """Somebody packs and unpacks for ever: reading ends all the same."""
-    opened, calls = Run.open(place), []
+    opened, calls = RunDirectory.open(place), []
 
     def names(folder):
         calls.append(folder)
@@ -177,7 +248,7 @@ def test_commands__name_what_could_not_be_written(place, main, monkeypatch, comm
 
 @pytest.mark.parametrize("moment", ["before writing", "while writing"])
 def test_run__removed_while_it_goes_on_ends_and_can_be_made_again(sound, tmp_path, monkeypatch, bytes_of, moment):
-    (tmp_path / "spec.toml").write_text(SPEC)
+    shutil.copy(sound / "spec.toml", tmp_path)
     write_task, write_block, done = task.write_task, commits.write_block, []
 
     def writing_task(info, plan, index, *rest):
@@ -214,8 +285,8 @@ def test_run__ends_only_if_every_task_is_committed_here(place, main, monkeypatch
         (place.with_name("losing") / marker_key(2)).unlink()
 
     for function, words in (
-        (elsewhere, "4 of 4 tasks were computed but are not committed here"),
-        (losing, "1 of 4 .*the first is 2"),
+        (elsewhere, "3 of 3 tasks were computed but are not committed here"),
+        (losing, "1 of 3 .*the first is 2"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(execute, "run_tasks", function)
@@ -239,27 +310,16 @@ def test_sweep__removes_and_names_what_no_record_vouches_for_and_nothing_else(wh
     for name in ("derived/kept.txt", "figures/kept.txt"):
         (directory / name).parent.mkdir()
         (directory / name).write_text("x")
-    before = everything(directory)
+    before = contents(directory)
     (directory / "cube.zarr/section/c.0.0.abc.partial").write_bytes(b"x")
     (directory / "cube.zarr/status/c.link").symlink_to(outside / "kept")
     (directory / "cube.zarr/status/folder").symlink_to(outside)
     leftovers = ["section/c.0.0.abc.partial", "status/c.link", "status/folder"]
     assert verify_run(directory).leftovers == leftovers
-    found = read_commits(whole.info, whole.plan)
-    assert sweep(whole.info, whole.plan, found, said.append) == 3
+    assert sweep(whole.info, whole.plan, read_commits(whole.info, whole.plan), said.append) == 3
     assert "removed 3 files that no commit record vouches for: cube.zarr/" in said[0]
-    assert everything(directory) == before
+    assert contents(directory) == before
     assert (outside / "kept").read_text() == "x"
-    (directory / marker_key(1)).write_text("{")
-    chunk = next((directory / "cube.zarr/section").glob("c.0.*"))
-    chunk.unlink()
-    said.clear()
-    commits_left = read_commits(whole.info, whole.plan, said.append)
-    assert set(commits_left) == set(range(whole.plan.n_tasks)) - {0, 1}
-    assert "commits/000001.json: torn or damaged; it does not count" in said
-    assert any("is missing or has another size; it is computed again" in line for line in said)
-    assert sweep(whole.info, whole.plan, commits_left) > 0
-    assert sweep(whole.info, whole.plan, commits_left) == 0
 
 
 @pytest.mark.slow
@@ -272,17 +332,87 @@ def test_rebuild__files_worded_by_another_version(whole):
     found = verify_run(directory, repair=True)
     assert found.skeleton == ["q/zarr.json: its content has changed"]
     assert "another version" in describe(found, directory, repaired=True)[-1]
-    establish_again(whole)
+    establish(directory, whole.spec, whole.plan, whole.identity, whole.info.spec_text, silent)
     assert verify_run(directory).sound
-    assert len(Run.open(directory).commits) == whole.plan.n_tasks
+    assert len(RunDirectory.open(directory).commits) == whole.plan.n_tasks
 
 
-def test_skeleton_files__hold_nothing_of_this_machine_or_moment(made):
-    one, same, other = (
-        skeleton_files(made.spec, made.plan, made.identity, text, "title") for text in ("text", "text", "other")
-    )
-    assert one == same
-    assert {key for key in other if other[key] != one[key]} == {"zarr.json"}
+# ---- two coordinators in one directory -------------------------------------------------------------------
 
 
-# ---- other readers -----------------------------------------------------------------------------
+TWENTY = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 20 }",
+    'kind = "grid"\nx = 0.5\nv = 0.1',
+    execution="trajectories_per_task = 1",
+)
+
+WITHOUT_LOCKS = """
+import sys, time, warnings
+import filelock
+from pipeline.runs.run import run
+def broken(self, *arguments, **options):
+    raise NotImplementedError("no locks here")
+filelock.FileLock.acquire = broken
+warnings.simplefilter("ignore")
+spec, out, start = sys.argv[1:]
+while time.time() < float(start):
+    time.sleep(0.01)
+assert run(spec, out, workers=0, echo=lambda line: None).complete
+"""
+
+
+def _hold(directory, ready, done):
+    with writer_lock(directory):
+        ready.set()
+        done.wait(60)
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds the lock of a directory."""
+    context = multiprocessing.get_context("spawn")
+    ready, done = context.Event(), context.Event()
+    process = context.Process(target=_hold, args=(tmp_path, ready, done))
+    process.start()
+    assert ready.wait(60)
+    yield process
+    process.kill()
+    process.join()
+
+
+@pytest.mark.slow
+def test_writer_lock__names_its_holder_and_frees_a_killed_one(holder, tmp_path):
+    with pytest.raises(LockedError) as caught, writer_lock(tmp_path):
+        pass
+    said = str(caught.value)
+    assert f"(process {holder.pid} on {platform.node()} since 20" in said
+    assert "Wait for it or stop it" in said
+    holder.kill()
+    holder.join()
+    with writer_lock(tmp_path) as alone:  # at once: it waits for nobody
+        assert alone
+        assert json.loads((tmp_path / "lock.json").read_text())["pid"] == os.getpid()
+    assert not (tmp_path / "lock.json").exists()
+
+
+@pytest.mark.slow
+def test_writer_lock__holder_unknown(holder, tmp_path):
+    for text in ("", "{", '{"pid": "x"}', "[]"):
+        (tmp_path / "lock.json").write_text(text)
+        with pytest.raises(LockedError, match=r"is writing here\. Wait"), writer_lock(tmp_path):
+            pass
+
+
+@pytest.mark.slow
+def test_run__two_without_locks_end_with_the_same_bytes(write_spec, tmp_path, environment, bytes_of):
+    spec = write_spec(TWENTY)
+    quietly(spec, tmp_path / "alone")
+    # once the imports are done, both begin at the same moment
+    arguments = [sys.executable, "-c", WITHOUT_LOCKS, str(spec), str(tmp_path / "both"), str(time.time() + 6)]
+    both = [subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    errors = [process.communicate(timeout=200)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], errors
+    assert state(tmp_path / "both").complete
+    found = verify_run(tmp_path / "both")
+    assert (found.sound, found.leftovers) == (True, [])
+    assert bytes_of(tmp_path / "both") == bytes_of(tmp_path / "alone")

@@ -139,21 +139,11 @@ def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Section points of one set, to test whether other trajectories lie on the same set.
+    """Section points of one set, to test whether other trajectories lie on the same set."""
 
-    Attributes
-    ----------
-    points : ndarray, (n, state)
-        Section points of its trajectories.
-    geometry : Geometry
-        Geometry of the states.
-    least : float
-        Smallest spacing of points to assume.
-    """
-
-    points: np.ndarray
-    geometry: Geometry
-    least: float
+    points: np.ndarray  # (n, state): section points of its trajectories
+    geometry: Geometry  # geometry of the states
+    least: float  # smallest spacing of points to assume
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:

@@ -15,40 +15,19 @@ ON_SET, FAILED, DIVERGED, AT_REST = -1, -2, -3, -4
 
 @dataclass
 class Course:
-    """A trajectory of the run that is integrated further, with its old and its new section points.
+    """A trajectory of the run that is integrated further, with its old and its new section points."""
 
-    Attributes
-    ----------
-    cell : int
-        Its place among the cells of the point.
-    key : int
-        Box of its last kept section.
-    kept : ndarray, (n, state)
-        Sections that the run kept.
-    state, step
-        State (state,) and step size [s] with which the integration continues.
-    legs : list of ndarray
-        Sections of the extension, leg by leg.
-    end : int
-        Number of an orbit, or one of the codes above.
-    periods : float
-        Drive periods or returns from its last kept section until it came near its end.
-    is_leaving : bool
-        Whether it was near its end from the start.
-    is_neighbour : bool
-        Whether it was drawn beside a cell, and is none itself.
-    """
-
-    cell: int
-    key: int
-    kept: np.ndarray
+    cell: int  # its place among the cells of the point
+    key: int  # box of its last kept section
+    kept: np.ndarray  # (n, state): sections that the run kept
+    # state (state,) and step size [s] with which the integration continues
     state: np.ndarray
     step: float = 0.0
-    legs: list[np.ndarray] = field(default_factory=list)
-    end: int = ON_SET
-    periods: float = 0.0
-    is_leaving: bool = False
-    is_neighbour: bool = False
+    legs: list[np.ndarray] = field(default_factory=list)  # sections of the extension, leg by leg
+    end: int = ON_SET  # number of an orbit, or one of the codes above
+    periods: float = 0.0  # drive periods or returns from its last kept section until it came near its end
+    is_leaving: bool = False  # whether it was near its end from the start
+    is_neighbour: bool = False  # whether it was drawn beside a cell, and is none itself
 
     @property
     def goes_on(self) -> bool:

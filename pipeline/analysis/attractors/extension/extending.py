@@ -20,19 +20,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, left_behind, were_on
+from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, is_one_torus, left_behind, were_on
 from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
-from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
-from pipeline.analysis.attractors.extension.tori import is_one_torus
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.equilibria import approaching, rest_near, rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Work
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Work
 from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
+from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import REACH
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET, NEUTRAL, NOT_SETTLED
@@ -68,27 +67,13 @@ LOOK_BACK = 4
 
 @dataclass
 class Outcome:
-    """Result of the further integration of the trajectories of one parameter point.
+    """Result of the further integration of the trajectories of one parameter point."""
 
-    Attributes
-    ----------
-    orbits : list of Orbit
-        Known orbits, old and new.
-    courses : list of Course
-        Sampled cells.
-    sets : list of BoundedSet
-        Sets that do not close.
-    spent : int
-        Periods integrated.
-    ran_out : bool
-        Whether the budget ended the work.
-    """
-
-    orbits: list[Orbit]
-    courses: list[Course]
-    sets: list[BoundedSet]
-    spent: int = 0
-    ran_out: bool = False
+    orbits: list[Orbit]  # known orbits, old and new
+    courses: list[Course]  # sampled cells
+    sets: list[BoundedSet]  # sets that do not close
+    spent: int = 0  # periods integrated
+    ran_out: bool = False  # whether the budget ended the work
 
 
 def extend(
@@ -251,7 +236,7 @@ class _Extension:
             least = min(course.length for course in going)
             going = [course for course in going if course.length == least]
             states, steps = np.array([c.state for c in going]), np.array([c.step for c in going])
-            leg: Extended = yield Leg(states, steps, self.spent / self.budget)
+            leg = yield Leg(states, steps, self.spent / self.budget)
             self.spent += LEG * len(going)
             yield from self._take(going, leg)
 
@@ -270,11 +255,12 @@ class _Extension:
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
-    def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
+    def _take(self, going: Sequence[Course], leg: Block) -> Work[None]:
         """Record the newly integrated section points of each trajectory. Finish the trajectories that reached an orbit
         or an equilibrium.
         """
         computed = (leg.status == Status.PERIODIC) | (leg.status == Status.BOUNDED)
+        assert leg.step is not None
         for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
             course.state, course.step = state, float(step)
             if ok:
@@ -284,7 +270,7 @@ class _Extension:
         rows = np.flatnonzero(computed)
         if not len(rows):
             return
-        block = Block(slice(0, 0), leg.section[rows], leg.status[rows], leg.orbit_period[rows], leg.turns[rows])
+        block = leg.take(rows)
         own = [going[i] for i in rows.tolist()]
         n = len(own[0].legs)
         if n.bit_count() == 1 or n % SEARCH_EACH == 0:
@@ -293,8 +279,8 @@ class _Extension:
         for course, number in zip(own, label.tolist(), strict=True):
             if number >= 0 and self.orbits[number].is_stable:
                 self._leave(course, number)
-        self._rest(own, leg.section[rows], leg.seconds[rows])
-        self._leap(own, leg.section[rows])
+        self._rest(own, block)
+        self._leap(own, block.section)
 
     def _fail(self, course: Course, status: int) -> None:
         course.periods = float(course.length)
@@ -343,13 +329,15 @@ class _Extension:
         course.end, course.periods = number, float(max(entered - len(course.kept), 0))
         course.is_leaving = entered <= len(course.kept)
 
-    def _rest(self, own: Sequence[Course], section: np.ndarray, seconds: np.ndarray) -> None:
+    def _rest(self, own: Sequence[Course], leg: Block) -> None:
         if not self.point.can_rest:
             return
+        assert leg.seconds is not None
         going = [i for i, course in enumerate(own) if course.goes_on]
         if not going:
             return
-        number = approaching(self.point, section[going], seconds[going], self.settings.closure, self.geometry)
+        section, seconds = leg.section[going], leg.seconds[going]
+        number = approaching(self.point, section, seconds, self.settings.closure, self.geometry)
         for i, k in zip(going, number.tolist(), strict=True):
             if k >= 0:
                 own[i].end, own[i].periods = AT_REST - k, float(own[i].length)

@@ -54,33 +54,20 @@ an interval around 0 counts as 0."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Lyapunov exponents of the section map on a set, per iteration of this map.
+    """Lyapunov exponents of the section map on a set, per iteration of this map."""
 
-    Attributes
-    ----------
-    rate, low, high : float
-        Largest exponent that is not 0 by construction, and its interval.
-    weighted : float
-        Weighted Birkhoff average of this exponent, from the cell with the largest modulus.
-    weighted_error : float
-        Largest difference between the averages of the two halves of a cell.
-    volume, volume_error : float
-        Mean change of the logarithm of a volume along the flow, and its standard error (`_mean`).
-    length : int
-        Number of sections of each cell.
-    n_zero : int
-        Number of exponents that are 0 within their interval, those that are 0 by construction included; -1 unless all
-        others are negative beyond doubt.
-    """
-
+    # largest exponent that is not 0 by construction, and its interval
     rate: float
     low: float
     high: float
-    weighted: float
-    weighted_error: float
+    weighted: float  # weighted Birkhoff average of this exponent, from the cell with the largest modulus
+    weighted_error: float  # largest difference between the averages of the two halves of a cell
+    # mean change of the logarithm of a volume along the flow, and its standard error (`_mean`)
     volume: float
     volume_error: float
-    length: int
+    length: int  # number of sections of each cell
+    # number of exponents that are 0 within their interval, those that are 0 by construction included; -1 unless all
+    # others are negative beyond doubt
     n_zero: int
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -13,42 +13,34 @@ from pipeline.analysis.sets import Geometry, groups, hashes
 
 @dataclass(frozen=True)
 class Block:
-    """Some cells (trajectories) of one parameter point, with their section points and status.
+    """Some cells (trajectories) of one parameter point, with their section points and status."""
 
-    Attributes
-    ----------
-    cells : slice
-        Their places among all cells of the point.
-    section : ndarray, (cell, period_index, state)
-    status, orbit_period : ndarray, (cell,)
-    turns : ndarray, (cell, angle)
-    rest : ndarray, (cell, state), or None
-        States in which cells waited in vain for a return, if sections are crossings of a flow.
-    seconds : ndarray, (cell, period_index), or None
-        Time from the previous section to each [s].
-    step : ndarray, (cell,), or None
-        Step size that continues each cell bit for bit from its last section [s].
-    known_marks : ndarray of uint64, (cell,), or None
-        Hashes of the cells' sections, if they were computed before.
-    """
-
-    cells: slice
-    section: np.ndarray
+    cells: slice  # their places among all cells of the point
+    section: np.ndarray  # (cell, period_index, state)
+    # (cell,)
     status: np.ndarray
     orbit_period: np.ndarray
-    turns: np.ndarray
+    turns: np.ndarray  # (cell, angle)
+    # (cell, state): states in which cells waited in vain for a return, if sections are crossings of a flow
     rest: np.ndarray | None = None
-    seconds: np.ndarray | None = None
-    step: np.ndarray | None = None
+    seconds: np.ndarray | None = None  # (cell, period_index): time from the previous section to each [s]
+    step: np.ndarray | None = None  # (cell,): step size that continues each cell bit for bit from its last section [s]
+    # uint64, (cell,): hashes of the cells' sections, if they were computed before
     known_marks: np.ndarray | None = None
 
-    def take(self, rows: np.ndarray) -> Block:
+    def take(self, rows: np.ndarray | slice) -> Block:
         """Return a block of the cells at the given indices. Its attribute `cells` is still the range of the whole
         block.
         """
-        marks = None if self.known_marks is None else self.known_marks[rows]
-        section, status, period = self.section[rows], self.status[rows], self.orbit_period[rows]
-        return Block(self.cells, section, status, period, self.turns[rows], known_marks=marks)
+        arrays = {f.name: value for f in fields(self)[1:] if (value := getattr(self, f.name)) is not None}
+        return Block(self.cells, **{name: array[rows] for name, array in arrays.items()})
+
+    @property
+    def state(self) -> np.ndarray:
+        """State with which each cell goes on, (cell, state); NaN if it cannot."""
+        if self.rest is None:
+            return self.section[:, -1]
+        return np.where((self.status == Status.NO_RETURN)[:, None], self.rest, self.section[:, -1])
 
     @cached_property
     def marks(self) -> np.ndarray:
@@ -76,27 +68,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Guesses:
-    """Starting guesses for closed orbits, each from the best cell of one box of section points.
+    """Starting guesses for closed orbits, each from the best cell of one box of section points."""
 
-    Attributes
-    ----------
-    key : ndarray of uint64
-        The box.
-    score : ndarray
-        Smaller is better.
-    mark : ndarray of uint64
-        Hash of the cell's own sections; decides between equal scores.
-    point : ndarray, (n, state)
-        Last section point.
-    period : ndarray of int64
-        Period; 0 if unknown, and then the point is integrated further until it closes.
-    """
-
-    key: np.ndarray
-    score: np.ndarray
-    mark: np.ndarray
-    point: np.ndarray
-    period: np.ndarray
+    key: np.ndarray  # the box
+    score: np.ndarray  # smaller is better
+    mark: np.ndarray  # hash of the cell's own sections; decides between equal scores
+    point: np.ndarray  # (n, state): last section point
+    period: np.ndarray  # period; 0 if unknown, and then the point is integrated further until it closes
 
     @classmethod
     def none(cls, n_states: int) -> Guesses:

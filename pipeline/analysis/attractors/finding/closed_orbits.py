@@ -40,32 +40,17 @@ RUN_ON_PERIODS = 2000
 
 @dataclass(frozen=True)
 class Orbit:
-    """A closed orbit at one parameter point, by its section points and its multipliers.
+    """A closed orbit at one parameter point, by its section points and its multipliers."""
 
-    Attributes
-    ----------
-    points : ndarray, (period, state)
-        Section points in the order of time, the least one (rounded, scaled, lexicographic) first.
-    multipliers : ndarray of complex, (state,)
-        NaN if not polished.
-    residual : float
-        Residual of `polish_orbits`; NaN if not polished.
-    derivative : ndarray, (state, state)
-        Monodromy matrix at the first point; NaN if not polished.
-    seconds : float
-        Period [s]; NaN if not polished.
-    approached_within : float
-        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
-    sizes : tuple of float
-        Units of the states in which errors of the monodromy matrix are estimated; empty for 1.
-    """
-
+    # (period, state): section points in the order of time, the least one (rounded, scaled, lexicographic) first
     points: np.ndarray
-    multipliers: np.ndarray
-    residual: float
-    derivative: np.ndarray
-    seconds: float = np.nan
+    multipliers: np.ndarray  # complex, (state,): NaN if not polished
+    residual: float  # residual of `polish_orbits`; NaN if not polished
+    derivative: np.ndarray  # (state, state): monodromy matrix at the first point; NaN if not polished
+    seconds: float = np.nan  # period [s]; NaN if not polished
+    # scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen
     approached_within: float = 0.0
+    # units of the states in which errors of the monodromy matrix are estimated; empty for 1
     sizes: tuple[float, ...] = ()
 
     @property

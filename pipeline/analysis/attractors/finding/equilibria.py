@@ -15,8 +15,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from magpend_core.equilibria import find_equilibria, newton_steps
-from magpend_core.natural import natural_size
 from magpend_core.sections import run_branches
+from magpend_core.sizes import natural_size
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point

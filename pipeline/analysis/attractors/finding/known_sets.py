@@ -16,32 +16,17 @@ from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """An equilibrium of a flow: a state at which the rate of change is zero.
+    """An equilibrium of a flow: a state at which the rate of change is zero."""
 
-    Attributes
-    ----------
-    state : ndarray, (state,)
-    eigenvalues : ndarray of complex, (state,)
-        Eigenvalues of the Jacobian [1/s], by falling real part.
-    residual : float
-        Scaled length of the last Newton step.
-    jacobian : ndarray, (state, state)
-        Jacobian in units of the scales [1/s].
-    approached_within : float
-        Scaled distance from which trajectories came nearer; 0 if not tried or not seen.
-    rate : float
-        Order of magnitude of the flow's rates [1/s]; the Jacobian of a degenerate equilibrium may vanish.
-    side : ndarray, (state,), or None
-        If trajectories came nearer on one side only and left on the other: the scaled covector that is 1 on the unit
-        vector towards that side.
-    """
-
-    state: np.ndarray
-    eigenvalues: np.ndarray
-    residual: float
-    jacobian: np.ndarray
-    approached_within: float = 0.0
+    state: np.ndarray  # (state,)
+    eigenvalues: np.ndarray  # complex, (state,): eigenvalues of the Jacobian [1/s], by falling real part
+    residual: float  # scaled length of the last Newton step
+    jacobian: np.ndarray  # (state, state): Jacobian in units of the scales [1/s]
+    approached_within: float = 0.0  # scaled distance from which trajectories came nearer; 0 if not tried or not seen
+    # order of magnitude of the flow's rates [1/s]; the Jacobian of a degenerate equilibrium may vanish
     rate: float = 1.0
+    # (state,): if trajectories came nearer on one side only and left on the other: the scaled covector that is 1 on
+    # the unit vector towards that side
     side: np.ndarray | None = None
 
     @cached_property
@@ -131,27 +116,13 @@ class Equilibrium:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A stable limit cycle of a flow, by one of its states, its period and its multipliers.
+    """A stable limit cycle of a flow, by one of its states, its period and its multipliers."""
 
-    Attributes
-    ----------
-    state : ndarray, (state,)
-        Polished state at which the cycle crosses a level upwards.
-    crossed : int
-        Index of the state variable that crosses the level there.
-    seconds : float
-        Period [s].
-    multipliers : ndarray of complex, (state,)
-        Floquet multipliers by falling modulus; the first is 1, along the flow.
-    residual : float
-        Residual of `polish_orbits`.
-    """
-
-    state: np.ndarray
-    crossed: int
-    seconds: float
-    multipliers: np.ndarray
-    residual: float
+    state: np.ndarray  # (state,): polished state at which the cycle crosses a level upwards
+    crossed: int  # index of the state variable that crosses the level there
+    seconds: float  # period [s]
+    multipliers: np.ndarray  # complex, (state,): Floquet multipliers by falling modulus; the first is 1, along the flow
+    residual: float  # residual of `polish_orbits`
 
     @property
     def error(self) -> float:

@@ -19,7 +19,7 @@ from pipeline.analysis.attractors.extension.growth import volumes_of
 from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
+from pipeline.layout.vocabulary import FREQUENCY_DIM, START, frequency_of, model_of, parameters_of, split_dims
 from pipeline.products.reporting import UNTOLD, report
 
 _READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
@@ -37,25 +37,14 @@ BUDGET = 256 * 2**20
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Model, parameters and compiled system of the cells of a run's result cube.
+    """Model, parameters and compiled system of the cells of a run's result cube."""
 
-    Attributes
-    ----------
-    model : Model or None
-        None if another system was given.
-    parameters : Parameters, ndarray or None
-        Parameters of the run; swept values are replaced at each point. A packed vector if another system was
-        given. None if nothing is integrated.
-    system : System or None
-        None if nothing is integrated, since a system imports the compiler.
-    geometry : Geometry
-        Geometry of the states.
-    """
-
-    model: Model | None
+    model: Model | None  # None if another system was given
+    # parameters of the run; swept values are replaced at each point. A packed vector if another system was given.
+    # None if nothing is integrated.
     parameters: Parameters | np.ndarray | None
-    system: System | None
-    geometry: Geometry
+    system: System | None  # None if nothing is integrated, since a system imports the compiler
+    geometry: Geometry  # geometry of the states
 
     @classmethod
     def of(
@@ -105,56 +94,32 @@ class Dynamics:
 
 @dataclass
 class Point:
-    """One parameter point: its cells (trajectories), its parameters and its system.
+    """One parameter point: its cells (trajectories), its parameters and its system."""
 
-    Attributes
-    ----------
-    cube, at : Dataset, Mapping
-        Cells of some parameter points, and the indices of this point among them.
-    parameters : Parameters or None
-        Parameters with the swept values of this point; None for a system without a model.
-    packed : ndarray
-        Packed parameter vector for the engine.
-    frequency : float
-        Drive frequency [Hz]; for a flow seen at crossings, one over the longest wait for a return.
-    system : System or None
-        System to integrate.
-    equilibria : list of Equilibrium
-        Equilibria that cells are at, see `equilibria.tell_rest`.
-    at_rest : ndarray, (cell,), or None
-        Index of the equilibrium that each cell is at, -1 for none. Cells at rest count as neither closed nor
-        bounded.
-    cycles : list of Cycle
-        Limit cycles that cells are on, for a flow sampled at equal times; see `limit_cycles.tell_cycles`.
-    on_cycle : ndarray, (cell,), or None
-        Index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
-        nor bounded.
-    n_periods : int
-        Drive periods or returns that the run integrated here, summed over cells.
-    is_flow : bool
-        Whether sections are crossings of a flow.
-    can_rest : bool
-        Whether equilibria are searched.
-    arrays : dict
-        Variables of all cells, shapes (cell, ...), if they fit the memory; else they are read from the cube.
-    """
-
+    # cells of some parameter points, and the indices of this point among them
     cube: xr.Dataset
     at: Mapping[str, int]
     start_dims: tuple[str, ...]
-    frequency: float
-    packed: np.ndarray
-    parameters: Parameters | None
+    frequency: float  # drive frequency [Hz]; for a flow seen at crossings, one over the longest wait for a return
+    packed: np.ndarray  # packed parameter vector for the engine
+    parameters: Parameters | None  # parameters with the swept values of this point; None for a system without a model
     n_angles: int
     block_cells: int
-    system: System | None = None
+    system: System | None = None  # system to integrate
+    # equilibria that cells are at, see `equilibria.tell_rest`
     equilibria: list[Equilibrium] = field(default_factory=list)
+    # (cell,): index of the equilibrium that each cell is at, -1 for none. Cells at rest count as neither closed nor
+    # bounded.
     at_rest: np.ndarray | None = None
+    # limit cycles that cells are on, for a flow sampled at equal times; see `limit_cycles.tell_cycles`
     cycles: list[Cycle] = field(default_factory=list)
+    # (cell,): index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
+    # nor bounded.
     on_cycle: np.ndarray | None = None
-    n_periods: int = 0
-    is_flow: bool = False
-    can_rest: bool = False
+    n_periods: int = 0  # drive periods or returns that the run integrated here, summed over cells
+    is_flow: bool = False  # whether sections are crossings of a flow
+    can_rest: bool = False  # whether equilibria are searched
+    # variables of all cells, shapes (cell, ...), if they fit the memory; else they are read from the cube
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
     _whole: Block | None = None
 
@@ -190,6 +155,23 @@ class Point:
     def n_states(self) -> int:
         """Number of state variables."""
         return int(self.cube.sizes["state"])
+
+    def holding(self, block: Block, n_periods: int = 0) -> Point:
+        """Return this parameter point with the trajectories of a block as its cells."""
+        n, n_kept = block.section.shape[:2]
+        seconds = np.full((n, n_kept), 1.0 / self.frequency) if block.seconds is None else block.seconds
+        return replace(
+            self,
+            cube=xr.Dataset({"section": ((START, "period_index", "state"), block.section)}),
+            at={},
+            arrays={},
+            start_dims=(START,),
+            block_cells=n,
+            at_rest=None,
+            on_cycle=None,
+            n_periods=n_periods,
+            _whole=replace(block, cells=slice(0, n), seconds=seconds),
+        )
 
     def blocks(self) -> Iterator[Block]:
         """Yield all cells in blocks, in the order of their initial conditions (or branches, in a continuation).

@@ -16,7 +16,7 @@ import numpy as np
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
-from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Work
+from pipeline.analysis.attractors.finding.requests import LEG, Leg, Work
 from pipeline.analysis.sets import Geometry
 
 DISTANCES = (0.05, 0.01)
@@ -86,7 +86,7 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
     """
     step, before = np.zeros(len(state)), np.full(len(state), np.inf)
     for _ in range(LEGS):
-        leg: Extended = yield Leg(state, step)
+        leg = yield Leg(state, step)
         waits = leg.status == Status.NO_RETURN
         if not (np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED)) | waits).all():
             return False
@@ -107,7 +107,7 @@ def _leaves(state: np.ndarray, point: np.ndarray, size: float, geometry: Geometr
     """
     step = np.zeros(len(state))
     for _ in range(LEGS):
-        leg: Extended = yield Leg(state, step)
+        leg = yield Leg(state, step)
         if (leg.status == Status.DIVERGED).all():
             return True
         waits = leg.status == Status.NO_RETURN

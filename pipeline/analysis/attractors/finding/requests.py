@@ -16,10 +16,10 @@ import xarray as xr
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
-from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.finding.cell_blocks import Guesses
+from pipeline.analysis.attractors.finding.cell_blocks import Block, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.flight import Flight
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.analysis.together import run_together
 from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
@@ -31,45 +31,21 @@ FINDING, EXTENDING = "finding attractors", "extending cells"
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
 
-
 MOST_SLOPES = 16_384
 """Most derivatives of the section map in one call of the engine."""
 
 
 @dataclass(frozen=True)
 class Leg:
-    """Request to integrate trajectories over some more sections, from states (n, state) with step sizes (n,).
+    """Request to integrate trajectories over `LEG` more sections, from states (n, state) with step sizes (n,).
 
-    With a step size of 0 the engine chooses the step. `spent` is the part of the point's budget that is spent.
+    With a step size of 0 the engine chooses the step. `spent` is the part of the point's budget that is spent. The
+    answer is a `Block` of the new sections; its `state` and `step` continue the trajectories bit for bit.
     """
 
     state: np.ndarray
     step: np.ndarray
     spent: float = 0.0
-
-
-@dataclass(frozen=True)
-class Extended:
-    """Answer to a `Leg` request: section points, status and final states of the trajectories.
-
-    Attributes
-    ----------
-    section : ndarray, (n, LEG, state)
-    status, orbit_period : ndarray, (n,)
-    turns : ndarray, (n, angle)
-    state, step : ndarray
-        State (n, state) and step size (n,) that continue the trajectory bit for bit.
-    seconds : ndarray, (n, LEG)
-        Time from the previous section to each [s].
-    """
-
-    section: np.ndarray
-    status: np.ndarray
-    orbit_period: np.ndarray
-    turns: np.ndarray
-    state: np.ndarray
-    step: np.ndarray
-    seconds: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -101,42 +77,20 @@ Work = Generator[Request, Any, T]
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings with which trajectories of a run are integrated further: tolerances, limits, system and method.
+    """Settings with which trajectories of a run are integrated further: tolerances, limits, system and method."""
 
-    Attributes
-    ----------
-    rtol, atol : float
-        Tolerances of the run.
-    max_steps : int
-        Most steps per period.
-    closure : float
-        Scaled distance at which extended cells count as closed.
-    longest : int
-        Longest orbit period in the search.
-    residual : float
-        Scaled residual that Newton's method is to reach.
-    seen : int
-        Drive periods or returns for which the run integrated a cell.
-    system : System or None
-        System to integrate.
-    method : str
-        Integration method of the run, also used for legs.
-    geometry : Geometry
-        Geometry of the states.
-    known : dict
-        Orbits that were polished before, see `closed_orbits.polish`.
-    """
-
+    # tolerances of the run
     rtol: float
     atol: float
-    max_steps: int
-    closure: float
-    longest: int
-    residual: float
-    seen: int
-    system: System | None
-    method: str
-    geometry: Geometry
+    max_steps: int  # most steps per period
+    closure: float  # scaled distance at which extended cells count as closed
+    longest: int  # longest orbit period in the search
+    residual: float  # scaled residual that Newton's method is to reach
+    seen: int  # drive periods or returns for which the run integrated a cell
+    system: System | None  # system to integrate
+    method: str  # integration method of the run, also used for legs
+    geometry: Geometry  # geometry of the states
+    # orbits that were polished before, see `closed_orbits.polish`
     known: dict[bytes, Orbit | None] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -154,6 +108,30 @@ class Settings:
             method=method,
             geometry=geometry,
             **asked,
+        )
+
+    def fly(
+        self,
+        packed: np.ndarray,
+        frequency: np.ndarray | float,
+        states: np.ndarray,
+        most: int = LEG,
+        step: np.ndarray | None = None,
+    ) -> Flight:
+        """Return trajectories that are integrated as those of the run; see `Flight`."""
+        assert self.system is not None
+        return Flight(
+            replace(self.system, method=self.method),
+            packed,
+            frequency,
+            states,
+            rtol=self.rtol,
+            atol=self.atol,
+            max_steps=self.max_steps,
+            closure=self.closure,
+            longest=self.longest,
+            most=most,
+            step=step,
         )
 
 
@@ -198,39 +176,12 @@ def _gathered(
 
 def _legs(
     asked: Mapping[tuple[int, ...], Leg], points: Mapping[tuple[int, ...], Point], settings: Settings
-) -> dict[tuple[int, ...], Extended]:
-    assert settings.system is not None
+) -> dict[tuple[int, ...], Block]:
     sizes = [len(leg.state) for leg in asked.values()]
     packed, frequency, ends = _gathered(sizes, asked, points)
-    found = run_branches(
-        packed[:, None],
-        frequency[:, None],
-        np.concatenate([leg.state for leg in asked.values()]),
-        n_transient=0,
-        n_keep=LEG,
-        rtol=settings.rtol,
-        atol=settings.atol,
-        max_steps_per_period=settings.max_steps,
-        closure_tolerance=settings.closure,
-        max_orbit_period=settings.longest,
-        system=replace(settings.system, method=settings.method),
-        step_size=np.concatenate([leg.step for leg in asked.values()]),
-    )
-    seconds = np.broadcast_to(1.0 / frequency[:, None], (len(frequency), LEG))
-    if found.return_time is not None:
-        seconds = found.return_time[:, 0]
-    return {
-        index: Extended(
-            found.section[own, 0],
-            found.status[own, 0],
-            found.orbit_period[own, 0],
-            found.turns[own, 0],
-            found.final_state[own, 0],
-            np.nan_to_num(found.step_size[own, 0]),
-            seconds[own],
-        )
-        for index, own in _slices(asked, sizes, ends)
-    }
+    state, step = (np.concatenate([getattr(leg, name) for leg in asked.values()]) for name in ("state", "step"))
+    found = settings.fly(packed, frequency, state, step=step).advance(LEG)
+    return {index: found.take(own) for index, own in _slices(asked, sizes, ends)}
 
 
 def _slices(

@@ -28,24 +28,12 @@ ROUNDS, ROUNDS_LOOSE = 3, 6
 
 @dataclass(frozen=True)
 class Search:
-    """Options of the search for attractors, with the dynamics and the settings of the run.
+    """Options of the search for attractors, with the dynamics and the settings of the run."""
 
-    Attributes
-    ----------
-    options : IdentifyOptions
-        Options of `identify`.
-    tolerance : float
-        Tolerance of the options, or the default that follows from the run.
-    dynamics : Dynamics
-        Model, parameters and system.
-    settings : Settings
-        Settings by which trajectories are extended.
-    """
-
-    options: IdentifyOptions
-    tolerance: float
-    dynamics: Dynamics
-    settings: Settings
+    options: IdentifyOptions  # options of `identify`
+    tolerance: float  # tolerance of the options, or the default that follows from the run
+    dynamics: Dynamics  # model, parameters and system
+    settings: Settings  # settings by which trajectories are extended
 
     @property
     def geometry(self) -> Geometry:
@@ -70,25 +58,14 @@ class Search:
 
 @dataclass
 class State:
-    """Result of the search for orbits at one parameter point, before its cells are labelled.
+    """Result of the search for orbits at one parameter point, before its cells are labelled."""
 
-    Attributes
-    ----------
-    orbits : list of Orbit
-        Orbits, those of the last rounds last.
-    keys, group : ndarray
-        Keys of the boxes of closed cells, and the group of each box.
-    closed : ClosedCells
-        Closed cells by group.
-    ends : dict
-        Index of the orbit that a closed cell reached after further integration, by the cell's mark.
-    """
-
-    orbits: list[Orbit]
+    orbits: list[Orbit]  # orbits, those of the last rounds last
+    # keys of the boxes of closed cells, and the group of each box
     keys: np.ndarray
     group: np.ndarray
-    closed: ClosedCells
-    ends: dict[int, int]
+    closed: ClosedCells  # closed cells by group
+    ends: dict[int, int]  # index of the orbit that a closed cell reached after further integration, by the cell's mark
 
 
 def search_orbits(point: Point, search: Search) -> Work[State]:

@@ -52,24 +52,14 @@ map that allows it, in units of the growth."""
 
 @dataclass(frozen=True)
 class Recurrence:
-    """Recurrence of each cell's section points: after how many periods, how closely, and about which centre.
+    """Recurrence of each cell's section points: after how many periods, how closely, and about which centre."""
 
-    Attributes
-    ----------
-    period : ndarray of int64, (cell,)
-        Period after which the younger half of the sections recurs within `NEAR`; 0 if there is none.
-    lag : ndarray, (cell,)
-        Distance of the last section from that one period before; infinite without a period.
-    centred : ndarray of int64, (cell,)
-        Period at which sections contract to the mean of their phase; 0 if there is none.
-    centre : ndarray, (cell, state)
-        Mean of the last section's phase over the last part.
-    """
-
+    # int64, (cell,): period after which the younger half of the sections recurs within `NEAR`; 0 if there is none
     period: np.ndarray
-    lag: np.ndarray
+    lag: np.ndarray  # (cell,): distance of the last section from that one period before; infinite without a period
+    # int64, (cell,): period at which sections contract to the mean of their phase; 0 if there is none
     centred: np.ndarray
-    centre: np.ndarray
+    centre: np.ndarray  # (cell, state): mean of the last section's phase over the last part
 
     @classmethod
     def of(cls, section: np.ndarray, max_period: int, geometry: Geometry) -> Recurrence:

@@ -1,4 +1,4 @@
-// What both kinds of copies share: objects of data by name, packed as pipeline/explorer/copies/packing.py packs them.
+// What both kinds of copies share: objects of data by name, packed as pipeline/explorer/data/arrays.py does.
 
 import { unpackArrays } from "./arrays.js";
 
@@ -21,7 +21,7 @@ function joined(planes, dtype, length) {
 
 /**
  * Read an object of arrays.
- * @param {ArrayBuffer} buffer as `packed` of pipeline/explorer/copies/packing.py has made it, decompressed
+ * @param {ArrayBuffer} buffer as `pack_zipped` of pipeline/explorer/data/arrays.py has made it, decompressed
  * @returns {{attrs: Object, arrays: Object<string, TypedArray>, shapes: Object<string, number[]>}}
  */
 export function unpackData(buffer) {

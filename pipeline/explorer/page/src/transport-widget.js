@@ -1,5 +1,5 @@
 // How requests and messages travel in a notebook: as custom messages of the widget's model, answered by the kernel
-// (pipeline/explorer/notebook/connection.py lists them). Several outputs share a model, so messages name their page.
+// (pipeline/explorer/connection.py lists them). Several outputs share a model, so messages name their page.
 
 import { SourceError } from "./source-error.js";
 

@@ -13,7 +13,7 @@ export class ServerTransport {
   }
 
   /**
-   * Ask for an answer of pipeline/explorer/serving/answers.py.
+   * Ask for an answer of pipeline/explorer/answers.py.
    * @param {string} name
    * @param {Object<string, string>} words arguments by name
    * @param {string|null} [body]

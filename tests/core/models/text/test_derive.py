@@ -15,16 +15,12 @@ from hypothesis import strategies as st
 from magpend_core import evaluate, sections
 from magpend_core.engine.plain_python import plain
 from magpend_core.models import ModelError
-from magpend_core.models.text import graph, read_model
+from magpend_core.models.text import graph
 from magpend_core.models.text.grammar import FUNCTIONS, parse
 from magpend_core.models.text.numeric import value_of
+from tests.core.flows import model_of
 
 FREQUENCY = 0.7
-
-
-def model_of(equations, parameters=None, **more):
-    states = {name: "1" for name in equations}
-    return read_model({"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more})
 
 
 def model_with_value(text):
@@ -81,6 +77,14 @@ def plain_jacobian(model, state, t=0.3, **values):
 
 
 PARAMETERS = {"a": 0.6, "b": -1.7}
+
+
+def known_at(x, v, t=0.3):
+    """All that a text may name, at a state and a time."""
+    return {"x": x, "v": v, "t": t, "f": FREQUENCY, "phase": t * FREQUENCY, "pi": math.pi, **PARAMETERS}
+
+
+SMOOTH_FUNCTIONS = ("sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh")
 LEAVES = ["x", "v", "a", "b", "t", "phase", "f", "2", "0.5", "1", "0"]
 
 
@@ -90,9 +94,7 @@ def joined(inner):
         st.tuples(inner, st.sampled_from(["2", "3", "5", "-1", "0.5", "-2", "1.5"])).map(
             lambda p: f"({p[0]})**({p[1]})"
         ),
-        st.tuples(st.sampled_from(["sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh"]), inner).map(
-            lambda p: f"{p[0]}({p[1]})"
-        ),
+        st.tuples(st.sampled_from(SMOOTH_FUNCTIONS), inner).map(lambda p: f"{p[0]}({p[1]})"),
         inner.map(lambda text: f"(-{text})"),
     )
 
@@ -117,8 +119,7 @@ CORNERED = st.recursive(
 @given(SMOOTH, st.floats(0.1, 2.0), st.floats(-2.0, 2.0))
 def test_rates__are_what_the_text_says(text, x, v):
     model = model_with_value(text)
-    names = {"x": x, "v": v, "t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, "pi": math.pi, **PARAMETERS}
-    wanted = float(value_of(parse(text), names))
+    wanted = float(value_of(parse(text), known_at(x, v)))
     found = plain_rates(model, (x, v))
     # parts that cancel leave rounding errors of their own size
     if math.isfinite(wanted) and abs(wanted) < 1e10 and np.isfinite(found).all():
@@ -130,7 +131,7 @@ def test_rates__are_what_the_text_says(text, x, v):
 @given(CORNERED, st.floats(0.11, 2.0), st.floats(-2.0, 2.0))
 def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
     model = model_with_value(text)
-    names = {"x": x, "v": v, "t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, "pi": math.pi, **PARAMETERS}
+    names = known_at(x, v)
     wanted = float(value_of(parse(text), names))
     nearby = [float(value_of(parse(text), {**names, "x": x + d, "v": v - 0.7 * d})) for d in (-1e-7, 1e-7)]
     close = [abs(n - wanted) < 1e-4 * (1.0 + abs(wanted)) for n in nearby]
@@ -180,8 +181,7 @@ def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
 def test_rates__on_either_side_of_a_corner(text):
     model = model_of({"x": "v", "v": text}, PARAMETERS)
     for x, v, t in itertools.product((-0.9, -0.2, 0.3, 1.1), (-1.0, -0.15, 0.25, 0.8), (0.05, 0.3, 0.9)):
-        names = {"x": x, "v": v, "t": t, "f": FREQUENCY, "phase": t * FREQUENCY, "pi": math.pi, **PARAMETERS}
-        wanted = float(value_of(parse(text), names))
+        wanted = float(value_of(parse(text), known_at(x, v, t)))
         assert plain_rates(model, (x, v), t)[1] == pytest.approx(wanted, rel=1e-14, abs=1e-14), (x, v, t)
 
 
@@ -191,11 +191,8 @@ def test_jacobian__is_sympys_derivative(text):
     x, v = 0.83, -0.57
     model = model_of({"x": text, "v": "x*v"}, PARAMETERS)
     symbols = sympy.symbols("x v")
-    scope = {
-        name: getattr(sympy, name) for name in ("sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh")
-    }
-    known = {"t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, **PARAMETERS}
-    expression = sympy.sympify(text, locals={**scope, "x": symbols[0], "v": symbols[1], **known})
+    scope = {name: getattr(sympy, name) for name in SMOOTH_FUNCTIONS}
+    expression = sympy.sympify(text, locals={**scope, **known_at(*symbols)})
     wanted = []
     for symbol in symbols:
         slope = sympy.diff(expression, symbol).subs(dict(zip(symbols, (x, v), strict=True)))
@@ -282,7 +279,7 @@ def test_functions__are_the_same_bits_alone_and_among_others(functions):
         np.testing.assert_array_equal(alone[0].view(np.uint64), together[i].view(np.uint64))
 
 
-def test_forcing__is_the_largest_part_that_is_one_number():
+def test_forcing__is_the_largest_part_that_is_one_number(monkeypatch):
     one = model_of({"x": "v", "v": "a + b*cos(2*pi*f*t) - x"}, PARAMETERS).derived.forcing
     assert one.op == "add"
     scaled = model_of({"x": "v + a*cos(2*pi*f*t)", "v": "b*x*cos(2*pi*f*t)"}, PARAMETERS).derived.forcing
@@ -294,18 +291,11 @@ def test_forcing__is_the_largest_part_that_is_one_number():
     ).derived.forcing  # a recording takes the place of what is called the drive
     assert preferred.op == "held"
     assert preferred.args[0].args[0].is_number(2.0)
-
-
-def test_system__refuses_a_drive_without_the_period():
     model = model_of({"x": "cos(2*t) - x*sin(3*t)"})
     with pytest.raises(ValueError, match="differs between time 0 and 1/frequency"):
         sections(model.load(), [1.0], [[0.5]], n_transient=0, n_keep=1)
-
-
-def test_graph__refuses_what_grows_without_end(monkeypatch):
     define = {"a0": "sin(x*v)"} | {f"a{i}": f"sin(a{i - 1}*x)*cos(a{i - 1}*v)" for i in range(1, 120)}
-    states = "".join(chr(ord("A") + i) for i in range(20))
-    equations = {"x": "a119", "v": "a119", **{s: f"a119*{s}" for s in states}}
+    equations = {"x": "a119", "v": "a119", **{s: f"a119*{s}" for s in "ABCDEFGHIJKLMNOPQRST"}}
     model = model_of(equations, define=define)
     monkeypatch.setattr(graph, "MAX_NODES", 2000)
     with pytest.raises(ModelError, match="more than 2000 parts; simplify them"):

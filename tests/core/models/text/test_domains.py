@@ -1,28 +1,20 @@
 """Where a text has no value: the innermost part, why, and at which numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from magpend_core.models import load_model
 from magpend_core.models.text.domains import domain_faults, readable
 from magpend_core.models.text.grammar import parse, parse_condition
 from magpend_core.models.text.numeric import value_of
+from tests.core.flows import model_of
 
 
 def faults(rate, define=None, **values):
-    table = {
-        "name": "probe",
-        "states": {"x": "1", "v": "1"},
-        "parameters": {"k": 1.0, "g": 2.0, "z": 0.0},
-        "define": define or {},
-        "equations": {"x": "v", "v": rate},
-    }
+    model = model_of({"x": "v", "v": rate}, {"k": 1.0, "g": 2.0, "z": 0.0}, define=define or {})
     given = {"x": 0.0, "v": 0.0, "k": 1.0, "g": 2.0, "z": 0.0, "t": 0.0, "f": 1.0, "phase": 0.0, **values}
     n = max(np.size(v) for v in given.values())
     columns = {name: np.broadcast_to(np.asarray(v, float), n) for name, v in given.items()}
-    return domain_faults(load_model(table).definition, columns)
+    return domain_faults(model.definition, columns)
 
 
 @pytest.mark.parametrize(
@@ -65,52 +57,39 @@ def test_domain_faults__constant_parts_count_in_every_branch(rate, part, why):
     assert fault.values == ({"z": 0.0} if "z" in part else {})
 
 
-@pytest.mark.parametrize("rate", ["where(z > 0, v/z, v)", "where(z > 0, log(z), 1)*v", "where(not z < 1, 1/z, x)"])
-def test_domain_faults__none_behind_a_guard_without_a_state(rate):
-    assert faults(rate) == []
-
-
 def test_domain_faults__impacts_and_quantities():
-    table = {
-        "name": "probe",
-        "states": {"x": "1", "v": "1"},
-        "parameters": {"d": 0.0},
-        "define": {"g": "1/d"},
-        "equations": {"x": "v", "v": "-x"},
-        "quantities": {"q": "x*sqrt(-1)"},
-        "impacts": [{"of": "x - log(d)", "direction": "up", "set": {"v": "-v*g"}}],
-    }
+    impacts = [{"of": "x - log(d)", "direction": "up", "set": {"v": "-v*g"}}]
+    more = {"define": {"g": "1/d"}, "quantities": {"q": "x*sqrt(-1)"}, "impacts": impacts}
+    model = model_of({"x": "v", "v": "-x"}, {"d": 0.0}, **more)
     zeros = dict.fromkeys(("x", "v", "d", "t", "f", "phase"), np.zeros(1))
-    found = domain_faults(load_model(table).definition, zeros)
+    found = domain_faults(model.definition, zeros)
     assert [(f.place, f.part) for f in found] == [
         ("define.g", "1/d"),
         ("impacts[0].of", "log(d)"),
         ("quantities.q", "sqrt(-1)"),
     ]
-
-
-@pytest.mark.parametrize("rate", ["k + x", "where(x > 0, 1/x, 0)", "where(x > 0, log(x), -x)", "atan2(v, x)"])
-def test_domain_faults__none_where_every_part_that_counts_has_a_value(rate):
-    assert faults(rate, x=[0.0, -1.0, 2.0]) == []
-
-
-def test_domain_faults__branch_that_is_taken_counts():
-    (fault,) = faults("where(x > 0, 1/(x - 1), 0)", x=[-1.0, 0.0, 1.0, 2.0])
-    assert (fault.row, fault.count) == (2, 1)
-
-
-def test_domain_faults__branch_that_is_not_taken_does_not_count_beside_a_fault():
-    (fault,) = faults("1/x + where(x > 0, log(x), 0)")
-    assert fault.why == "division by 0"
-
-
-def test_domain_faults__definition_is_told_once_and_at_its_place():
     (fault,) = faults("r*k + r", {"r": "1/x", "unused": "log(-1)"}, x=[1.0, 0.0, 0.0])
     assert fault.place == "define.r"
     assert (fault.row, fault.count, fault.values) == (1, 2, {"x": 0.0})
 
 
-def test_domain_faults__all_at_once():
+@pytest.mark.parametrize(
+    "rate",
+    [
+        *("k + x", "where(x > 0, 1/x, 0)", "where(x > 0, log(x), -x)", "atan2(v, x)"),
+        # behind a guard without a state
+        *("where(z > 0, v/z, v)", "where(z > 0, log(z), 1)*v", "where(not z < 1, 1/z, x)"),
+    ],
+)
+def test_domain_faults__none_where_every_part_that_counts_has_a_value(rate):
+    assert faults(rate, x=[0.0, -1.0, 2.0]) == []
+
+
+def test_domain_faults__of_branches_and_of_several_parts():
+    (fault,) = faults("where(x > 0, 1/(x - 1), 0)", x=[-1.0, 0.0, 1.0, 2.0])
+    assert (fault.row, fault.count) == (2, 1)
+    (fault,) = faults("1/x + where(x > 0, log(x), 0)")
+    assert fault.why == "division by 0"
     found = faults("1/x + log(v - 1)")
     assert [f.why for f in found] == ["division by 0", "logarithm of -1"]
 

@@ -141,26 +141,17 @@ def test_parse__names_unknown_functions_after_a_wrong_sign(text):
     assert second.startswith("unknown function 'sine'")
 
 
-def test_parse_condition__wants_a_condition():
-    assert bool(value_of(parse_condition("x < 1 and not y > 0"), VALUES))
-    with pytest.raises(GrammarError, match="must be a condition"):
-        parse_condition("x")
-
-
-def test_parse__reads_long_sums_without_depth():
+def test_parse__long_sums_conditions_and_names():
     text = "+".join(["x*y"] * 1900)
     assert len(parse(text).args) == 1900
     assert value(text) == pytest.approx(1900 * 0.7 * -1.3)
-
-
-def test_names__come_with_their_places():
     assert list(names(parse("x + sin(w1*x)"))) == [("x", 1), ("w1", 9), ("x", 12)]
-
-
-def test_name_problem__bars_what_expressions_mean_already():
     assert name_problem("omega_0") is None
     for name in ("sin", "t", "pi", "lambda", "and", "_x", "2x", "a b", "ω", "x" * 50, "", 3, None):
         assert name_problem(name), name
+    assert bool(value_of(parse_condition("x < 1 and not y > 0"), VALUES))
+    with pytest.raises(GrammarError, match="must be a condition"):
+        parse_condition("x")
 
 
 EXPRESSION = st.recursive(

@@ -1,4 +1,4 @@
-"""Steep places, corners and jumps: what is found, and what the engine then does with it."""
+"""Steep places, corners and jumps: what is found, what the engine is told, and what it then does with it."""
 
 import dataclasses
 import itertools
@@ -7,20 +7,14 @@ import math
 import mpmath
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from magpend_core import jacobian, load_model, rates, sections
 from magpend_core.engine.plain_python import plain
 from magpend_core.engine.variational import with_tangents
-from magpend_core.models.text import read_model
-from magpend_core.sections import run_branches
+from tests.core.cells import run_cells, scipy_end
+from tests.core.flows import model_of
 
 KEPT = {"n_transient": 0, "n_keep": 1, "rtol": 1e-10, "atol": 1e-10}
-
-
-def model_of(equations, parameters=None, **more):
-    states = {name: "1" for name in equations}
-    return read_model({"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more})
 
 
 def declared(model, y, frequency=1.7, **values):
@@ -102,13 +96,11 @@ def test_layers__may_move_with_time(shaken):
     assert value == pytest.approx(0.5 - math.cos(omega * 0.7))
     assert rate == pytest.approx(-0.2 + omega * math.sin(omega * 0.7))
     assert width == pytest.approx(1 / 2e3)
-    y0 = np.random.default_rng(2).normal(size=(8, 2))
-    packed = np.tile(shaken.load().pack(), (8, 1, 1))
-    keywords = {"n_transient": 6, "n_keep": 1, "rtol": 1e-8, "atol": 1e-8}
-    found = [
-        run_branches(packed, np.full((8, 1), 0.4), y0, **keywords, system=s)
-        for s in (system, dataclasses.replace(system, name="hidden", has_layers=False))
-    ]
+    y0, hidden = (
+        np.random.default_rng(2).normal(size=(8, 2)),
+        dataclasses.replace(system, name="hidden", has_layers=False),
+    )
+    found = [run_cells(s, shaken.load().pack(), 0.4, y0, n_transient=6) for s in (system, hidden)]
     np.testing.assert_allclose(found[0].section, found[1].section, atol=1e-5)
     with_layer, without = (int(f.n_rejected.sum()) for f in found)
     assert with_layer < 0.2 * without
@@ -117,19 +109,12 @@ def test_layers__may_move_with_time(shaken):
 @pytest.mark.slow
 def test_layers__that_move_with_time_carry_tangents(shaken):
     extended = with_tangents(shaken.system, 2)
-    start = np.array([[0.3, 0.2]])
-    whole = np.concatenate([start, np.eye(2).reshape(1, 4)], axis=1)
-    keywords = {"n_transient": 0, "n_keep": 1, "rtol": 1e-10, "atol": 1e-10}
-    packed, frequency = shaken.load(k=50.0).pack()[None, None], np.full((1, 1), 0.4)
-    carried = run_branches(packed, frequency, whole, **keywords, system=extended).section[0, 0, 0, 2:]
-    h = 1e-5
-    for k, direction in enumerate(np.eye(2)):
-        ends = [
-            run_branches(packed, frequency, start + s * h * direction, **keywords, system=shaken.system).section
-            for s in (1.0, -1.0)
-        ]
-        slope = (ends[0] - ends[1])[0, 0, 0] / (2.0 * h)
-        np.testing.assert_allclose(carried[2 * k : 2 * k + 2], slope, atol=1e-5)
+    start, packed, h = np.array([0.3, 0.2]), shaken.load(k=50.0).pack(), 1e-5
+    whole = [[*start, 1.0, 0.0, 0.0, 1.0]]
+    carried = run_cells(extended, packed, 0.4, whole, rtol=1e-10).section[0, 0, 0, 2:].reshape(2, 2)
+    steps = h * np.array([[1.0, 0.0], [0.0, 1.0]])
+    ends = run_cells(shaken.system, packed, 0.4, [*(start + steps), *(start - steps)], rtol=1e-10).section[:, 0, 0]
+    np.testing.assert_allclose(carried, (ends[:2] - ends[2:]) / (2.0 * h), atol=1e-5)
 
 
 def test_edges__of_a_smooth_wave_are_its_zeros():
@@ -206,10 +191,7 @@ def test_sawtooth__jumps_where_the_period_begins(jumping):
     for _ in range(3):
         wanted = 0.5 * (2.0 - 1.0) + (wanted + 0.5) * math.exp(-2.0)
     assert found.section[0, 0, 0] == pytest.approx(wanted, abs=1e-9)
-
-
-def test_system__with_time_in_two_numbers_runs(jumping):
-    """x' = -x + cos(wt) + x sin(wt) by an exact integrating factor on a fine grid."""
+    # x' = -x + cos(wt) + x sin(wt) by an exact integrating factor on a fine grid
     assert jumping.derived.forcing.op == "time"
     found = sections(jumping.load(tones=1.0), [1.0], [[0.5]], n_transient=0, n_keep=1, rtol=1e-11, atol=1e-11)
     with mpmath.workdps(20):
@@ -222,17 +204,7 @@ def test_system__with_time_in_two_numbers_runs(jumping):
     assert found.section[0, 0, 0] == pytest.approx(float(wanted), abs=1e-10)
 
 
-def test_square__of_what_has_no_known_edges_is_told_as_missed():
-    assert model_of({"x": "square(a*t*f, 0.5) - x"}, {"a": 2.0}).derived.missed == ("square",)
-
-
 # ---- corners and jumps on the state ----------------------------------------------------------------
-
-
-def by_scipy(function, y0, end):
-    """Independent: short stretches of DOP853, which finds the corners by its step control."""
-    found = solve_ivp(function, (0.0, end), y0, method="DOP853", rtol=1e-12, atol=1e-13, max_step=2e-3)
-    return found.y[:, -1]
 
 
 CORNERS = {
@@ -267,25 +239,26 @@ def test_corners__are_stepped_on(text, cornered):
     weight = {f"p{list(CORNERS).index(text)}": 1.0}
     found = sections(cornered.load(**weight), [0.2], [[0.5, -0.3, 1.0, 0.0, 0.0]], **KEPT)
     omega = 2 * math.pi * 0.2
-    wanted = by_scipy(
-        lambda t, y: [y[1], math.cos(omega * t) - 0.1 * y[1] - y[0] - CORNERS[text](y[0])], [0.5, -0.3], 5.0
-    )
+
+    def rates(t, y):
+        return [y[1], math.cos(omega * t) - 0.1 * y[1] - y[0] - CORNERS[text](y[0])]
+
+    # independent: short stretches of DOP853, which finds the corners by its step control
+    wanted = scipy_end(rates, [0.5, -0.3], 5.0, max_step=2e-3)
     np.testing.assert_allclose(found.section[0, 0, :2], wanted, atol=3e-5 if "or" in text else 2e-7)
     # no corner is found by trial: hardly a step is rejected but to land
     assert found.n_rejected[0] < 60
 
 
-def test_corner__in_a_narrow_layer_of_the_same_argument_is_left_to_the_layer():
+def test_switches__are_one_where_they_can_be():
+    derived = model_of({"x": "v", "v": "-sign(v) - abs(-v) - max(2*v, 0) + where(v < 0, 1, 2)"}).derived
+    assert len(derived.switches) == 1
+    assert derived.sliding.slides == (True,)
     narrow = model_of({"x": "v", "v": "-atan(1000*v)*exp(-abs(v)) - x"}).derived
     assert (len(narrow.layers), len(narrow.switches)) == (1, 0)
     wide = model_of({"x": "v", "v": "-atan(v)*exp(-abs(v)) - x"}).derived
     assert (len(wide.layers), len(wide.switches)) == (1, 1)
-
-
-def test_switch__is_one_for_all_that_turns_at_the_same_place():
-    derived = model_of({"x": "v", "v": "-sign(v) - abs(-v) - max(2*v, 0) + where(v < 0, 1, 2)"}).derived
-    assert len(derived.switches) == 1
-    assert derived.sliding.slides == (True,)
+    assert model_of({"x": "square(a*t*f, 0.5) - x"}, {"a": 2.0}).derived.missed == ("square",)
 
 
 @pytest.fixture(scope="module")
@@ -398,3 +371,42 @@ def test_sections__of_a_text_are_the_same_bits_alone_and_among_others(name, requ
     if name == "cornered":  # one engine more
         watched = sections(parameters, frequency, y0, quantities=["x"], **keywords)
         np.testing.assert_array_equal(watched.section, together.section)
+
+
+# ---- what the engine is told: whether layers fade; quotients by roots without divisions
+
+
+def oscillator(force):
+    return model_of({"x": "v", "v": force}, {"k": 1e3, "e": 0.01})
+
+
+@pytest.mark.parametrize(
+    ("force", "fades"),
+    [
+        ("-x - tanh(k*v)", True),
+        ("-x - 1/(1 + exp(-k*v))", True),
+        ("-x - atan(k*v)", False),
+        ("-x - v/sqrt(v**2 + e**2)", False),
+        ("-x - tanh(k*v) - atan(k*x)", False),
+    ],
+)
+def test_system_of__layers_fade_if_all_of_them_do(force, fades):
+    system = oscillator(force).system
+    assert system.has_layers
+    assert system.layers_fade is fades
+
+
+def test_source__quotients_by_roots_have_no_divisions():
+    force = "-x/(1 + v**2)**1.5 - v/sqrt(2 + x**2) + (3 + x*x)**-2.5 + 2/(4 + x*x)**2.5"
+    model = oscillator(force)
+    rhs = model.source.text.split("def rhs")[1].split("def ")[0]
+    assert rhs.count("inverse_sqrt") == 4
+    assert " / " not in rhs
+    assert "sqrt(" not in rhs.replace("inverse_sqrt(", "")
+    states = np.random.default_rng(0).uniform(-2.0, 2.0, (50, 2))
+    x, v = states.T
+    wanted = -x / (1 + v**2) ** 1.5 - v / np.sqrt(2 + x**2) + (3 + x * x) ** -2.5 + 2 / (4 + x * x) ** 2.5
+    # a handful of roundings
+    assert np.allclose(rates(0.0, states, model.load(), 1.0)[:, 1], wanted, rtol=5e-15, atol=1e-15)
+    model = oscillator("-x/sqrt(x**2)")
+    assert not np.isfinite(rates(0.0, [[0.0, 1.0]], model.load(), 1.0)[0, 1])

@@ -1,7 +1,5 @@
 """A model from lines of equations is the model that the same TOML text gives."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -38,13 +36,13 @@ def test_read_lines__gives_the_table_of_the_same_model():
     assert lines.table == table
     assert load_model(lines.table).digest == load_model(TABLE).digest
     assert load_model(lines.table) is load_model(table)
-
-
-def test_read_lines__of_a_dict():
     by_state = read_lines({"x": "v", "v": "-x"}, {})
     assert by_state.judged() == []
     assert by_state.table == read_lines("x' = v\nv' = -x", {}).table
     assert read_lines({"x''": "-x"}, {}).table == read_lines("x'' = -x", {}).table
+    table = read_lines("a'' = -a + b\nb' = -b\nc''' = -c''", {"states": {"c": "rad"}}).table
+    assert table["states"] == {"a": "1", "b": "1", "c": "rad", "a_dot": "1", "c_dot": "rad/s", "c_ddot": "rad/s2"}
+    assert table["equations"]["c_ddot"] == "-c_ddot"
 
 
 @pytest.mark.parametrize("equations", ["x'' = -d*x' - x", {"x''": "-d*x' - x"}], ids=["lines", "primed key"])
@@ -57,12 +55,6 @@ def test_load_model__reads_primes_in_a_table(equations):
     assert model is load_model({**table, **renamed})
     with pytest.raises(ModelError, match=r"'dd' .*did you mean d"):
         load_model(json.loads(json.dumps(table).replace("-d*", "-dd*")))
-
-
-def test_read_lines__puts_positions_before_their_rates():
-    table = read_lines("a'' = -a + b\nb' = -b\nc''' = -c''", {"states": {"c": "rad"}}).table
-    assert table["states"] == {"a": "1", "b": "1", "c": "rad", "a_dot": "1", "c_dot": "rad/s", "c_ddot": "rad/s2"}
-    assert table["equations"]["c_ddot"] == "-c_ddot"
 
 
 @pytest.mark.parametrize(
@@ -91,9 +83,6 @@ def test_read_lines__names_line_key_and_remedy(text, values, expected):
 def test_read_lines__reports_all_problems_at_once():
     found = problems("x' = v + gama\nv' -x\nz' = -z + delt", mu="big")
     assert len(found) == 4, found
-
-
-def test_is_equations__tells_equations_from_toml():
     assert is_equations("x' = -x")
     assert is_equations("a = 2\n x ″ = -x")
     assert not is_equations("name = \"x'\"\n[states]\nx = 'm'")

@@ -75,9 +75,6 @@ def test_read_model__fills_in_what_a_short_text_leaves_out():
     assert model.preset().provenance["d"]
     assert not model.autonomous
     assert model.text == DUFFING == model.reference
-
-
-def test_read_model__keeps_all_that_a_long_text_says():
     model = read_model(PENDULUM)
     assert (model.title, model.name) == ("a pendulum", "pendulum1")
     assert model.is_angle == (True, False)
@@ -104,6 +101,13 @@ def test_drawing__places_points_by_the_text():
     np.testing.assert_array_equal(model.drawing.fixed(model.load())["pivot"], [0.0, 0.0])
     assert model.drawing.lines == (("pivot", "bob"),)
     assert (model.drawing.trace, model.drawing.unit) == ("bob", "m")
+    classifier = read_model(PENDULUM).classifier
+    section = np.zeros((3, 4, 2))
+    section[0, :, 0], section[1, :, 0], section[2, :, 0] = -0.5, [0.1, 3.0, 1.0, 2.0], [0.1, -0.1, 0.2, 0.3]
+    codes = classifier.classify(section, np.zeros((3, 1)), np.ones(3), dict(read_model(PENDULUM).load()))
+    assert classifier.words == ("unknown", "left", "right", "mixed")
+    assert codes.dtype == np.int8
+    assert [classifier.words[c] for c in codes] == ["left", "right", "mixed"]
 
 
 @pytest.mark.parametrize(
@@ -114,24 +118,11 @@ def test_mirror__must_be_one_of_the_equations(signs, half_period, wrong):
     table = changed(PENDULUM, "mirror", value={"signs": signs, "half_period": half_period})
     (problem,) = problems_of(table)
     assert f"model.mirror: the rate of {wrong} at a state" in problem
-
-
-def test_mirror__may_hold_nearly():
-    """That of a square wave with a duty cycle of 0.4927, in the pendulum as text."""
+    # That of a square wave with a duty cycle of 0.4927, in the pendulum as text
     table = {**load_model("pendulum-text").definition.table, "name": "a"}
     names = ("psi1", "psi2", "psi1_dot", "psi2_dot")
     table["mirror"] = {"signs": dict.fromkeys(names, -1), "half_period": True}
     assert read_model(table).mirror == Mirror((-1, -1, -1, -1), True)
-
-
-def test_classifier__calls_what_stays_by_its_word():
-    classifier = read_model(PENDULUM).classifier
-    section = np.zeros((3, 4, 2))
-    section[0, :, 0], section[1, :, 0], section[2, :, 0] = -0.5, [0.1, 3.0, 1.0, 2.0], [0.1, -0.1, 0.2, 0.3]
-    codes = classifier.classify(section, np.zeros((3, 1)), np.ones(3), dict(read_model(PENDULUM).load()))
-    assert classifier.words == ("unknown", "left", "right", "mixed")
-    assert codes.dtype == np.int8
-    assert [classifier.words[c] for c in codes] == ["left", "right", "mixed"]
 
 
 @pytest.mark.parametrize(
@@ -184,11 +175,18 @@ def test_read_model__tells_all_problems_at_once():
     table = changed(changed(DUFFING, "equations", "v", value="q1 - q2"), "parameters", "d", value="x")
     table["states"]["v"]["unit"] = 1
     assert len(problems_of(table)) == 4
-
-
-def test_read_model__follows_a_circle_of_definitions():
     table = changed(DUFFING, "define", value={"drive": "b1*2", "b1": "sin(b2)", "b2": "drive + 1"})
     assert problems_of(table) == ["model.define.drive: goes round in a circle: drive needs b1 needs b2 needs drive."]
+    problems = problems_of(changed(DUFFING, "equations", "v", value="driv - e*v - sine(x) + q1 + q2*q3 +"))
+    said = [problem.removeprefix("model.equations.v: ").partition(": ")[2] for problem in problems]
+    assert [s.split(" at ")[0] for s in said] == [
+        "unknown function 'sine'",
+        "ends where something must follow.",
+        *(f"unknown name {name!r}" for name in ("driv", "e", "q1", "q2", "q3")),
+    ]
+    problems = problems_of(changed(DUFFING, "equations", "v", value="+".join(f"q{i}" for i in range(20))))
+    assert len(problems) == 9
+    assert problems[-1].endswith("12 more problems.")
 
 
 def test_autonomous__is_what_knows_no_time():
@@ -203,7 +201,7 @@ def test_autonomous__is_what_knows_no_time():
 # ---- references and digests --------------------------------------------------------------------
 
 
-def test_load_model__returns_the_same_object_for_a_text_however_it_is_given():
+def test_load_model__returns_the_same_object_for_a_text_however_it_is_given(tmp_path):
     model = load_model(copy.deepcopy(DUFFING))
     assert load_model(model.reference) is model
     assert load_model(json.dumps(model.reference)) is model
@@ -211,26 +209,20 @@ def test_load_model__returns_the_same_object_for_a_text_however_it_is_given():
     again = pickle.loads(pickle.dumps(parameters))
     assert again == parameters
     assert again.model is model
-
-
-def test_load_model__finds_shipped_texts_by_name():
     for name in ("rossler", "belt"):
         assert name in model_names()
         model = load_model(name)
         assert model.reference == name
         assert pickle.loads(pickle.dumps(model.load())) == model.load()
+    path = tmp_path / "mine.toml"
+    path.write_text('model = "duffing5"\nbase = "default"\n[values]\nA = 0.5\n[provenance]\nA = "a fit"\n')
+    assert dict(read_model(DUFFING).load(Preset.read(path))) == {"d": 0.08, "A": 0.5}
 
 
 @pytest.mark.parametrize("text", ["{", "{]", '{"name": 1}', "{" * 5000, '{"name":"a","states":{"x":NaN}}'])
 def test_load_model__refuses_broken_json(text):
     with pytest.raises(ModelError, match="model"):
         load_model(text)
-
-
-def test_preset__from_a_file_serves_a_text(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('model = "duffing5"\nbase = "default"\n[values]\nA = 0.5\n[provenance]\nA = "a fit"\n')
-    assert dict(read_model(DUFFING).load(Preset.read(path))) == {"d": 0.08, "A": 0.5}
 
 
 def digest(table):
@@ -383,19 +375,6 @@ def test_opening__needs_neither_compiler_nor_algebra(run_python):
     assert run_python(script).strip() == "[]"
 
 
-def test_read_model__reports_all_that_is_wrong_in_an_expression():
-    problems = problems_of(changed(DUFFING, "equations", "v", value="driv - e*v - sine(x) + q1 + q2*q3 +"))
-    said = [problem.removeprefix("model.equations.v: ").partition(": ")[2] for problem in problems]
-    assert [s.split(" at ")[0] for s in said] == [
-        "unknown function 'sine'",
-        "ends where something must follow.",
-        *(f"unknown name {name!r}" for name in ("driv", "e", "q1", "q2", "q3")),
-    ]
-    problems = problems_of(changed(DUFFING, "equations", "v", value="+".join(f"q{i}" for i in range(20))))
-    assert len(problems) == 9
-    assert problems[-1].endswith("12 more problems.")
-
-
 def test_remarks__name_parameters_and_definitions_that_nothing_uses():
     assert read_model(DUFFING).remarks == ()
     assert read_model(PENDULUM).remarks == ()  # l stands in the drawing and in a definition
@@ -408,6 +387,7 @@ def test_remarks__name_parameters_and_definitions_that_nothing_uses():
     )
     used = changed(table, "impacts", value=[{"of": "x - dd", "direction": "up", "set": {"v": "-friction"}}])
     assert read_model(used).remarks == ()
+    assert {name: load_model(name).remarks for name in model_names() if load_model(name).remarks} == {}
 
 
 def turning(rates, more=(), **states):
@@ -444,7 +424,3 @@ def test_remarks__name_angles_that_are_not_declared(model, angles):
     assert said == list(model.angle_remarks)
     assert [line.split(":")[0] for line in said] == [f"model.states.{name}" for name in angles]
     assert all(f"{name} = {{ on_circle = true }}" in line for name, line in zip(angles, said, strict=True))
-
-
-def test_remarks__models_that_ship_have_none():
-    assert {name: load_model(name).remarks for name in model_names() if load_model(name).remarks} == {}

@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 
 from pipeline.runs.derive import derive
-from tests.pipeline.explorer.small_runs import finished
+from tests.pipeline.factories import finished
 
 ROOT = Path(__file__).parents[4]
 

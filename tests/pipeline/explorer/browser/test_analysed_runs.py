@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.ragged import dense
-from pipeline.explorer.data.disturbances import disturbances
+from pipeline.explorer.data.overlays import disturbances
 from pipeline.explorer.data.parameter_plane import parameter_plane
 from pipeline.runs.derive import stored
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.browser.conftest import drawn, served
 from tests.pipeline.explorer.browser.test_panels import QUIET, choose, note_of
 from tests.pipeline.explorer.small_runs import SMOOTH
@@ -36,7 +36,7 @@ def pressed(page: Any, name: str) -> None:
 
 
 def test_push__is_dragged_and_tried_and_shaken(visit: Callable[..., Any], address: str, wells: Path) -> None:
-    found = dense(stored(Run.open(wells), "attractors"), points=True)
+    found = dense(stored(RunDirectory.open(wells), "attractors"), points=True)
     assert found is not None
     ids = found["attractor_id"].transpose("amplitude", "x_0", "v_0").values.ravel()
     opened = drawn(visit(address, **QUIET))
@@ -99,7 +99,7 @@ PANEL = ".panel-parameter-plane"
 def test_click_on_a_curve(bent: tuple[Path, Path], visit: Callable[..., Any]) -> None:
     """Over the map of another run; the pointer tells the curve, the click shows the orbit at that point."""
     line, plane = bent
-    found = parameter_plane(Run.open(line))
+    found = parameter_plane(RunDirectory.open(line))
     with served(plane, "--curves", str(line)) as address:
         opened = drawn(visit(address))
         page = opened.page

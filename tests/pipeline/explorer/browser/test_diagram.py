@@ -8,7 +8,6 @@ import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -212,75 +211,6 @@ def test_diagram__keys_zoom_move_walk_and_tell(page: Any, cube: xr.Dataset) -> N
     assert one.evaluate("document.activeElement.closest('.diagram')") is None
 
 
-def test_diagram__shift_and_drag_zooms_into_the_box(page: Any) -> None:
-    one = page.page
-    box, (x0, x1, y0, y1) = one.evaluate("[magpend.diagram.box, magpend.diagram.window]")
-    around = one.locator(".diagram").bounding_box()
-    left, top = around["x"] + box["left"], around["y"] + box["top"]
-    one.keyboard.down("Shift")
-    one.mouse.move(left + 0.25 * box["width"], top + 0.5 * box["height"])
-    one.mouse.down()
-    one.mouse.move(left + 0.75 * box["width"], top + 0.75 * box["height"], steps=4)
-    one.mouse.up()
-    one.keyboard.up("Shift")
-    window = one.evaluate("magpend.diagram.window")
-    wanted = [x0 + 0.25 * (x1 - x0), x0 + 0.75 * (x1 - x0), y1 - 0.75 * (y1 - y0), y1 - 0.5 * (y1 - y0)]
-    pixel = np.repeat([(x1 - x0) / box["width"], (y1 - y0) / box["height"]], 2)
-    assert np.all(np.abs(np.array(window) - wanted) <= pixel)
-    one.mouse.dblclick(left + 10, top + 10)
-    assert one.evaluate("magpend.diagram.window") == [x0, x1, y0, y1]
-    # deep inside, ticks stay apart
-    x = 2.2 + 1e-10
-    one.evaluate(f"magpend.diagram.moveTo([{x!r} - 1e-12, {x!r} + 1e-12, -0.1, 0.1])")
-    settled(one)
-    texts = [node.text or "" for node in svg_root(one).iter("{http://www.w3.org/2000/svg}text")]
-    label = next(text for text in texts if "drive frequency" in text)
-    assert "2.2" in label
-    assert "10⁻¹³" in label or "10⁻¹²" in label
-    assert len(set(texts)) == len(texts)
-
-
-def svg_root(page: Any) -> ElementTree.Element:
-    page.locator(".toolbar summary", has_text="Save").click()
-    with page.expect_download() as waiting:
-        page.get_by_role("button", name="Picture (SVG)").click()
-    return ElementTree.fromstring(Path(waiting.value.path()).read_text("utf-8"))
-
-
-def test_diagram__pictures_to_keep(page: Any, cube: xr.Dataset) -> None:
-    one = page.page
-    root = svg_root(one)
-    svg = "{http://www.w3.org/2000/svg}"
-    circles = [
-        path for path in root.iter(f"{svg}path") if path.get("fill", "none") != "none" and "A" in path.get("d", "")
-    ]
-    assert len(circles) == cube["status"].size * cube.sizes["period_index"] <= 20_000
-    assert any("drive frequency [Hz]" in (text.text or "") for text in root.iter(f"{svg}text"))
-    one.locator(".toolbar summary", has_text="Save").click()
-    with one.expect_download() as waiting:
-        one.get_by_role("button", name="Picture (PNG)").click()
-    data = Path(waiting.value.path()).read_bytes()
-    width = one.evaluate("magpend.diagram.width")
-    assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    assert int.from_bytes(data[16:20], "big") == 2 * width
-
-
-def test_diagram__legend_switches_points_off(page: Any) -> None:
-    one = page.page
-    one.select_option("select[name=colour]", "attractor")
-    asked = "magpend.diagram.points.ask('points', { bounds: magpend.diagram.window, most: 1e6 })"
-    ask = f"{asked}.then((found) => found.length / 3)"
-    before = one.evaluate(ask)
-    entry = one.locator(".legend-entry").first
-    entry.click()
-    one.wait_for_timeout(200)
-    assert entry.get_attribute("aria-pressed") == "false"
-    assert 0 < one.evaluate(ask) < before
-    entry.click()
-    one.wait_for_timeout(200)
-    assert one.evaluate(ask) == before
-
-
 def test_diagram__a_lost_server_is_said_and_tried_again(own: Any) -> None:
     one = own.page
     one.route("**/api/diagram*", lambda route: route.abort())
@@ -420,3 +350,29 @@ def _choose_other_axes(page: Any, cube: xr.Dataset) -> None:
     until(page, f"magpend.diagram.data.attrs.x === '{other}'")
     assert state_of(page)["at"] == {shown: 0}
     assert page.evaluate("[...magpend.diagram.data.x]") == sorted(cube[other].values.tolist())
+
+
+COLOURED = """(() => {
+    const canvas = document.querySelector('.strip[aria-label=Fractions]:not([hidden]) canvas');
+    if (!canvas?.width) return 0;
+    const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+    let n = 0;
+    for (let k = 0; k < data.length; k += 4) {
+        const [r, g, b, a] = data.subarray(k, k + 4);
+        n += a > 128 && Math.max(r, g, b) - Math.min(r, g, b) > 60;
+    }
+    return n;
+})()"""
+"""Number of coloured pixels in the strip of fractions: axes and texts are grey."""
+
+
+def test_fractions__are_drawn_if_their_answer_comes_before_the_diagrams(own: Any) -> None:
+    held, opened = [], own
+    opened.page.route("**/api/diagram*", lambda route: held.append(route))
+    opened.page.reload()
+    until(opened.page, "document.querySelector('.strip[aria-label=Fractions]:not([hidden]) canvas')?.width > 300")
+    opened.page.wait_for_timeout(100)  # the strip is painted in the next frame
+    held.pop().continue_()
+    drawn(opened)
+    until(opened.page, f"{COLOURED} > 200")
+    assert opened.complaints == []

@@ -12,12 +12,11 @@ import threading
 import numpy as np
 import pytest
 
-from pipeline.explorer.copies.export import export_page
-from pipeline.explorer.copies.folder import export_folder
+from pipeline.explorer.copies.export import export_folder, export_page
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.tables import table
-from pipeline.store.run import Run
+from pipeline.store.run import RunDirectory
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +48,7 @@ def hosted():
 def copies(looked_at, tmp_path_factory):
     """The small run in both forms, with its orbits."""
     folder = tmp_path_factory.mktemp("copies")
-    run = Run.open(looked_at)
+    run = RunDirectory.open(looked_at)
     written = export_page(run, folder / "copy.html")
     assert written.orbits > 0
     export_folder(run, folder / "site")
@@ -123,7 +122,7 @@ def test_copy__shows_the_diagram_and_an_orbit(visit, copies, hosted, looked_at, 
     address = (copies / "copy.html").as_uri() if form == "file" else hosted(copies / "site")
     opened = visit(address)
     page = _drawn(opened)
-    run = Run.open(looked_at)
+    run = RunDirectory.open(looked_at)
     _compare(page, run)
     notes = page.locator(".notes").inner_text()
     assert "live integration is off" in notes
@@ -207,7 +206,7 @@ def test_copy__of_two_axes_shows_each(visit, made, hosted, tmp_path, form):
     """Numbers that nothing has integrated, with cells that are not committed."""
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
-    run = Run.open(made.info.directory)
+    run = RunDirectory.open(made.info.directory)
     quantities = [run.model.quantities[0].name]
     if form == "file":
         export_page(run, tmp_path / "copy.html", most_orbits=0, quantities=quantities)

@@ -13,9 +13,9 @@ import pytest
 import xarray as xr
 
 from pipeline.analysis.ragged import dense
-from pipeline.layout.attractor_letters import letter
+from pipeline.layout.vocabulary import letter
 from pipeline.runs.derive import stored
-from pipeline.store.run import Run, open_run
+from pipeline.store.run import RunDirectory, open_run
 from tests.pipeline.explorer.browser.conftest import WAIT_MS, drawn, reused, served
 from tests.pipeline.explorer.browser.test_diagram import click_on, places_of
 
@@ -32,7 +32,7 @@ def cube(looked_at: Path) -> xr.Dataset:
 @pytest.fixture(scope="module")
 def owners(looked_at: Path, cube: xr.Dataset) -> np.ndarray:
     """Attractor of each cell, in C order."""
-    found = dense(stored(Run.open(looked_at), "attractors"), points=True)
+    found = dense(stored(RunDirectory.open(looked_at), "attractors"), points=True)
     assert found is not None
     return found["attractor_id"].transpose(*cube["status"].dims).values.ravel()
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from pipeline.rig.identify import build as b
-from pipeline.rig.identify.judging import judge
+from pipeline.rig.identify.judgement import judge
 from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import smooth

@@ -11,61 +11,44 @@ from pipeline.rig.identify import directory as d
 from pipeline.rig.identify.specification import parse_identification
 from pipeline.store.errors import DamagedError, RefusedError
 
-TEXT = """
-kind = "identification"
-title = "a ring-down"
-model = "duffing"
-preset = "hardening"
-[identify.damping]
-start = 0.2
-[[recordings]]
-file = "a.csv"
-mapping = "a.toml"
-"""
+from .test_specification import GOOD
 
 
 @pytest.fixture
 def spec(tmp_path):
     (tmp_path / "a.csv").write_text("1,2")
     (tmp_path / "a.toml").write_text("model = 'duffing'")
-    return lambda text=TEXT: parse_identification(tomllib.loads(text), tmp_path)
+    return lambda text=GOOD: parse_identification(tomllib.loads(text), tmp_path)
 
 
 @pytest.fixture
 def begun(tmp_path, spec):
     one = spec()
-    return d.establish(tmp_path / "out", one, d.sources_of(one), TEXT)
+    return d.establish(tmp_path / "out", one, d.sources_of(one), GOOD)
 
 
 def test_establish__twice_is_the_same(tmp_path, spec, begun):
     before = (begun.directory / d.IDENTIFICATION).read_bytes()
     one = spec()
-    assert d.establish(begun.directory, one, d.sources_of(one), TEXT) == begun
+    assert d.establish(begun.directory, one, d.sources_of(one), GOOD) == begun
     assert (begun.directory / d.IDENTIFICATION).read_bytes() == before
 
 
-def test_check__a_title_does_not_count(spec, begun):
-    other = spec(TEXT.replace("a ring-down", "another title"))
-    assert d.check(begun.directory, d.identity_of(other, d.sources_of(other))) == begun
+def test_check__values_and_recordings_count_and_a_title_does_not(tmp_path, spec, begun):
+    def checked(text=GOOD, folder=begun.directory):
+        one = spec(text)
+        return d.check(folder, d.identity_of(one, d.sources_of(one)))
 
-
-def test_check__names_what_differs(spec, begun):
-    other = spec(TEXT.replace("0.2", "0.25"))
+    assert checked(GOOD.replace("a ring-down", "another title")) == begun
     with pytest.raises(RefusedError, match=r"identify\.damping\.start: 0\.2 in the directory, 0\.25 now"):
-        d.check(begun.directory, d.identity_of(other, d.sources_of(other)))
-
-
-def test_check__other_recordings_differ(tmp_path, spec, begun):
-    (tmp_path / "a.csv").write_text("1,3")
-    with pytest.raises(RefusedError, match="recordings"):
-        d.check(begun.directory, d.identity_of(spec(), d.sources_of(spec())))
-
-
-def test_check__refuses_a_folder_that_holds_something_else(tmp_path, spec):
+        checked(GOOD.replace("0.2", "0.25"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "run.json").write_text("{}")
     with pytest.raises(RefusedError, match="holds no identification"):
-        d.check(tmp_path / "run", d.identity_of(spec(), d.sources_of(spec())))
+        checked(folder=tmp_path / "run")
+    (tmp_path / "a.csv").write_text("1,3")
+    with pytest.raises(RefusedError, match="recordings"):
+        checked()
 
 
 def test_read_info__damaged(begun):

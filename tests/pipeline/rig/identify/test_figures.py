@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.rig.identify import figures, residuals
+from pipeline.rig.identify import figures
 
 
 @pytest.fixture
@@ -48,13 +48,13 @@ RESULT = {
 
 
 def test_pieces_in__and_their_root_mean_squares(ds):
-    found = residuals.pieces_in(ds)
+    found = figures.pieces_in(ds)
     assert [(s.number, s.held_out, s.samples) for s in found] == [
         (0, False, (0, 400)),
         (2, False, (400, 800)),
         (1, True, (800, 1200)),
     ]
-    rms = residuals.per_piece(ds, "x")
+    rms = figures.per_piece(ds, "x")
     assert rms["piece"].values.tolist() == [0, 1, 2]
     assert rms["held_out"].values.tolist() == [0, 1, 0]
     left = ds["x_residual"].values
@@ -63,7 +63,7 @@ def test_pieces_in__and_their_root_mean_squares(ds):
 
 def test_residual_views__mean_goes_with_the_rate(ds):
     """What a wrong friction leaves: the slope of the means in bins is that of the residuals."""
-    views = residuals.residual_views(ds, ["x"])
+    views = figures.residual_views(ds, ["x"])
     slope = np.polyfit(views["x_rate"], views["x_mean"], 1)[0]
     assert slope == pytest.approx(0.002, rel=0.02)
     width = np.diff(views["x_edges"].values)
@@ -82,11 +82,3 @@ def test_draw_all__writes_figures_and_their_data(ds, tmp_path):
     first = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     figures.draw_all(tmp_path, ds, RESULT)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == first
-
-
-@pytest.mark.slow
-def test_plot_residuals__says_units_and_what_is_simulated(ds):
-    for simulated in (0, 1):
-        fig = figures.plot_residuals(ds.assign_attrs(simulated=simulated))
-        assert any("simulated" in t.get_text() for t in fig.texts) == bool(simulated)
-        assert "rms [mm]" in [ax.get_ylabel() for ax in fig.axes]

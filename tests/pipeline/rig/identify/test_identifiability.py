@@ -74,11 +74,6 @@ def test_warnings_of__nothing_to_warn_of():
     assert idf.warnings_of(NAMES, directions, covariance(np.eye(3) * 0.0025), NONE, ("", "", "")) == []
 
 
-def test_invisible__names_columns_without_slope():
-    information = np.diag([1.0, 0.0, 2.0])
-    assert idf.invisible(information, NAMES) == ["stiffness"]
-
-
 @pytest.mark.parametrize(
     ("theta", "start", "sensed", "size"),
     [(2.0, 1.0, np.nan, 2.0), (0.0, 1.0, np.nan, 1.0), (0.0, 0.0, np.nan, 3.0), (1e-3, 0.0, 1.0, 1.0)],

@@ -8,8 +8,8 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from magpend_core.models import load_model
-from pipeline.rig.identify import check as checking
 from pipeline.rig.identify import identification
+from pipeline.rig.identify import validation as checking
 from pipeline.rig.identify.build import drive_problems
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.specification.problems import SpecError
@@ -146,9 +146,7 @@ def test_known_drive__a_model_without_a_drive_is_refused():
     ("old", "new", "words"),
     [
         ("frequency_hz = 0.16\n", "", "recordings[1].frequency_hz: missing"),
-        ("frequency_hz = 0.16", "frequency_hz = 0.0", "recordings[1].frequency_hz = 0.0: must be greater than 0"),
         ("frequency_hz = 0.16", "frequency_hz = 7.0", "recordings[1].frequency_hz = 7: must be below 5 Hz"),
-        ("frequency_hz = 0.16", "frequency_hz = 0.16\nphase = 90.0", "recordings[1].phase = 90.0: must be less than 1"),
         (
             'drive = "known"\nfrequency_hz = 0.16',
             "frequency_hz = 0.16",

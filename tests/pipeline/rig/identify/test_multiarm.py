@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
-from pipeline.rig.identify import check as checking
 from pipeline.rig.identify import identification
-from pipeline.runs.workflows import find_spec, shipped_identifications, shipped_workflows
+from pipeline.rig.identify import validation as checking
+from pipeline.specification.files import find_spec, shipped_identifications, shipped_workflows
 
 RECORDING = "recordings/multiarm/multiarm_free_swings.mat"
 
@@ -40,12 +38,9 @@ def test_identify__multiarm(multiarm):
 
 
 @pytest.mark.slow
-def test_check__multiarm_on_its_own_recording(multiarm, main):
+def test_check__multiarm_on_its_own_recording(multiarm):
     """Whole pieces and refitted starts give the fit's own root mean squares."""
     folder, result = multiarm
     recording = find_spec("multiarm").parent / RECORDING
     found = checking.check(folder, recording)
     assert found["rms"] == pytest.approx(result["rms"], rel=1e-4)
-    code, out, _ = main("identify", "check", folder, recording, "--json")
-    assert code == 0
-    assert json.loads(out)["rms"] == found["rms"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from pipeline.rig.identify.profiles import Curvature, following, interval_of, profile
+from pipeline.rig.identify.identifiability import Curvature, following, interval_of, profile
 
 INFORMATION = np.array([[4.0, 3.0], [3.0, 9.0]])
 ESTIMATE = np.array([1.0, 2.0])

@@ -11,13 +11,12 @@ import xarray as xr
 
 from pipeline.rig.identify.directory import read_result
 from pipeline.rig.identify.identification import identify
-from pipeline.rig.identify.log_posterior import LogPosterior, log_posterior
-from pipeline.rig.identify.posterior import Sampling, kept_draws, posterior_table, sample_draws
-from pipeline.rig.identify.posterior_files import write_posterior
-from pipeline.rig.identify.sampling import _first, judged, sample_posterior, split_rhat
+from pipeline.rig.identify.mcmc import LogPosterior, _first, judged, log_posterior, sample_posterior, split_rhat
+from pipeline.rig.identify.posterior import Sampling, kept_draws, posterior_table, sample_draws, write_posterior
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from tests.pipeline.bautin import MODEL, SECTION, TRUTH, radius, write_orbits, write_toml
+from tests.pipeline.factories import silent
 
 pytestmark = pytest.mark.slow  # needs emcee
 
@@ -33,10 +32,6 @@ def chi2_of(g, h, w):
     return amplitudes + len(VALUES) * ((TRUTH["w"] - w) / (2 * math.pi) / FREQUENCY_SD) ** 2
 
 
-def quiet(line):
-    pass
-
-
 @pytest.fixture(scope="module")
 def cycles(tmp_path_factory):
     """An identification from three stable cycles without noise."""
@@ -50,7 +45,7 @@ def cycles(tmp_path_factory):
         "orbits": [{"file": "cycles.csv", "section": SECTION, "range": [-0.3, 0.5]}],
     }
     write_toml(folder / "fit.toml", data)
-    identify(folder / "fit.toml", folder / "out", figures=False, echo=quiet)
+    identify(folder / "fit.toml", folder / "out", figures=False, echo=silent)
     return folder / "out"
 
 
@@ -99,7 +94,7 @@ def closed(cycles):
     return density, np.array(result["covariance"]["matrix"])
 
 
-def chain_of(cycles, closed, seed, most_steps, echo=quiet):
+def chain_of(cycles, closed, seed, most_steps, echo=silent):
     density, covariance = closed
     return sample_posterior(cycles, density, covariance, n_walkers=32, most_steps=most_steps, seed=seed, echo=echo)
 
@@ -156,7 +151,7 @@ def test_sample_posterior__goes_on_to_the_same_bytes(cycles, closed):
 
 
 def test_sample_draws__not_converged_is_an_answer(cycles):
-    drawn = sample_draws(cycles, 40, seed=5, sampling=Sampling(most_steps=20), echo=quiet)
+    drawn = sample_draws(cycles, 40, seed=5, sampling=Sampling(most_steps=20), echo=silent)
     assert drawn.attrs["converged"] == 0
     table = posterior_table(drawn)
     assert "NOT CONVERGED" in table.lines[-1]
@@ -166,9 +161,9 @@ def test_sample_draws__not_converged_is_an_answer(cycles):
 
 def test_write_posterior__keeps_the_draws_for_runs(cycles):
     sampling = Sampling(most_steps=20)
-    _, bifurcations, _ = write_posterior(cycles, 12, seed=5, sampling=sampling, figures=False, echo=quiet)
+    _, bifurcations, _ = write_posterior(cycles, 12, seed=5, sampling=sampling, figures=False, echo=silent)
     kept = kept_draws(cycles, 12)
-    xr.testing.assert_equal(kept["value"], sample_draws(cycles, 12, 5, sampling, echo=quiet)["value"])
+    xr.testing.assert_equal(kept["value"], sample_draws(cycles, 12, 5, sampling, echo=silent)["value"])
     assert kept_draws(cycles, 10).sizes["draw"] == 10
     with pytest.raises(SpecError, match=r"-n = 13: .* has 12 draws"):
         kept_draws(cycles, 13)
@@ -179,10 +174,10 @@ def test_write_posterior__keeps_the_draws_for_runs(cycles):
 
 def test_sample_draws__names_the_remedy(cycles, monkeypatch):
     with pytest.raises(SpecError, match=r"--walkers = 5: must be even and at least 6"):
-        sample_draws(cycles, 20, sampling=Sampling(n_walkers=5), echo=quiet)
+        sample_draws(cycles, 20, sampling=Sampling(n_walkers=5), echo=silent)
     monkeypatch.setitem(sys.modules, "emcee", None)
     with pytest.raises(SpecError, match=r"pip install '\.\[mcmc\]'"):
-        sample_draws(cycles, 20, echo=quiet)
+        sample_draws(cycles, 20, echo=silent)
 
 
 def test_judged__a_drifting_chain_has_not_converged():
@@ -239,7 +234,7 @@ def test_log_posterior__of_recordings_is_the_gaussian_of_a_linear_model(tmp_path
         'kind = "identification"\nmodel = "ramp.toml"\n[identify.c]\n[[recordings]]\nfile = "ramp.csv"\n'
         'mapping = "map.toml"\ndrive = "none"\n[search]\nn_starts = 1\nprofiles = false\n'
     )
-    result = identify(tmp_path / "fit.toml", tmp_path / "out", figures=False, echo=quiet)
+    result = identify(tmp_path / "fit.toml", tmp_path / "out", figures=False, echo=silent)
     assert result["covariance"]["estimator"] == "white"
     # the scatter of the residuals, three starts and a slope fitted
     sd = result["rms"]["x"] * math.sqrt(3 * n / (3 * n - 4) / square)
@@ -247,11 +242,11 @@ def test_log_posterior__of_recordings_is_the_gaussian_of_a_linear_model(tmp_path
     steps = np.array([-2.0, -0.5, 0.0, 1.0, 3.0])
     found = density(result["values"]["c"] + sd * steps[:, None])
     np.testing.assert_allclose(found - found[2], -0.5 * steps**2, atol=1e-5)
-    drawn = sample_draws(tmp_path / "out", 20, 1, Sampling(most_steps=20, spec=tmp_path / "fit.toml"), echo=quiet)
+    drawn = sample_draws(tmp_path / "out", 20, 1, Sampling(most_steps=20, spec=tmp_path / "fit.toml"), echo=silent)
     assert (np.abs(drawn["value"].sel(parameter="c") - c) < 6 * sd).all()
     with pytest.raises(SpecError, match="--spec: missing"):
-        sample_draws(tmp_path / "out", 20, echo=quiet)
+        sample_draws(tmp_path / "out", 20, echo=silent)
     text = (tmp_path / "fit.toml").read_text().replace("n_starts = 1", "n_starts = 2")
     (tmp_path / "other.toml").write_text(text)
     with pytest.raises(RefusedError, match="another identification"):
-        sample_draws(tmp_path / "out", 20, sampling=Sampling(spec=tmp_path / "other.toml"), echo=quiet)
+        sample_draws(tmp_path / "out", 20, sampling=Sampling(spec=tmp_path / "other.toml"), echo=silent)

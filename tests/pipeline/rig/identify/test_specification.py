@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 
 import pytest
 
-from pipeline.rig.identify.specification import load_identification, parse_identification
+from pipeline.rig.identify.specification import parse_identification
 from pipeline.specification.problems import SpecError
 
 GOOD = """
@@ -44,16 +45,6 @@ def parse(tmp_path):
     return call
 
 
-def problems_of(parse, *changes: tuple[str, str]) -> list[str]:
-    text = GOOD
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    with pytest.raises(SpecError) as caught:
-        parse(text)
-    return caught.value.problems
-
-
 def test_parse_identification__fills_in_starts_and_bounds(parse):
     spec = parse(GOOD)
     damping, linear = spec.unknowns
@@ -68,8 +59,6 @@ def test_parse_identification__fills_in_starts_and_bounds(parse):
 
 
 def test_parse_identification__plain_data_are_json(parse):
-    import json
-
     assert json.loads(json.dumps(parse(GOOD).as_dict()))["identify"]["linear"]["bounds"] == ["-inf", "inf"]
 
 
@@ -108,43 +97,20 @@ def test_tied__is_a_number_times_a_name(parse, text, tie):
         ('preset = "hardening"', 'preset = "hardning"', ("preset", "did you mean hardening")),
         ("amplitude = 0.0", "amplitude = 0.0\ndamping = 0.1", ("parameters.damping", "also in identify")),
         ('kind = "identification"', 'kind = "identfication"', ("kind", "Did you mean 'identification'")),
+        ('kind = "identification"', 'kind = "sweep"', ("magpend run",)),
+        ("[sensors]", '[fit]\nslopes = "variation"\n[sensors]', ("fit.slopes",)),
     ],
 )
 def test_parse_identification__names_the_problem(parse, old, new, words):
-    found = problems_of(parse, (old, new))
-    assert len(found) == 1
-    assert all(word in found[0] for word in words), found
+    assert old in GOOD
+    with pytest.raises(SpecError) as caught:
+        parse(GOOD.replace(old, new))
+    (found,) = caught.value.problems
+    assert all(word in found for word in words), found
 
 
 def test_parse_identification__names_all_problems_at_once(parse):
-    found = problems_of(
-        parse, ("start = 0.2", "start = 2.0"), ('zero = ["x"]', 'zero = ["q"]'), ("sd = 0.1", "sd = -1.0")
-    )
-    assert len(found) == 3
-
-
-def test_parse_identification__refuses_a_run(parse):
-    (found,) = problems_of(parse, ('kind = "identification"', 'kind = "sweep"'))
-    assert "magpend run" in found
-
-
-def test_load_identification__a_file_that_is_not_there(tmp_path):
-    with pytest.raises(SpecError, match="cannot be read"):
-        load_identification(tmp_path / "none.toml")
-
-
-@pytest.mark.slow
-def test_load__slopes_are_one_of_two_kinds(tmp_path):
-    """What the fit takes them by goes into the problem; another word is refused by name."""
-    from pipeline.rig.identify.build import build, read_all
-    from pipeline.runs.workflows import find_spec
-
-    path = find_spec("multiarm")
-    text = path.read_text("utf-8").replace("recordings/", f"{path.parent}/recordings/")
-    own = tmp_path / "own.toml"
-    own.write_text(text + '\n[fit]\nslopes = "variational"\n')
-    spec = load_identification(own)
-    assert build(spec, read_all(spec)).problem.slopes == "variational"
-    own.write_text(text + '\n[fit]\nslopes = "variation"\n')
-    with pytest.raises(SpecError, match=r"fit\.slopes"):
-        load_identification(own)
+    text = GOOD.replace("start = 0.2", "start = 2.0").replace('zero = ["x"]', 'zero = ["q"]')
+    with pytest.raises(SpecError) as caught:
+        parse(text.replace("sd = 0.1", "sd = -1.0"))
+    assert len(caught.value.problems) == 3

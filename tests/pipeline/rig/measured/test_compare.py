@@ -8,10 +8,10 @@ import xarray as xr
 
 from pipeline.analysis.ragged import dense
 from pipeline.products.measured import SweepOptions
-from pipeline.rig.measured.compare import compare, compare_with
+from pipeline.rig.measured.comparison import compare, compare_with
 from pipeline.rig.measured.computed import Computed
+from pipeline.rig.measured.diagram import measure
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
-from pipeline.rig.measured.measuring import measure
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 
@@ -157,6 +157,17 @@ def test_candidates__orbits_are_interpolated_between_frequencies(run_directory, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("layout", ["side", "over"])
+def test_figures__carry_what_they_draw(compared, run_directory, layout):
+    computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
+    measured = plot_measured(compared, computed.cube, layout=layout, degrees=True)
+    assert {"value", "x_diagram", "y_diagram"} <= set(measured.data.variables)
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in measured.axes}) == 1
+    drawn = plot_comparison(compared, computed).data["distance_in_noise"]
+    np.testing.assert_array_equal(drawn, compared["distance_in_noise"])
+
+
+@pytest.mark.slow
 def test_compare__steps_off_the_runs_axis_have_no_winner(measured, run_directory):
     computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
     moved = measured.assign_coords(frequency=measured["frequency"] + 0.05)
@@ -183,30 +194,3 @@ def test_measure__recordings_that_do_not_fit_are_refused(swept):
         measure([up.drop_vars("drive")], WAY)
     with pytest.raises(SpecError, match="no edges"):
         measure([up.assign(drive=xr.ones_like(up["drive"]))], WAY)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("layout", "simulated"), [("side", 1), ("over", 0)])
-def test_plot_measured__draws_both_on_shared_axes(compared, run_directory, layout, simulated):
-    computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
-    fig = plot_measured(compared.assign_attrs(simulated=simulated), computed.cube, layout=layout, degrees=True)
-    axes = fig.axes
-    assert len(axes) == (2 if layout == "side" else 1)
-    if layout == "side":
-        assert [t.get_text() for ax in axes for t in ax.texts] == ["simulated rig", "computed"]
-    assert all(ax.get_ylim() == axes[0].get_ylim() and ax.get_xlim() == axes[0].get_xlim() for ax in axes)
-    low, high = axes[0].get_ylim()
-    shown = fig.data["value"].values
-    assert low < np.nanmin(shown) < np.nanmax(shown) < high
-    assert {"x_diagram", "y_diagram"} <= set(fig.data.variables)
-
-
-@pytest.mark.slow
-def test_plot_comparison__marks_each_distance_in_its_winners_colour(compared, run_directory):
-    computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
-    fig = plot_comparison(compared, computed)
-    lines = [line for line in fig.axes[1].lines if str(line.get_gid()).startswith("distance")]
-    drawn = {str(line.get_gid()).split(":")[1]: line.get_ydata() for line in lines if len(line.get_ydata())}
-    np.testing.assert_array_equal(np.sort(drawn["up"]), np.sort(compared["distance_in_noise"].values[:5]))
-    rows = [t.get_text() for t in fig.axes[2].get_yticklabels()]
-    assert rows == ["rig, up", "model, up", "rig, down", "model, down"]

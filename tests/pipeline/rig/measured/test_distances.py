@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import wasserstein_distance
 
 from pipeline.analysis.sets import Geometry
-from pipeline.rig.measured.distances import Candidate, Cloud, cloud_of, distance_to, floor_of, wasserstein
+from pipeline.rig.measured.comparison import Cloud, cloud_of, distance_to, floor_of, wasserstein
+from pipeline.rig.measured.computed import Candidate
 
 LINE = Geometry((False,), (2.0,))
 CIRCLE = Geometry((True, False), (1.0, 10.0))
@@ -87,18 +88,17 @@ def test_distance_to__the_true_attractor_is_one_floor_away():
     assert np.mean(ratios) == pytest.approx(0.93, abs=0.06)
 
 
-def test_distance_to__an_orbit_that_is_off_is_as_far_as_it_is_off():
-    orbit = np.array([[0.1, 0.5], [0.7, -2.0]])
-    one = cloud(np.tile(orbit, (30, 1)), [3e-4, 3e-3], 2)
-    off = Candidate(0, 2, 0, orbit + [0.05, 0.0])
-    assert distance_to(off, one, CIRCLE, np.random.default_rng(0)) == pytest.approx(0.05, rel=0.02)
-
-
-def test_distance_to__a_period_doubled_model_costs_half_its_split():
-    single, split = np.array([[0.1, 0.5]]), 0.04
-    one = cloud(np.tile(single, (60, 1)), [1e-4, 1e-3], 1)
-    doubled = Candidate(0, 2, 0, np.array([[0.1 - split / 2, 0.5], [0.1 + split / 2, 0.5]]))
-    assert distance_to(doubled, one, CIRCLE, np.random.default_rng(0)) == pytest.approx(split / 2, rel=0.02)
+@pytest.mark.parametrize(
+    ("orbit", "model", "far"),
+    [
+        ([[0.1, 0.5], [0.7, -2.0]], [[0.15, 0.5], [0.75, -2.0]], 0.05),  # as far as it is off
+        ([[0.1, 0.5]], [[0.08, 0.5], [0.12, 0.5]], 0.02),  # a doubled period costs half its split
+    ],
+)
+def test_distance_to__another_orbit(orbit, model, far):
+    one = cloud(np.tile(orbit, (60 // len(orbit), 1)), [1e-4, 1e-3], len(orbit))
+    candidate = Candidate(0, 2, 0, np.array(model))
+    assert distance_to(candidate, one, CIRCLE, np.random.default_rng(0)) == pytest.approx(far, rel=0.02)
 
 
 def test_distance_to__samples_of_one_bounded_set_are_a_floor_apart():

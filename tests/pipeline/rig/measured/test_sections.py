@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from pipeline.rig.edges import Edges
-from pipeline.rig.measured.recorded_sections import find_sections
+from pipeline.rig.measured.sections import find_sections
 from pipeline.specification.problems import SpecError
 
 STATES = ("psi1", "psi2", "psi1_dot", "psi2_dot")

@@ -33,22 +33,19 @@ def test_constant_spans__steps_of_ten_millihertz_are_found_to_an_edge(resolution
     np.testing.assert_allclose([b for _, b in spans], 60 * np.arange(1, len(f) + 1), atol=1)
 
 
+def test_constant_spans__a_gap_ends_a_stretch_and_jitter_does_not():
+    for seed in range(20):
+        assert constant_spans(edges_for([2.2], 300, 1e-3, seed)) == [(0, 300)]
+    edges = edges_for([2.2], 100)
+    rising = np.delete(edges.rising, np.s_[50:60])
+    assert constant_spans(Edges(rising, edges.falling)) == [(0, 49), (50, 90)]
+
+
 def test_constant_spans__a_step_of_one_millihertz_is_found():
     """0.2 ms a period among 0.1 ms of jitter: found after some edges, and then placed."""
     spans = constant_spans(edges_for([2.2, 2.201], 80, 1e-4))
     assert len(spans) == 2
     assert abs(spans[0][1] - 80) <= 6
-
-
-def test_constant_spans__jitter_alone_makes_no_step():
-    for seed in range(20):
-        assert constant_spans(edges_for([2.2], 300, 1e-3, seed)) == [(0, 300)]
-
-
-def test_constant_spans__a_gap_ends_a_stretch():
-    edges = edges_for([2.2], 100)
-    rising = np.concatenate([edges.rising[:50], edges.rising[60:]])
-    assert constant_spans(Edges(rising, edges.falling)) == [(0, 49), (50, 90)]
 
 
 def test_cut__frequencies_are_within_their_errors_and_directions_told():
@@ -59,11 +56,8 @@ def test_cut__frequencies_are_within_their_errors_and_directions_told():
     assert [s.direction for s in found] == [1, 1, 1, -1, -1]
     assert [s.edges.rising.size for s in found] == pytest.approx([61] * 5, abs=1)
     assert found[0].timing.duty_cycle == pytest.approx(DUTY, abs=3e-4)
-
-
-def test_cut__one_frequency_has_no_direction():
-    (found,) = cut(edges_for([2.2], 100))
-    assert found.direction == 0
+    (alone,) = cut(edges_for([2.2], 100))
+    assert alone.direction == 0
 
 
 def test_cut__instants_of_sampling_lie_on_the_line():

@@ -9,8 +9,8 @@ import pytest
 
 from magpend_core.models import load_model
 from pipeline.products.measured import SweepOptions
-from pipeline.rig.measured.measuring import measure
-from pipeline.rig.measured.phase import section_phase
+from pipeline.rig.measured.diagram import measure
+from pipeline.rig.measured.sections import section_phase
 from pipeline.rig.measured.series import series_of
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
 from pipeline.specification.problems import SpecError

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.rig.recordings.channels import Channel, Raw
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.reading import recording_of
 
 RATE_HZ = 500.0

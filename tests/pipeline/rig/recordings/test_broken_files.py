@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import parse_mapping, recording_of
-from pipeline.rig.recordings.formats import read_raw
+from pipeline.rig.recordings.reading import read_raw
 from pipeline.rig.recordings.writing import write_raw
 from pipeline.specification.problems import SpecError
 
@@ -29,8 +29,9 @@ def damaged(data, rng):
     return bytes(broken)
 
 
-def check_damaged_files(tmp_path, make, suffix):
-    """Read 300 damaged files, which are read or refused."""
+@pytest.mark.slow  # needs nptdms
+@pytest.mark.parametrize("suffix", [".csv", ".lvm", ".tdms"])
+def test_read_raw__damaged_files_are_read_or_refused(tmp_path, make, suffix):
     source, target = tmp_path / f"whole{suffix}", tmp_path / f"x{suffix}"
     if suffix == ".lvm":
         segment = lvm_segment([1.0, 1.5, 2.0, 1.0], [0.0] * 4, columns="One", time="12:00:00.25", step=0.01)
@@ -49,12 +50,6 @@ def check_damaged_files(tmp_path, make, suffix):
         except SpecError:
             outcomes.append("refused")
     assert set(outcomes) == {"read", "refused"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".csv", ".lvm"])
-def test_read_raw__damaged_files_are_read_or_refused(tmp_path, make, suffix):
-    check_damaged_files(tmp_path, make, suffix)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.99])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of
-from pipeline.rig.recordings.findings import runs
+from pipeline.rig.recordings.channels import runs
 
 
 def kinds(ds):
@@ -41,15 +41,11 @@ def test_missing__samples_that_are_no_numbers(make):
     ds = make.recorded(a)
     found = findings_of(ds)
     assert kinds(ds) == [("missing", "psi1")] * 2
+    assert kinds(make.recorded(np.full_like(a, 2.5))) == [("constant", "psi1")]
     assert found[0].start_s == pytest.approx(0.2)
     assert found[0].end_s == pytest.approx(0.204)
     assert "3 samples" in found[0].text
     assert np.flatnonzero(np.isnan(ds["psi1"])).tolist() == [100, 101, 102, 500]
-
-
-def test_constant__a_channel_that_does_not_move(make):
-    a, _ = make.swing()
-    assert kinds(make.recorded(np.full_like(a, 2.5))) == [("constant", "psi1")]
 
 
 def test_saturated__at_the_ends_of_the_range(make):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of, window
-from pipeline.rig.recordings.formats import read_raw
+from pipeline.rig.recordings.channels import Channel
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.recordings.raw import Channel
+from pipeline.rig.recordings.reading import read_raw
 from pipeline.specification.problems import SpecError
 
 
@@ -93,26 +93,39 @@ def test_clock__stamps_coarser_than_the_sampling(make):
     assert len(np.unique(ds["piece"])) == 1
 
 
-def test_clock__time_that_goes_backwards_is_refused(make):
-    stamps = make.time.copy()
-    stamps[1000:] -= 1.0
-    with pytest.raises(SpecError, match=r"goes backwards after sample 999 .* give sampling_rate_hz"):
-        stamped(make, stamps)
-
-
-def test_clock__mixed_rates_are_refused(make):
+def test_clock__rates_that_do_not_fit_are_refused(make):
     a, b = make.swing()
     channels = {"a": Channel("a", a, step_s=0.001), "b": Channel("b", b[::2], step_s=0.002)}
     with pytest.raises(SpecError, match=r"different sampling rates \(psi1 1000 Hz, psi2 500 Hz\); map channels"):
         recording_of(make.raw(channels), make.mapping())
-
-
-def test_clock__unknown_rate_is_refused_with_the_remedy(make):
+    backwards = make.time - 1.0 * (np.arange(make.n) >= 1000)
+    with pytest.raises(SpecError, match=r"goes backwards after sample 999 .* give sampling_rate_hz"):
+        stamped(make, backwards)
     raw = make.raw(make.channels(dict(zip("ab", make.swing(), strict=True)), step_s=np.nan))
     with pytest.raises(SpecError, match=r"psi1, psi2 is not known; add .* time = .* or sampling_rate_hz"):
         recording_of(raw, make.mapping())
     stated = make.mapping().model_copy(update={"sampling_rate_hz": 500.0})
     assert recording_of(raw, stated).attrs["sampling_rate_hz"] == 500.0
+
+
+def test_clock__irregular_sampling_is_named_and_its_remedy_helps(make):
+    stamps = np.cumsum(np.random.default_rng(5).uniform(0.005, 0.035, 2000))
+    raw = make.raw(make.channels({"t": stamps, "a": 0.3 * np.sin(2.0 * stamps), "b": stamps}, step_s=np.nan))
+    mapping = make.mapping(tables={"time": {"channel": "t"}})
+    with pytest.raises(
+        SpecError, match=r"irregular times, with steps of 5\.\d* to 34\.\d* ms.*resample = 5\d"
+    ) as caught:
+        recording_of(raw, mapping)
+    rate = float(str(caught.value).partition("resample = ")[2].partition(",")[0])
+    ds = recording_of(raw, mapping.model_copy(update={"resample": rate}))
+    assert int(ds["piece"].max()) == 0
+    assert ds.attrs["sampling_rate_hz"] == pytest.approx(rate)
+    assert not [f for f in findings_of(ds) if f.kind in ("gap", "jitter")]
+    # linear interpolation over steps of at most 35 ms: at most h^2/8 max |a''| = 2e-4
+    np.testing.assert_allclose(ds["psi1"], 0.3 * np.sin(2.0 * (ds["time"].values + stamps[0])), atol=2e-4)
+    # gaps of even sampling are not irregular
+    kept = np.random.default_rng(1).uniform(size=make.n) > 0.1
+    assert int(stamped(make, make.time[kept])["piece"].max()) > 100
 
 
 def test_clock__stated_rate_that_is_not_the_files(make):
@@ -132,15 +145,6 @@ def test_clock__stated_rate_beside_time_stamps_is_noted(make):
     assert {(f.kind, f.severity) for f in findings_of(ds)} == {("rate", "note")}
     np.testing.assert_allclose(ds["time"], make.time, atol=1e-12)
     assert [f.kind for f in findings_of(recording_of(make.raw(channels), make.mapping()))] == ["gap"]
-
-
-def test_clock__unequal_lengths(make):
-    a, b = make.swing()
-    ds = recording_of(make.raw(make.channels({"a": a, "b": b[:1900]})), make.mapping())
-    (found,) = findings_of(ds)
-    assert (found.kind, found.channel) == ("length", "psi1")
-    assert "the last 100 are left out" in found.text
-    assert ds.sizes["sample"] == 1900
 
 
 def test_clock__channels_that_begin_apart(make):
@@ -180,14 +184,6 @@ def test_clock__stretches_that_follow_on_are_one_piece(make):
     ds = recording_of(make.raw(first, second), make.mapping())
     assert findings_of(ds) == []
     assert not ds["piece"].any()
-
-
-def test_clock__piece_channel_begins_new_pieces(make):
-    a, b = make.swing()
-    number = (np.arange(make.n) >= 1200).astype(float)
-    raw = make.raw(make.channels({"a": a, "b": b, "k": number}))
-    ds = recording_of(raw, make.mapping(tables={"piece": {"channel": "k"}}))
-    np.testing.assert_array_equal(ds["piece"], number)
 
 
 @pytest.mark.parametrize(("axis", "key"), [("t", "time"), ("k", "piece")])

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
+
+from pipeline.rig.recordings.mapping import parse_mapping
+from pipeline.rig.virtual import parse_rig, simulated
 
 FOLDER = Path(__file__).parents[4] / "workflows" / "recordings" / "multiarm"
 
@@ -82,15 +86,15 @@ def test_recordings_convert__is_read_with_its_mapping(main, swing):
     assert out == "recording: x.nc\n"
 
 
-@pytest.mark.slow
-def test_recordings_show__real_pendulum(main, tmp_path):
-    for name in ("multiarm_free_swings.mat", "multiarm_free_swings.toml"):
-        shutil.copy(FOLDER / name, tmp_path)
-    words = ("--mapping", "multiarm_free_swings.toml", "--smooth", "--out", "x.png")
-    code, out, err = main("recordings", "show", "multiarm_free_swings.mat", *words)
-    assert code == 0, err
-    assert "69342 samples at 1000 Hz, 69.341 s in 26 pieces" in out
-    assert "findings: none" in out
+def test_docs__rig_and_mapping_belong_together():
+    """The tutorial's files are valid, and its mapping is the one that the virtual rig writes."""
+    page = (FOLDER.parents[2] / "docs" / "rig.md").read_text("utf-8")
+    rig, mapping = (tomllib.loads(text) for text in re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[:2])
+    raw, own = simulated(parse_rig(rig))
+    assert parse_mapping(mapping) == own
+    assert {name: len(channel) for name, channel in raw.stretches[0].items()} == dict.fromkeys(
+        ("rig/psi1", "rig/psi2", "rig/drive"), 11818
+    )
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.plots import style
 from pipeline.rig.recordings import recording_of, smooth
 from pipeline.rig.recordings.figure import MOST_DOTS, plot_recording
 from pipeline.rig.recordings.overview import describe_file, describe_recording
@@ -14,10 +13,6 @@ from pipeline.rig.recordings.overview import describe_file, describe_recording
 def line_of(figure, name):
     (line,) = [x for ax in figure.axes for x in ax.lines if x.get_gid() == f"recording-{name}"]
     return line
-
-
-def texts_of(figure):
-    return [t.get_text() for legend in figure.legends for t in legend.get_texts()]
 
 
 @pytest.fixture
@@ -32,19 +27,14 @@ def broken(make):
 
 
 @pytest.mark.slow
-def test_plot_recording__draws_what_was_measured(broken):
+def test_plot_recording__shows_samples_pieces_and_findings(broken):
     figure = plot_recording(broken)
-    assert len(figure.axes) == 2
-    assert [ax.get_ylabel() for ax in figure.axes] == [r"$\psi_1$, $\psi_2$ [rad]", "drive [N m]"]
     drawn = line_of(figure, "psi2").get_ydata()
     np.testing.assert_array_equal(drawn[np.isfinite(drawn)], broken["psi2"])
     assert np.isnan(drawn).sum() == 1  # the gap
     assert figure.data is broken
-    assert texts_of(figure)[-2:] == ["gap", "missing"]
-    assert [len(ax.patches) for ax in figure.axes] == [2, 1]  # the missing samples are those of an angle
-    smoothed = plot_recording(smooth(broken).assign_attrs(simulated=1), frame=style.Frame(85.0))
-    assert smoothed.axes[1].get_ylabel() == r"$\dot{\psi}_1$, $\dot{\psi}_2$ [rad/s]"
-    assert [len(f.axes[0].get_title(loc="left").split("simulated")) for f in (figure, smoothed)] == [1, 2]
+    assert [t.get_text() for legend in figure.legends for t in legend.get_texts()][-2:] == ["gap", "missing"]
+    assert line_of(plot_recording(smooth(broken)), "psi1_dot").get_ydata().size
 
 
 def test_plot_recording__long_recordings_keep_their_extremes(make):

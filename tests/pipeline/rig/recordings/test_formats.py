@@ -7,13 +7,12 @@ import logging
 import numpy as np
 import pytest
 
-from pipeline.rig.recordings import findings_of, mapping_for, parse_mapping, read_recording, window, write_recording
-from pipeline.rig.recordings.formats import read_raw
+from pipeline.rig.recordings import findings_of, parse_mapping, read_recording
 from pipeline.rig.recordings.mapping import CsvMap
+from pipeline.rig.recordings.reading import read_raw
 from pipeline.specification.problems import SpecError
 
 from .lvm_files import lvm_segment, written_lvm
-from .test_broken_files import check_damaged_files
 
 pytestmark = pytest.mark.slow  # needs nptdms
 
@@ -33,18 +32,6 @@ def write_tdms(path, columns, *, segments=1, **properties):
 
 
 # ---- TDMS ----------------------------------------------------------------------------------------
-
-
-def test_read_tdms__waveforms(tmp_path, make):
-    a, b = make.swing()
-    path = tmp_path / "swing.tdms"
-    wave = {"wf_increment": 0.002, "unit_string": "rad", "wf_start_time": np.datetime64("2026-03-01T12:00:00.25")}
-    write_tdms(path, {"angle 1": a, "angle 2": b}, segments=7, **{"angle 1": wave, "angle 2": wave})
-    ds = read_recording(path, parse_mapping(RIG))
-    assert findings_of(ds) == []
-    assert ds.attrs["sampling_rate_hz"] == 500.0
-    np.testing.assert_array_equal(ds["psi1"], a)
-    np.testing.assert_array_equal(ds["psi2"], b)
 
 
 def test_read_tdms__starts_are_read_beyond_microseconds(tmp_path, make):
@@ -92,22 +79,6 @@ def test_read_tdms__truncated_file_is_a_finding(tmp_path, make, caplog):
     assert not caplog.records  # said once, as a finding
 
 
-def test_read_tdms__cut_in_the_metadata_of_a_later_segment(tmp_path, make):
-    a, b = make.swing()
-    path = tmp_path / "two.tdms"
-    wave = {"wf_increment": 0.002}
-    write_tdms(path, {"angle 1": a, "angle 2": b}, **{"angle 1": wave, "angle 2": wave})
-    size = len(path.read_bytes())
-    write_tdms(path, {"angle 1": a, "angle 2": b}, segments=2, **{"angle 1": wave, "angle 2": wave})
-    data = path.read_bytes()
-    second = data.index(b"TDSm", 4)
-    assert size > second
-    path.write_bytes(data[: second + 20])
-    ds = read_recording(path, parse_mapping(RIG))
-    assert "truncated" in {f.kind for f in findings_of(ds)}
-    assert ds.sizes["sample"] == 1000
-
-
 def test_read_tdms__other_unit_is_a_finding(tmp_path, make):
     a, b = make.swing()
     path = tmp_path / "deg.tdms"
@@ -118,22 +89,6 @@ def test_read_tdms__other_unit_is_a_finding(tmp_path, make):
     (found,) = findings_of(read_recording(path, mapping))
     assert (found.kind, found.channel) == ("unit", "psi2")
     assert "the file says 'deg', the mapping 'rad'" in found.text
-
-
-@pytest.mark.parametrize("part", ["whole", "window", "simulated"])
-def test_write_recording__tdms_is_read_back(tmp_path, make, part):
-    """Time counts from the first sample of what is in the file."""
-    ds = make.recorded().assign_attrs({"simulated": 1} if part == "simulated" else {})
-    ds = window(ds, (1.0, 2.0)) if part == "window" else ds
-    path = write_recording(ds, tmp_path / "x.tdms")
-    found = read_recording(path, mapping_for(ds, path))
-    make.same(found, ds.assign_coords(time=ds["time"] - ds["time"][0]))
-    assert found.attrs.get("simulated") == ds.attrs.get("simulated")
-    assert findings_of(found) == []
-
-
-def test_read_tdms__damaged_files_are_read_or_refused(tmp_path, make):
-    check_damaged_files(tmp_path, make, ".tdms")
 
 
 # ---- MATLAB --------------------------------------------------------------------------------------
@@ -199,32 +154,21 @@ LVM_MAPPING = {
 
 
 @pytest.mark.parametrize("columns", ["One", "Multi", "No"])
-@pytest.mark.parametrize("decimal", [".", ","])
-def test_read_lvm__columns_and_decimal_commas(tmp_path, make, columns, decimal):
-    a, b = (v[:300] for v in make.swing())
-    segment = lvm_segment(a, b, columns=columns, time="12:00:00.5", comment="début")
-    path = written_lvm(tmp_path / "x.lvm", [segment], decimal=decimal, columns=columns)
-    ds = read_recording(path, parse_mapping(LVM_MAPPING))
-    assert findings_of(ds) == []
-    assert ds.attrs["sampling_rate_hz"] == 500.0
-    np.testing.assert_allclose(ds["psi1"], a, atol=1e-12)
-    np.testing.assert_allclose(ds["psi2"], b, atol=1e-12)
-
-
-@pytest.mark.parametrize("columns", ["One", "Multi", "No"])
-def test_read_lvm__segments_that_follow_on_are_one_recording(tmp_path, make, columns):
-    """A header for every 100 samples, as a program writes that appends what it has."""
+@pytest.mark.parametrize(("decimal", "n"), [(".", 300), (",", 300), (",", 100)])
+def test_read_lvm__columns_decimal_commas_and_segments(tmp_path, make, columns, decimal, n):
+    """One header, or one for every 100 samples as a program writes that appends what it has."""
     a, b = (v[:300] for v in make.swing())
     segments = [
-        lvm_segment(a[i : i + 100], b[i : i + 100], columns=columns, time=f"12:00:{0.5 + 0.002 * i:09.6f}")
-        for i in (0, 100, 200)
+        lvm_segment(a[i : i + n], b[i : i + n], columns=columns, time=f"12:00:{0.5 + 0.002 * i:09.6f}", comment="début")
+        for i in range(0, 300, n)
     ]
-    path = written_lvm(tmp_path / "x.lvm", segments, decimal=",", columns=columns)
+    path = written_lvm(tmp_path / "x.lvm", segments, decimal=decimal, columns=columns)
     ds = read_recording(path, parse_mapping(LVM_MAPPING))
     assert findings_of(ds) == []
     assert not ds["piece"].any()
+    assert ds.attrs["sampling_rate_hz"] == 500.0
     np.testing.assert_allclose(ds["time"], make.time[:300], atol=1e-9)
-    np.testing.assert_allclose(ds["psi1"], a, atol=1e-12)
+    np.testing.assert_allclose([ds["psi1"], ds["psi2"]], [a, b], atol=1e-12)
 
 
 def test_read_lvm__gap_between_segments_is_a_finding(tmp_path, make):

@@ -89,7 +89,6 @@ def test_parse_mapping__names_all_problems_at_once():
         ({"unit": "rpm"}, "is not one of rad"),
         ({"unit": "V", "scale": 0.0}, "must not be 0"),
         ({"range": [5.0, 0.0]}, "the second number must be the greater one"),
-        ({"sign": 2}, "sign"),
         ({"relative_to": "psi2"}, "must be another channel of this mapping"),
     ],
 )
@@ -107,8 +106,13 @@ def test_parse_mapping__refuses(entry, sentence):
         ({"channels": None}, "channels: missing"),
         ({"drive": "off"}, 'must be "none"'),
         ({"time": {"channel": "t"}, "sampling_rate_hz": 1.0}, "keep time or sampling_rate_hz"),
-        ({"window_s": [3.0, 1.0]}, "the second number must be the greater one"),
         ({"time": {"channel": "t", "unit": "V"}}, "time.unit"),
+        ({"window_s": [3.0, 1.0]}, "the second number must be the greater one"),
+        ({"resample": 50.0}, "resample: needs time stamps"),
+        (
+            {"resample": 50.0, "time": {"channel": "t"}, "channels": {"psi1": {"channel": "a", "wraps": True}}},
+            "channels.psi1.wraps",
+        ),
     ],
 )
 def test_parse_mapping__refuses_a_whole_that_does_not_fit(changed, sentence):

@@ -59,22 +59,6 @@ def driven(make, level):
     return recording_of(make.raw(make.channels({"a": a, "b": b, "m": level})), mapping)
 
 
-def test_switches__of_a_square_wave_and_where_it_is_switched_off(make):
-    t = make.time
-    level = np.where(np.mod(t, 0.5) < 0.25, 1.0, -1.0) * (t < 3.0)
-    rng = np.random.default_rng(0)
-    found = _switches(driven(make, level + 0.03 * rng.standard_normal(make.n)))
-    expected = np.arange(1, 13) * 0.25
-    np.testing.assert_allclose(found, expected, atol=make.step_s)
-
-
-def test_switches__with_flanks_of_a_few_samples(make):
-    level = np.where(np.mod(make.time, 0.5) < 0.25, 5.0, 0.0)
-    flat = np.convolve(np.pad(level, (3, 0), mode="edge"), np.ones(4) / 4, mode="valid")
-    found = _switches(driven(make, flat))
-    assert np.abs(found[:, None] - 0.25 * np.arange(1, 16)).min(axis=1).max() < 3 * make.step_s
-
-
 @pytest.mark.parametrize("kind", ["sine", "none", "noise"])
 def test_switches__none_where_the_drive_does_not_leap(make, kind):
     rng = np.random.default_rng(0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -30,12 +32,15 @@ def pieces(make):
     return recording_of(make.raw(make.channels({"t": stamps, "a": a, "b": b, "m": drive}, step_s=np.nan)), mapping)
 
 
-@pytest.mark.parametrize("kind", ["whole", "pieces", "simulated", "window"])
-def test_write_recording__csv_is_read_back(tmp_path, make, pieces, kind):
+@pytest.mark.slow  # needs nptdms
+@pytest.mark.parametrize(
+    ("suffix", "kind"), [*product((".csv", ".tdms"), ("whole", "simulated", "window")), (".csv", "pieces")]
+)
+def test_write_recording__is_read_back(tmp_path, make, pieces, suffix, kind):
     ds = pieces if kind == "pieces" else make.recorded()
     ds = ds.assign_attrs(simulated=1) if kind == "simulated" else ds
     ds = window(ds, (1.0, 2.0)) if kind == "window" else ds
-    path = write_recording(ds, tmp_path / "x.csv")
+    path = write_recording(ds, tmp_path / f"x{suffix}")
     mapping = tmp_path / "x.toml"
     mapping.write_text(mapping_for(ds, path).toml())
     found = read_recording(path, load_mapping(mapping))

@@ -1,0 +1,311 @@
+"""Compute the features of an attractor: ranges, rotation, class of motion, energy, mirror image.
+
+Half a drive period
+-------------------
+A drive whose second half is minus its first gives many systems a symmetry that takes half a period, such as
+``y(t) -> -y(t + T/2)``. On the section (t = 0) the image of a point x is then minus the state at t = T/2 of
+the motion from x, not minus x itself. The model declares its symmetry. The image of a closed orbit is
+computed from its polished orbit, the image of a bounded set from its stored points. The mirror partner is the
+attractor nearest to the image, where a difference in rotation adds to the distance. A motion that is its own
+image is its own partner. If the symmetry is approximate (a duty cycle of 0.4927 instead of one half),
+`mirror_distance` measures how well it holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magpend_core.defaults import MOST_STEPS
+from magpend_core.models.model import Mirror, Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.pointwise import evaluate
+from magpend_core.sampling import Drive, sample
+from magpend_core.status import Status
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
+from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
+from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points, rows_by_number
+from pipeline.analysis.sides import UNKNOWN
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
+from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
+
+ENERGY = "energy"
+"""Name of the model's quantity whose range is computed for each attractor."""
+
+SAMPLES = 256
+"""Times per drive period or return at which a polished orbit is sampled for its ranges; even."""
+
+MOST_SAMPLES = 2**20
+"""Most states of orbits that are held at once."""
+
+
+@dataclass
+class Cells:
+    """Statistics of the trajectories (cells) on one attractor, collected from one block of cells after another."""
+
+    n_points: int
+    n: int = 0  # cells
+    # (state,): range of the kept sections
+    low: np.ndarray = field(default_factory=lambda: np.full(1, np.inf))
+    high: np.ndarray = field(default_factory=lambda: np.full(1, -np.inf))
+    # list of ndarray, (cell, angle): mean rotation of the cells
+    rotations: list[np.ndarray] = field(default_factory=list)
+    # list of ndarray, (cell, angle): full turns of the cells over their sections
+    turns: list[np.ndarray] = field(default_factory=list)
+    sides: dict[int, int] = field(default_factory=dict)  # cells by the classifier's code
+    points: np.ndarray | None = None  # (m, state): section points of least hash
+    # list of ndarray, (cell,): mean time between two sections of the cells [s]
+    seconds: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
+        """Add some cells of a block to the statistics; `labels` has the class of motion (a code) of every cell of the
+        block.
+        """
+        section = block.section[cells]
+        self.n += len(cells)
+        flat = section.reshape(-1, section.shape[-1])
+        self.low = np.minimum(self.low, flat.min(axis=0))
+        self.high = np.maximum(self.high, flat.max(axis=0))
+        self.rotations.append(mean_rotation(section, block.turns[cells], geometry))
+        self.turns.append(np.abs(block.turns[cells]))
+        for code, count in zip(*np.unique(labels[cells], return_counts=True), strict=True):
+            self.sides[int(code)] = self.sides.get(int(code), 0) + int(count)
+        if block.seconds is not None:
+            self.seconds.append(block.seconds[cells].mean(axis=1))
+        both = flat if self.points is None else np.concatenate([self.points, flat])
+        least = np.unique(hashes(both), return_index=True)[1][: self.n_points]
+        self.points = both[least]
+
+    @property
+    def mean_rotation(self) -> np.ndarray:
+        """Mean rotation of the cells [turns per drive period]. Its bits do not depend on the order of the cells."""
+        return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
+
+    @property
+    def mean_seconds(self) -> float:
+        """Mean time between two successive section points of the cells [s]; NaN if no times are known."""
+        return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
+
+    def side(self, parameters: Parameters, frequency: float) -> int:
+        """Return the attractor's class of motion (a code): the class of all its cells or, if they differ, of their
+        pooled points.
+
+        The pooled points are classified with the median of the cells' turns.
+        """
+        known = [code for code in self.sides if code != UNKNOWN]
+        if len(known) <= 1:
+            return known[0] if known else UNKNOWN
+        assert self.points is not None
+        turns = np.median(np.concatenate(self.turns), axis=0).astype(np.int64)
+        return int(sides_of(self.points[None], turns[None], frequency, parameters)[0])
+
+
+@dataclass
+class Features:
+    """Features of one attractor at one parameter point; ``None`` and NaN mean "not known".
+
+    The attributes become variables of the same name; see `pipeline.analysis.attractors.attractors`.
+    """
+
+    points: np.ndarray
+    kind: int
+    orbit_period: int
+    rotation: np.ndarray
+    side: int
+    state_min: np.ndarray
+    state_max: np.ndarray
+    energy_min: float = np.nan
+    energy_max: float = np.nan
+    multipliers: np.ndarray | None = None
+    residual: float = np.nan
+    is_polished: bool = False
+    stability: int = NOT_SETTLED
+    evidence: int = 0
+    multiplier_error: float = np.nan
+    lyapunov_max: float = np.nan
+    lyapunov_low: float = np.nan
+    lyapunov_high: float = np.nan
+    n_sampled: int = 0
+    n_left: int = 0
+    n_leaving: int = 0
+    time_at_risk: float = np.nan
+    mean_lifetime: float = np.nan
+    lifetime_low: float = np.nan
+    lifetime_high: float = np.nan
+    n_to: np.ndarray | None = None
+    closes_above: int = 0
+    dimension: int = 0
+    period_s: float = np.nan
+    eigenvalues: np.ndarray | None = None
+    image: np.ndarray | None = None
+    mirror_partner: int = -1
+    mirror_distance: float = np.nan
+
+
+def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Compute the mean rotation of each angle over the stored section points [turns per drive period], shape (cell,
+    angle).
+    """
+    angles = np.asarray(geometry.is_angle)
+    change = section[:, -1, angles] - section[:, 0, angles]
+    n = max(section.shape[1] - 1, 1)
+    return np.asarray((change / TWO_PI + turns) / n)
+
+
+def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None) -> np.ndarray:
+    """Return the class of motion of each trajectory from its section points, by the model's classifier. It is "unknown"
+    if the model has no classifier or a point is NaN.
+    """
+    classifier = parameters.model.classifier if parameters is not None else None
+    if classifier is None or parameters is None:
+        return np.full(len(section), UNKNOWN, np.int64)
+    code = classifier.classify(np.nan_to_num(section), turns, np.asarray(frequency), parameters)
+    return np.where(np.isfinite(section).all(axis=(1, 2)), code, UNKNOWN).astype(np.int64)
+
+
+def follow_orbits(orbits: Sequence[tuple[Features, Parameters, float]], geometry: Geometry) -> None:
+    """Integrate periodic orbits over their periods, and store their ranges, exact rotations, energy ranges and mirror
+    images.
+
+    Parameters
+    ----------
+    orbits
+        Features of each orbit, its parameters, and the drive frequency or the mean frequency of the returns [Hz].
+    geometry
+        Geometry of the states.
+    """
+    by_period = rows_by_number(np.array([found.orbit_period for found, _, _ in orbits], np.int64))
+    for period, rows in by_period.items():
+        n = max(1, MOST_SAMPLES // (period * SAMPLES))
+        for begin in range(0, len(rows), n):
+            _follow([orbits[row] for row in rows[begin : begin + n]], period, geometry)
+
+
+def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry) -> None:
+    flows = [of_flow(parameters) for _, parameters, _ in orbits]
+    times = [np.arange(period * SAMPLES + 1) / (SAMPLES * frequency) for _, _, frequency in orbits]
+    paths = sample(
+        flows[0].model.system,
+        np.array([flow.pack() for flow in flows]),
+        np.array([found.points[0] for found, _, _ in orbits]),
+        times,
+        drives=[Drive(np.full(period, 1.0 / frequency)) for _, _, frequency in orbits],
+        rtol=PORTRAIT_RTOL,
+        atol=PORTRAIT_RTOL,
+        max_steps_per_interval=MOST_STEPS,
+        limits_first_step=False,
+    )
+    if (paths.status != Status.BOUNDED).any():
+        raise ArithmeticError(f"An orbit ended early: {Status(paths.status.max()).sentence}.")
+    angles = np.flatnonzero(geometry.is_angle)
+    turns = np.round((paths.states[:, -1] - paths.states[:, 0])[:, angles] / TWO_PI)
+    low, high = paths.states.min(axis=1), paths.states.max(axis=1)
+    for row, (found, parameters, frequency) in enumerate(orbits):
+        found.rotation = turns[row] / period + 0.0  # no -0.0
+        found.state_min, found.state_max = low[row], high[row]
+        rotating = angles[turns[row] != 0]
+        found.state_min[rotating], found.state_max[rotating] = -np.pi, np.pi
+        _fill_energy(found, times[row], paths.states[row], flows[row], frequency)
+        mirror = parameters.model.mirror
+        if mirror is not None:
+            first = SAMPLES // 2 if mirror.half_period else 0
+            found.image = paths.states[row, first : period * SAMPLES : SAMPLES] * np.array(mirror.signs)
+
+
+def fill_cycle(found: Features, cycle: Cycle) -> None:
+    """Store the features of a limit cycle, for an autonomous flow that is sampled at equal times."""
+    found.kind, found.period_s, found.residual = PERIODIC_ORBIT, cycle.seconds, cycle.residual
+    found.stability, found.evidence = ATTRACTS, BY_MULTIPLIERS
+    found.multipliers, found.lyapunov_max = cycle.multipliers, 0.0
+    found.lyapunov_low = found.lyapunov_high = 0.0
+
+
+def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
+    """Return the features of an equilibrium. Its largest Lyapunov exponent is the largest real part of the
+    eigenvalues.
+    """
+    by_probes = BY_APPROACH if found.side is None else BY_ONE_SIDE
+    x = Features(
+        found.state[None],
+        EQUILIBRIUM,
+        0,
+        np.zeros(n_angles),
+        UNKNOWN,
+        found.state,
+        found.state,
+        residual=found.residual,
+        is_polished=True,
+        stability=found.stability,
+        evidence=by_probes if found.approached_within else BY_EIGENVALUES,
+        eigenvalues=found.eigenvalues,
+    )
+    x.lyapunov_max = x.lyapunov_low = x.lyapunov_high = float(found.eigenvalues.real[0])
+    if parameters is None:
+        return x
+    x.side = int(sides_of(x.points[None], np.zeros((1, n_angles), np.int64), np.inf, parameters)[0])
+    follow_points(x, parameters, 1.0)
+    return x
+
+
+def follow_points(found: Features, parameters: Parameters, frequency: float) -> None:
+    """Compute the energy range and the mirror image of an attractor or other set from its stored section points."""
+    _fill_energy(found, np.zeros(len(found.points)), found.points, of_flow(parameters), frequency)
+    mirror = parameters.model.mirror
+    if mirror is None:
+        return
+    ends = found.points
+    if mirror.half_period:
+        half = Drive(np.array([1.0 / frequency]))
+        followed = sample(
+            parameters.model.system,
+            np.tile(parameters.pack(), (len(ends), 1)),
+            ends,
+            [np.array([0.5 / frequency])],
+            piece=np.zeros(len(ends), np.int64),
+            drives=[half],
+            rtol=PORTRAIT_RTOL,
+            atol=PORTRAIT_RTOL,
+            limits_first_step=False,
+        )
+        ends = followed.states[:, 0]
+    found.image = ends * np.array(mirror.signs)
+
+
+def has_energy(parameters: Parameters) -> bool:
+    """Return whether the model has a quantity named energy."""
+    return any(quantity.name == ENERGY for quantity in parameters.model.quantities)
+
+
+def _fill_energy(
+    found: Features, times: np.ndarray, states: np.ndarray, parameters: Parameters, frequency: float
+) -> None:
+    if has_energy(parameters):
+        energies = evaluate([ENERGY], times, states, parameters, frequency)
+        found.energy_min, found.energy_max = float(energies.min()), float(energies.max())
+
+
+def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geometry: Geometry) -> None:
+    """Find each attractor's mirror partner: the attractor nearest to its mirror image, if the two are within
+    `threshold`.
+    """
+    turned = np.array(mirror.signs)[list(geometry.is_angle)]
+    for a in found:
+        if a.image is None:
+            continue
+        distances = [
+            mean_distance(a.image, b.points, geometry)
+            + float(np.abs(turned * a.rotation - b.rotation).max(initial=0.0))
+            for b in found
+        ]
+        nearest = int(np.argmin(distances))
+        a.mirror_distance = distances[nearest]
+        a.mirror_partner = nearest if distances[nearest] <= threshold else -1
+
+
+def sorted_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Sort section points (n, state) in lexicographic order of their scaled and rounded values."""
+    rounded = rounded_points(points, geometry)
+    return np.asarray(points[np.lexsort(rounded.T[::-1])])

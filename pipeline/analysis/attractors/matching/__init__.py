@@ -1,1 +1,0 @@
-"""Match attractors along the swept parameters: ids, connected branches, hysteresis."""

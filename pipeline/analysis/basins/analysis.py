@@ -1,0 +1,344 @@
+"""Define the analysis ``basins``: the outcomes of a sweep's cells, basin fractions and boundaries, and their table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.basins.boundaries import basin_entropy, box_sides, epsilons_of, uncertainty_exponent
+from pipeline.analysis.basins.numbers import basin_rows
+from pipeline.analysis.basins.wada import wada_merge_test
+from pipeline.analysis.outcomes import DIVERGED, other_cells, outcomes, told
+from pipeline.analysis.ragged import dims_of, places_of_rows
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import (
+    FEW_POINTS,
+    FRACTION,
+    Row,
+    Words,
+    largest_share,
+    leading,
+    point_table,
+    points_of,
+    ranges,
+    summary,
+    with_interval,
+)
+from pipeline.layout import vocabulary
+from pipeline.layout.vocabulary import letter, split_dims
+from pipeline.products.basins import BasinOptions
+from pipeline.products.product import Table
+
+
+def needs_starts(run: OpenRun, options: BasinOptions) -> None:
+    """Raise ValueError unless the run's cells are independent initial conditions."""
+    check_starts(run.cube())
+
+
+def basins(run: OpenRun, options: BasinOptions) -> xr.Dataset:
+    """Compute the basins of attraction of a sweep: the outcomes of its cells, the basin fractions and the basin
+    boundaries.
+    """
+    found = run.derive("attractors")
+    return basins_of(run.cube(), found, options)
+
+
+def basins_table(ds: xr.Dataset) -> Table:
+    """Return the table of basins. It has one row per outcome and parameter point, with the number of cells and the
+    basin fraction.
+
+    The lines have a table per point if there are few, otherwise ranges; the boundaries follow.
+    """
+    rows, dims = _rows(ds), dims_of(ds)
+    confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
+    lines = [f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, {confidence}"]
+    if int(np.prod([ds.sizes[d] for d in dims])) > FEW_POINTS:
+        shown, n_others = leading(rows, "label", "n_cells")
+        lines += summary(ds, shown, dims, _label_summary, "label")
+        lines += [f"  and {n_others} smaller ones; all are in --csv and --json"] if n_others else []
+        lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
+    else:
+        for at, where in points_of(ds, dims):
+            one = ds.isel(at)
+            table = point_table(ds, where, rows, _basin_words)
+            lines += table
+            if len(table) > 1:
+                bound = float(one["unseen_high"])
+                lines.append(f"  an attractor that no cell shows: at most {bound:.3g} of the region")
+            lines += _boundary_lines(one)
+    lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
+    return Table(rows, [*lines, _sentence(ds)])
+
+
+def _rows(ds: xr.Dataset) -> list[Row]:
+    dims = dims_of(ds)
+    columns = dict(zip(dims, places_of_rows(ds, dims), strict=True))
+    columns |= {"label": ds["attractor"].values, "n_cells": ds["count"].values}
+    names = ("n_inferred", *FRACTION, "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
+    columns |= {name: ds[name].values for name in names}
+    return [dict(zip(columns, row, strict=True)) for row in zip(*(c.tolist() for c in columns.values()), strict=True)]
+
+
+_OTHERS = {
+    "n_pending": "pending",
+    "n_not_settled": "not settled",
+    "n_transient": "on a transient set",
+    "n_unstable": "on an unstable orbit or equilibrium",
+    "n_neutral": "on a neutral set",
+    "n_failed": "that could not be integrated",
+}
+
+
+def _sentence(ds: xr.Dataset) -> str:
+    counts = {"diverged": int(ds["count"].values[ds["attractor"].values == DIVERGED].sum())}
+    counts |= {text: int(ds[name].sum()) for name, text in _OTHERS.items()}
+    return told(ds["outcome"].size, {text: n for text, n in counts.items() if n})
+
+
+def _basin_words(row: Row) -> Words:
+    unfinished = row["fraction_if_all"] > row["fraction_if_none"]
+    return {
+        "id": "diverged" if row["label"] == DIVERGED else str(row["label"]),
+        "cells": str(row["n_cells"]),
+        "fraction": with_interval(row, FRACTION, ".4f"),
+        "with the unfinished": f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}" if unfinished else None,
+        "letter": "-" if row["label"] == DIVERGED else letter(row["label"]),
+        "inferred cells": str(row["n_inferred"] or "") or None,
+    }
+
+
+def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Words:
+    first = _basin_words(rows[0])
+    return {
+        "id": first["id"],
+        **ranges(ds, rows, dims),
+        "cells": str(sum(r["n_cells"] for r in rows)),
+        "max fraction": largest_share(ds, rows, dims),
+        "letter": first["letter"],
+        "inferred cells": str(sum(r["n_inferred"] for r in rows) or "") or None,
+    }
+
+
+_BOUNDARY = {
+    "basin_entropy": "basin entropy",
+    "boundary_basin_entropy": "boundary basin entropy",
+    "uncertainty_exponent": "uncertainty exponent",
+    "wada_beyond": "cells off the common boundary (Wada)",
+}
+
+
+def _boundary_lines(one: xr.Dataset) -> list[str]:
+    lines = []
+    for name, text in _BOUNDARY.items():
+        if name in one and np.isfinite(float(one[name])):
+            value, error, low, high = (float(one[f"{name}{end}"]) for end in ("", "_stderr", "_low", "_high"))
+            known = f"± {error:.2g} ({low:.4g} to {high:.4g})"
+            lines.append(f"  {text}: {value:.4g} {known if np.isfinite(error) else '(error not known)'}")
+    if int(one.get("above_ln2_surely", -1)) == 1:
+        lines.append("  the boundary basin entropy exceeds ln 2: the boundary is fractal")
+    if int(one.get("wada", -1)) >= 0:
+        verdict = "passes" if int(one["wada"]) else "does not pass"
+        lines.append(
+            f"  Wada merge test: {verdict} with radius {one.attrs['basin_radius']} "
+            f"(it takes {float(one['wada_distance']):g} cells)"
+        )
+    return lines
+
+
+def _range_line(ds: xr.Dataset, name: str, text: str) -> str:
+    values = ds[name].values[np.isfinite(ds[name].values)]
+    if not values.size:
+        return f"  {text}: nowhere"
+    return f"  {text}: {values.min():.4g} to {values.max():.4g} at {values.size} points"
+
+
+def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None, **changes: Any) -> xr.Dataset:
+    """Compute the basins of attraction at each parameter point of a sweep, with fractions and boundaries.
+
+    Parameters
+    ----------
+    ds
+        Cube of a sweep.
+    ids
+        Result of `match` or `identify` for the cube.
+    options
+        By default the defaults of `BasinOptions`. See `pipeline.analysis.intervals.binomial_interval` for the
+        intervals, `boundaries.basin_entropy` for the boxes, `boundaries.uncertainty_exponent` for the scaling, and
+        `wada.wada_merge_test` for radius and metric.
+    changes
+        Fields of `BasinOptions`, used if `options` is None.
+
+    Returns
+    -------
+    Dataset
+        On the cells: `attractor_id`, `decision`, `status`, `n_periods`, and `outcome`, the attractor that a
+        cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). One row (`pipeline.analysis.ragged`)
+        for each outcome of cells at each parameter point, with `attractor`, the id or -2: the variables of
+        `numbers.basin_rows`, in which cells without an outcome count as unfinished. On the
+        parameter dims: `n_pending`, `n_not_settled`, `n_transient`, `n_unstable`, `n_neutral` and `n_failed`
+        (step limits), which add up to `n_unfinished`.
+
+        If the starts are a grid, evenly spaced along every axis, on the parameter dims:
+        `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
+        `_stderr`, `_low`, `_high`; `above_ln2_surely`, `boundary_dimension`, `exponent_r_squared`;
+        `wada_distance`, the smallest radius [cells] that passes the Wada test; `wada`: 1 passes with
+        `radius`, 0 does not, -1 fewer than three labels; and `uncertain`, also on `epsilon`. A number that
+        the grid does not allow is NaN, and the attribute ``not_computed`` gives the reason.
+
+    Raises
+    ------
+    ValueError
+        If the cube is a continuation, or an option is out of bounds.
+    """
+    options = options or BasinOptions(**changes)
+    check_starts(ds)
+    dims, start_dims = split_dims(ids["attractor_id"])
+    labels = outcomes(ids).transpose(*dims, *start_dims)
+    result = ids[["attractor_id", "decision", "status", "ran_out"]]
+    result["n_periods"] = ds["n_periods"].transpose(*dims, *start_dims).load()
+    result["outcome"] = labels.assign_attrs(units="1", long_name="attractor that the cell ends on")
+    inferred = (ids["status"] == vocabulary.INFERRED).transpose(*dims, *start_dims)
+    result = result.merge(basin_rows(labels, dims, inferred, options.confidence, options.interval))
+    result = result.assign(_unfinished(ids, dims))
+    if reason := _no_grid(ds, start_dims):
+        missing = {"boundaries": reason}
+    else:
+        missing = _problems(labels.shape[len(dims) :], options)
+        result = result.assign(_boundaries(labels, dims, options, missing))
+    about = {f"basin_{name}": getattr(options, name) for name in type(options).model_fields}
+    reasons = "\n".join(f"{name}: {reason}" for name, reason in missing.items())
+    return result.assign_attrs({**ids.attrs, **about, "not_computed": reasons})
+
+
+def check_starts(ds: xr.Dataset) -> None:
+    """Raise ValueError unless each parameter point has several cells with independent initial conditions."""
+    if "branch" in ds["status"].dims:
+        raise ValueError(
+            'basins need independent initial conditions, a sweep (kind = "sweep"): where a branch of a '
+            "continuation starts is the end of its last point."
+        )
+    if not split_dims(ds["status"])[1]:
+        raise ValueError("basins need several initial conditions per parameter point; this run has one.")
+
+
+def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
+    """Count the cells without an outcome at each parameter point by reason, such as "not computed" or "not settled"."""
+    others = other_cells(ids)
+    shape = ids["attractor_id"].transpose(*dims, ...).shape
+    kinds = {
+        "n_pending": (("pending",), "cells not computed"),
+        "n_not_settled": (("not settled",), "cells of which nothing could be shown"),
+        "n_transient": (("on a transient set",), "cells on sets that others were seen to leave"),
+        "n_unstable": (("on an unstable orbit or equilibrium",), "cells on sets that do not attract"),
+        "n_neutral": (("on a neutral set",), "cells on neutral sets"),
+        "n_failed": (
+            ("step limit", "step underflow", "unreached", "no return", "chatter"),
+            "cells that could not be integrated",
+        ),
+    }
+    found = {}
+    for name, (words, text) in kinds.items():
+        which = np.zeros(shape, bool)
+        for word in words:
+            which |= others.get(word, False)
+        count = which.reshape(*shape[: len(dims)], -1).sum(axis=-1, dtype=np.int64)
+        found[name] = xr.DataArray(count, dims=dims, attrs={"units": "1", "long_name": text})
+    return found
+
+
+def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
+    if "initial_condition" in start_dims:
+        return "the starts are no grid"
+    for dim in start_dims:
+        steps = np.diff(ds[dim].values)
+        if np.ptp(steps) > 1e-6 * np.abs(steps).max(initial=0.0):
+            return f"{dim} is not evenly spaced"
+    return ""
+
+
+def _problems(shape: tuple[int, ...], options: BasinOptions) -> dict[str, str]:
+    """Return why measures of the boundaries cannot be computed on a grid, by measure."""
+    found = {}
+    checks: dict[str, Callable[[], object]] = {
+        "basin entropy": lambda: box_sides(options.box, shape),
+        "uncertainty exponent": lambda: epsilons_of(None, shape, options.scaling),
+    }
+    for name, check in checks.items():
+        try:
+            check()
+        except ValueError as error:
+            found[name] = str(error)
+    return found
+
+
+_LONG_NAMES = {
+    "basin_entropy": ("nat", "basin entropy"),
+    "boundary_basin_entropy": ("nat", "boundary basin entropy"),
+    "uncertainty_exponent": ("1", "uncertainty exponent"),
+    "wada_beyond": ("1", "part of all cells that is off the common boundary"),
+    "above_ln2_surely": ("1", "boundary basin entropy surely above ln 2: a fractal boundary; -1 not known"),
+    "boundary_dimension": ("1", "dimension of the basin boundary"),
+    "exponent_r_squared": ("1", "R squared of the fit of the uncertainty exponent"),
+    "wada_distance": ("cells", "largest distance between boundaries, the least radius that passes"),
+    "wada": ("1", "passes the Wada merge test; -1 fewer than three labels"),
+}
+_FLAGS = ("above_ln2_surely", "wada")
+_WITH_ERRORS = ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent", "wada_beyond")
+_ERRORS = ("stderr", "low", "high")
+
+
+def _boundaries(
+    labels: xr.DataArray, dims: tuple[str, ...], options: BasinOptions, missing: Mapping[str, str]
+) -> dict[str, Any]:
+    """Measure the basin boundaries at each parameter point; return variables as (dims, values, attributes)."""
+    shape, grid = labels.shape[: len(dims)], labels.shape[len(dims) :]
+    points = [dict(_boundary(one, options, missing)) for one in labels.values.reshape(-1, *grid)]
+    found: dict[str, Any] = {}
+    for name, (units, text) in _LONG_NAMES.items():
+        ends = ("", *(f"_{end}" for end in _ERRORS)) if name in _WITH_ERRORS else ("",)
+        for end in ends:
+            lacking = -1 if name in _FLAGS else np.nan
+            values = np.array([point.get(name + end, lacking) for point in points])
+            values = values.astype(np.int8 if name in _FLAGS else np.float64).reshape(shape)
+            long_name = text + end.replace("_stderr", ", standard error").replace("_", ", ")
+            found[name + end] = (dims, values, {"units": units, "long_name": long_name})
+    if "uncertainty exponent" not in missing:
+        epsilon = epsilons_of(None, grid, options.scaling)
+        values = np.array([point.get("uncertain", np.full(len(epsilon), np.nan)) for point in points])
+        attrs = {"units": "1", "long_name": "uncertain part of the region"}
+        found["uncertain"] = ((*dims, "epsilon"), values.reshape(*shape, len(epsilon)), attrs)
+        found["epsilon"] = ("epsilon", epsilon, {"units": "cells"})
+    return found
+
+
+def _boundary(grid: np.ndarray, options: BasinOptions, missing: Mapping[str, str]) -> Iterator[tuple[str, Any]]:
+    """Yield the name and value of each measure of the basin boundaries on one grid of labels."""
+    if not (grid != -1).any():
+        return
+    common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}
+    if "basin entropy" not in missing:
+        entropy = basin_entropy(grid, options.box, block=options.block, **common)
+        for ours, theirs in (("basin_entropy", "entropy"), ("boundary_basin_entropy", "boundary_entropy")):
+            yield from _with_errors(entropy, ours, theirs)
+        if np.isfinite(entropy["boundary_entropy_low"]):
+            yield "above_ln2_surely", int(entropy["above_ln2_surely"])
+    if "uncertainty exponent" not in missing:
+        exponent = uncertainty_exponent(grid, method=options.scaling, **common)
+        yield from _with_errors(exponent, "uncertainty_exponent", "exponent")
+        yield "boundary_dimension", float(exponent["boundary_dimension"])
+        yield "exponent_r_squared", float(exponent["r_squared"])
+        yield "uncertain", exponent["uncertain"].values
+    if np.unique(grid[grid != -1]).size >= 3:
+        wada = wada_merge_test(grid, options.radius, metric=options.metric, **common).isel(radius=0)
+        yield from _with_errors(wada, "wada_beyond", "beyond")
+        yield "wada_distance", float(wada["hausdorff_distance"])
+        yield "wada", int(wada["wada"])
+
+
+def _with_errors(ds: xr.Dataset, ours: str, theirs: str) -> Iterator[tuple[str, float]]:
+    yield ours, float(ds[theirs])
+    for end in _ERRORS:
+        yield f"{ours}_{end}", float(ds[f"{theirs}_{end}"])

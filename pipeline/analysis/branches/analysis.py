@@ -1,0 +1,408 @@
+"""Define the analyses ``branches`` and ``curves`` of a run, and tabulate them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.sizes import LEVEL
+from pipeline.analysis.branches.bifurcations import FOLD
+from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import Row, Words, aligned, counted, values
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
+from pipeline.products.branches import BranchOptions, CurveOptions
+from pipeline.products.product import Table
+
+LEAST_PERIOD = 4
+"""Least limit for the periods of followed branches, however short the orbits of the run are."""
+
+NO_LENGTH = 1e-9
+"""Length of a stable segment, as a share of its branch, that is nothing but rounding."""
+
+
+def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
+    """Fill in the parameter interval of the branches from the run's swept axis; raise SpecError if it is empty."""
+    parameter = options.parameter
+    _refuse_frequency_of_flow(run, parameter)
+    low, high = interval_of(run, parameter, options.low, options.high)
+    return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
+
+
+def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
+    """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
+    from pipeline.specification.problems import SpecError
+
+    if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
+        swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
+        known = ", ".join(swept or run.model.parameter_names)
+        raise SpecError(f"{run.model.name} has no drive frequency to follow; give --parameter: {known}.")
+
+
+def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
+    """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
+    from pipeline.analysis.branches.dataset import dataset_of
+    from pipeline.analysis.branches.exploring import Scope, explore
+    from pipeline.analysis.branches.starting_orbits import attracting, recurrent
+
+    cube, parameter = run.cube(), axis_name(options.parameter)
+    interval = low, high = _ends(options)
+    base = parameters_of(cube)
+    starts, left_out = attracting(run.derive("attractors"), base, parameter, interval, options.max_period)
+    longest = options.max_period or max([LEAST_PERIOD, *(s.family.period for s in starts)])
+    if options.recurrences:
+        found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
+        starts += [s for s in found if low <= s.value <= high]
+    run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
+    scope = Scope(low, high, longest, options.generations)
+    followed = explore(starts, scope)
+    if starts and not followed:
+        left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
+    return dataset_of(followed, parameter, base, left_out)
+
+
+def _ends(options: BranchOptions) -> tuple[float, float]:
+    assert options.low is not None
+    assert options.high is not None
+    return options.low, options.high
+
+
+def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
+    """Fill in the parameter interval of the branches; raise SpecError unless the second parameter differs from the
+    first.
+    """
+    from pipeline.specification.problems import SpecError
+
+    settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
+    second = options.second
+    if axis_name(second) == axis_name(settled.parameter):
+        raise SpecError(f"{second} is the branches' own parameter; give another one.")
+    if swept_axis(run, second) is not None:
+        raise SpecError(
+            f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."
+        )
+    interval_of(run, second, options.second_low, options.second_high)
+    return settled
+
+
+def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
+    """Continue the bifurcations on the branches in the plane of the branches' parameter and a second one."""
+    from pipeline.analysis.branches.curves import curves_dataset, curves_from
+
+    located = run.derive("branches", **options.part(BranchOptions))
+    bounds = (_ends(options), (options.second_low, options.second_high))
+    second = axis_name(options.second)
+    base = parameters_of(run.cube())
+    found = curves_from(located, base, second, bounds, options.curve_period)
+    return curves_dataset(found, axis_name(options.parameter), second, base.model)
+
+
+def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:
+    """Return the axis of a parameter in the run's result cube; None if the run does not sweep it."""
+    axis = run.cube().coords.get(axis_name(parameter))
+    return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
+
+
+def interval_of(run: OpenRun, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
+    """Return the parameter interval of the branches; its default is the range that the run sweeps."""
+    from pipeline.specification.problems import SpecError, unknown_name
+
+    base = parameters_of(run.cube())
+    is_frequency = axis_name(parameter) == FREQUENCY_DIM
+    if not is_frequency and parameter not in base.names:
+        raise SpecError(unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM)))
+    axis = swept_axis(run, parameter)
+    if axis is not None:
+        ends = float(axis.min()), float(axis.max())
+    elif low is None or high is None:
+        raise SpecError(f"the run does not sweep {parameter}; give the interval with --from and --to.")
+    else:
+        ends = low, high
+    chosen = (ends[0] if low is None else float(low), ends[1] if high is None else float(high))
+    if not chosen[0] < chosen[1]:
+        raise SpecError(
+            f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; --from must be less than --to."
+        )
+    if is_frequency and chosen[0] <= 0.0:
+        raise SpecError(f"--from {chosen[0]}: a drive frequency must be greater than 0.")
+    for value in () if is_frequency else chosen:
+        base.replace(**{parameter: value})
+    return chosen
+
+
+def branches_table(ds: xr.Dataset) -> Table:
+    """Return the table of bifurcations, with text lines on the stable segments of branches and on attractors without a
+    branch.
+
+    Equilibria have the period 0, and eigenvalues [1/s] in place of multipliers. A Hopf point has the period of
+    its small cycles. ``normal_form`` is the coefficient of the normal form (see
+    `pipeline.analysis.branches.normal_forms`). ``unstable_below`` and ``unstable_above`` say how many
+    multipliers are unstable on the two sides of the parameter; at a fold both orbits lie on one side, and the
+    other says ``none``.
+    """
+    rows = table_of(ds)
+    if not ds.sizes["branch"]:
+        lines = ["no branch: no closed orbit to begin with", *_left_out(ds)]
+        return Table(rows, lines, _why_none(ds))
+    head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
+    lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
+    return Table(rows, [*lines, *_listed(ds, "stuck"), *_left_out(ds)])
+
+
+def _why_none(ds: xr.Dataset) -> str:
+    name = parameter_name(str(ds.attrs["parameter"]))
+    lines = str(ds.attrs.get("left_out", "")).splitlines()
+    reasons = Counter(line.partition(": ")[2] for line in lines)
+    told = [f"\n  {n} of {len(lines)}: {reason}" for reason, n in reasons.most_common()]
+    head = f"no branch along {name}: there is no closed orbit to begin with"
+    return f"{head}. Attractors left out:{''.join(told)}" if told else f"{head}; no cell has an attractor."
+
+
+def table_of(ds: xr.Dataset) -> list[Row]:
+    """Return one table row per located bifurcation, sorted by parameter value.
+
+    The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
+    that have other values than the run's own follow, and ``side`` where the model has words for motions.
+    """
+    parameter = parameter_name(str(ds.attrs["parameter"]))
+    rows = []
+    for k in np.argsort(ds["value"].values, kind="stable"):
+        one = ds.isel(bifurcation=int(k))
+        branch, told = int(one["of_branch"]), values(one, "kind", "criticality", "bifurcation_side")
+        below, above = _unstable(one, told["kind"])
+        rows.append(
+            {
+                parameter: float(one["value"]),
+                "bracket": float(one["bracket"]),
+                "type": told["kind"],
+                "criticality": "" if told["criticality"] == "unknown" else told["criticality"],
+                "period": int(ds["orbit_period"].values[branch]),
+                **({"side": told["bifurcation_side"]} if "bifurcation_side" in told else {}),
+                "multiplier_real": float(one["critical_real"]),
+                "multiplier_imag": float(one["critical_imag"]),
+                "normal_form": float(one["normal_form"]),
+                "normal_form_error": float(one["normal_form_error"]),
+                "unstable_below": below,
+                "unstable_above": above,
+                "period_s": float(one["bifurcation_period_s"]),
+                **fixed_of(ds, branch),
+                "branch": branch,
+                "to_branch": int(one["to_branch"]),
+            }
+        )
+    return rows
+
+
+def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
+    """Return the fixed parameters of a branch by name: the drive frequency, and those that differ from the run's
+    values.
+    """
+    parameter = str(ds.attrs["parameter"])
+    names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
+    names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
+    return {parameter_name(n): float(ds[n].values[branch]) for n in names}
+
+
+def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
+    """Return the numbers of unstable multipliers below and above a bifurcation, as texts."""
+    before, after = int(one["n_unstable_before"]), int(one["n_unstable_after"])
+    rises = bool(one["rises_before"])
+    if kind == FOLD:
+        both = f"{min(before, after)}|{max(before, after)}"
+        return (both, "none") if rises else ("none", both)
+    return (str(before), str(after)) if rises else (str(after), str(before))
+
+
+def _words(ds: xr.Dataset, row: Row) -> Words:
+    name, unit = str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"])
+    to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
+    return {
+        name if unit == "1" else f"{name} {unit}".rstrip(): f"{row[parameter_name(name)]:.7f}",
+        "type": row["type"],
+        "criticality": row["criticality"],
+        "normal_form": _with_error(row["normal_form"], row["normal_form_error"]),
+        "period": str(row["period"] or "equilibrium"),
+        # the period in drive periods says the same
+        "seconds": f"{row['period_s']:.6g}" if model_of(ds).crossing is not None else None,
+        "side": row.get("side"),
+        "multiplier": _number(complex(row["multiplier_real"], row["multiplier_imag"]), row["period"]),
+        "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
+        "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
+    }
+
+
+def _at(ds: xr.Dataset, branch: int) -> str:
+    found = [
+        f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
+        for name, value in fixed_of(ds, branch).items()
+        if int(ds["orbit_period"][branch]) or name != LEVEL  # equilibria are on no section
+    ]
+    return f" at {', '.join(found)}" if found else ""
+
+
+def _with_error(value: float, error: float) -> str:
+    """Format a coefficient with as many digits as its error allows (1 to 4); ``?`` if the error is larger than the
+    value.
+    """
+    if not abs(value) > error:
+        return "?"
+    digits = int(np.clip(np.floor(np.log10(abs(value) / max(error, 1e-300))), 1, 4))
+    return f"{value:.{digits}g}"
+
+
+def _number(z: complex, period: int) -> str:
+    return (f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i") + ("" if period else " 1/s")
+
+
+def _windows(ds: xr.Dataset) -> list[str]:
+    lines = ["stable segments"]
+    for w in windows_of(ds):
+        ends = f"{w['from']:.7f} ({w['begins']}) to {w['to']:.7f} ({w['ends']})"
+        side = f", {w['side']}" if w["side"] else ""
+        what = f"period {w['period']}" if w["period"] else "equilibrium"
+        lines.append(f"  {what}{side}, branch {w['branch']}{_at(ds, w['branch'])}: {ends}")
+    return lines if len(lines) > 1 else ["no stable segment"]
+
+
+def _left_out(ds: xr.Dataset) -> list[str]:
+    return _listed(ds, "left_out")
+
+
+def _listed(ds: xr.Dataset, name: str) -> list[str]:
+    """Return the lines of an attribute under its name."""
+    lines = str(ds.attrs.get(name, "")).splitlines()
+    return ["", name.replace("_", " "), *(f"  {line}" for line in lines)] if lines else []
+
+
+def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the stable segments of all branches, with the parameter values and the names of their bounds."""
+    found = []
+    for i in range(ds.sizes["branch"]):
+        n, closed = int(ds["n_points"][i]), _ends_of(ds, i)[0] == "closed"
+        line = ds["parameter"].values[i, :n]
+        runs = _stable_runs(ds["n_unstable"].values[i, :n] == 0, closed)
+        for first, last in [piece for run in runs for piece in _straight(line, *run)]:
+            ends = sorted([_bound(ds, i, first, 0), _bound(ds, i, last, 1)])
+            if not ends[1][0] - ends[0][0] > NO_LENGTH * np.ptp(line):
+                continue
+            middle = (first + (last - first) % n // 2) % n
+            found.append(
+                {
+                    "from": ends[0][0],
+                    "to": ends[1][0],
+                    "begins": ends[0][1],
+                    "ends": ends[1][1],
+                    "period": int(ds["orbit_period"][i]),
+                    "side": values(ds[["side"]].isel(branch=i, point=middle), "side")["side"] if "side" in ds else "",
+                    **fixed_of(ds, i),
+                    "branch": i,
+                }
+            )
+    return sorted(found, key=lambda w: (w["period"], w["side"], w["from"]))
+
+
+def _straight(line: np.ndarray, first: int, last: int) -> list[tuple[int, int]]:
+    """Split a series of points where their parameter turns, as where a branch goes on to its mirror image."""
+    n = len(line)
+    path = [(first + k) % n for k in range((last - first) % n + 1)]
+    if last < first < n - 1:
+        path.remove(n - 1)  # the last step of a closed branch repeats the first one
+    steps = np.sign(np.diff(line[path]))
+    turns = [path[k + 1] for k in np.flatnonzero(steps[:-1] * steps[1:] < 0.0)]
+    return list(pairwise([first, *turns, last])) if len(path) > 1 else [(first, last)]
+
+
+def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
+    """Return the first and last index of each series of stable points; on a closed branch, a series may pass the
+    start.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))
+    runs = [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+    if closed and len(runs) > 1 and stable[0] and stable[-1]:
+        runs = [(runs[-1][0], runs[0][1]), *runs[1:-1]]
+    return runs
+
+
+def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
+    ends = values(ds[["first_end", "last_end"]].isel(branch=branch), "first_end", "last_end")
+    return ends["first_end"], ends["last_end"]
+
+
+def _bound(ds: xr.Dataset, branch: int, point: int, end: int) -> tuple[float, str]:
+    """Return the parameter value and the name of the first (0) or last (1) bound of a stable segment: a bifurcation, or
+    the end of the branch.
+    """
+    n, value = int(ds["n_points"][branch]), float(ds["parameter"][branch, point])
+    after = point - 1 + end
+    here = np.flatnonzero((ds["of_branch"].values == branch) & (ds["after"].values == after))
+    if len(here):
+        return _named(ds, int(here[0 if end else -1]))
+    origins = np.flatnonzero(ds["to_branch"].values == branch)
+    nearest = origins[np.argmin(np.abs(ds["value"].values[origins] - value))] if len(origins) else -1
+    name = "not located" if point not in (0, n - 1) else _ends_of(ds, branch)[end]
+    beside = ds["parameter"].values[branch, max(point - 1, 0) : min(point + 2, n)]
+    is_near = nearest >= 0 and abs(float(ds["value"][nearest]) - value) <= np.ptp(beside)
+    if (nearest >= 0 and name in ("start", "period_halving", "equilibrium")) or (name == "not located" and is_near):
+        parent = int(ds["orbit_period"][int(ds["of_branch"][nearest])])
+        at, kind = _named(ds, int(nearest))
+        own = parent == int(ds["orbit_period"][branch])
+        return at, kind if own else f"{kind} of {f'period {parent}' if parent else 'an equilibrium'}"
+    return value, name
+
+
+def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
+    names = ["value", "criticality", "kind"]
+    one = values(ds[names].isel(bifurcation=k), *names)
+    return one["value"], f"{one['criticality']} {one['kind']}".removeprefix("unknown ")
+
+
+# ---- curves ------------------------------------------------------------------------------------
+
+
+def curves_table(ds: xr.Dataset) -> Table:
+    """Return the table of the points of codimension two, with text lines that describe the bifurcation curves.
+
+    ``error`` is the larger of the errors of both parameters, in units of the ranges that the curves cover.
+    """
+    names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
+    rows = [_special(ds, names, k) for k in range(ds.sizes["special"])]
+    rows.sort(key=lambda row: (row["type"], row[names[0]]))
+    lines = [f"{counted(ds.sizes['curve'], 'curve')} in the plane of {' and '.join(names)}"]
+    lines += [_curve_line(ds.isel(curve=i), i, names) for i in range(ds.sizes["curve"])]
+    missed = int(ds["n_missed"].sum())
+    if missed:
+        lines += ["", f"{counted(missed, 'sign change')} of test functions could not be located: points may be missing"]
+    if rows:
+        lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
+    return Table(rows, lines)
+
+
+def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
+    one = ds.isel(special=k)
+    ranges = [float(np.nanmax(ds[role].values) - np.nanmin(ds[role].values)) for role in ("first", "second")]
+    errors = [float(one[f"special_{role}_error"]) for role in ("first", "second")]
+    return {
+        "type": values(one, "special_kind")["special_kind"],
+        names[0]: float(one["special_first"]),
+        names[1]: float(one["special_second"]),
+        "period": int(one["special_period"]),
+        "error": max((e / r for e, r in zip(errors, ranges, strict=True) if r > 0.0), default=np.nan),
+        "curve": int(one["special_curve"]),
+    }
+
+
+def _special_words(row: Row) -> Words:
+    words = {name: f"{value:.7f}" if isinstance(value, float) else str(value) for name, value in row.items()}
+    return words | {"error": f"{row['error']:.1g}"}
+
+
+def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
+    told, n = values(one, "kind", "orbit_period", "first_end", "last_end"), int(one["n_points"])
+    lines = [one[role].values[:n] for role in ("first", "second")]
+    spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
+    ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
+    return f"  {number}: {told['kind']}, period {told['orbit_period']}: {spans}" + (f"; ends: {ends}" if ends else "")

@@ -1,0 +1,298 @@
+"""Track the edge states between two attractors of a run, as an analysis (`pipeline.products.resilience`).
+
+The Dataset has the dims ``edge`` (different edge states), ``point``, ``state``, ``multiplier``, ``pair`` (tracked
+pairs) and ``step`` (sections of their paths).
+
+===============================  =============================================================================
+variable                         meaning
+===============================  =============================================================================
+``kind``                         of the edge state: ``vocabulary.KINDS``; a bounded set where it is no orbit
+                                 and no equilibrium
+``section``, ``n_points``        its section points, in the order of time
+``orbit_period``, ``period_s``   period of an orbit
+``multiplier_real``, ``_imag``   Floquet multipliers of an orbit, by falling modulus
+``eigenvalue_real``, ``_imag``   eigenvalues of an equilibrium [1/s], by falling real part
+``residual``                     scaled residual of Newton's method; NaN of a bounded set
+``n_pairs``                      pairs that lead to it; 0 of an orbit on a path that does not settle
+``pair_edge``, ``pair_reason``   edge state of each pair, -1 none, and why it has none
+``pair_start``                   the two initial states of each pair
+``path``, ``n_steps``            middle of the pair at successive sections
+===============================  =============================================================================
+
+The attribute ``between`` has the ids of the two attractors, and ``between_letters`` their letters.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.attractors.destinations import Destinations, destinations_at
+from pipeline.analysis.attractors.extension.clouds import group
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
+from pipeline.analysis.attractors.finding.known_sets import Equilibrium
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.basins.analysis import check_starts
+from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.resilience.analysis import start_states
+from pipeline.analysis.resilience.edge_tracking import REASONS, Limits, Pair, Tracking, nearest_pairs, orbits_on
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.selection import select_points
+from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, words_of
+from pipeline.analysis.tolerances import SAME_EQUILIBRIUM
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BOUNDED_SET,
+    EQUILIBRIUM,
+    KINDS,
+    PERIODIC_ORBIT,
+    letter,
+    section_attributes,
+    split_dims,
+    told_by,
+)
+from pipeline.products.product import Table
+from pipeline.products.resilience import EdgeOptions
+
+CANDIDATES = 4
+"""Pairs that are bisected for each that is tracked: between some of them a third basin lies."""
+
+PURPOSE = "edge states are tracked at one parameter point"
+
+
+def needs_pair(run: OpenRun, options: EdgeOptions) -> None:
+    """Raise ValueError unless the run has independent initial states and the options choose a parameter point."""
+    cube = run.cube()
+    check_starts(cube)
+    select_points(cube, options.at, purpose=PURPOSE)
+    first, second = _letters(options.between)
+    if first == second:
+        raise ValueError(f"--between {' '.join(options.between)}: give two different attractors.")
+    if not options.closest < options.farthest:
+        raise ValueError(
+            f"--closest {options.closest:g} must be less than --farthest {options.farthest:g}: a pair is bisected "
+            "down to the first distance when it exceeds the second."
+        )
+
+
+def settle_edge(run: OpenRun, options: EdgeOptions) -> EdgeOptions:
+    """Replace ids of attractors by their letters, in rising order."""
+    first, second = sorted(_letters(options.between), key=lambda name: (len(name), name))
+    return options.model_copy(update={"between": (first, second)})
+
+
+def _letters(names: tuple[str, str]) -> list[str]:
+    """Return the letters of attractors that are named by letters or ids."""
+    return [letter(int(name)) if name.isdigit() else name for name in (n.strip().upper() for n in names)]
+
+
+def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
+    """Track the edge states between two attractors at a parameter point."""
+    whole = run.derive("attractors")
+    cube = select_points(run.cube(), options.at, purpose=PURPOSE)
+    attractors = select_points(whole, options.at, purpose=PURPOSE)
+    dims, starts = split_dims(attractors["attractor_id"])
+    here = attractors.isel(dict.fromkeys(dims, 0))
+    between = _ids_of(here, options.between)
+    (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
+    ((_, there),) = destinations_at(cube, attractors, points)
+    untold = [name for name, number in zip(options.between, between, strict=True) if number not in there.told]
+    if untold:
+        raise ValueError(f"trajectories cannot be told to end on attractor {untold[0]}; track between two others.")
+    labels = outcomes(here).transpose(*starts).values.ravel()
+    states = start_states(cube, starts)
+    candidates = nearest_pairs(states, labels, between, CANDIDATES * options.pairs, there, options.seed)
+    limits = Limits(options.closest, options.farthest, options.returns, there.options.max_orbit_period)
+    tracking = Tracking(there, between, limits)
+    pairs = tracking.choose(candidates, options.pairs)
+    initial = np.array([pair.start for pair in pairs]).reshape(len(pairs), 2, -1)
+    tracking.run(pairs)
+    settled = all(isinstance(pair.found, Orbit | Equilibrium) for pair in pairs)
+    paths = [np.array(pair.path) for pair in pairs if len(pair.path) > options.max_period]
+    on_paths = [] if settled else orbits_on(paths, there, between, options.max_period)
+    return _dataset(run, there, between, pairs, on_paths, initial, here)
+
+
+def _ids_of(here: xr.Dataset, names: tuple[str, str]) -> tuple[int, int]:
+    """Return the ids of two attractors from their letters; raise ValueError if the point has no such attractors."""
+    known = {letter(i): i for i in np.flatnonzero(here["stability"].values == ATTRACTS).tolist()}
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"attractor {name} is not at the parameter point; it has {', '.join(known) or 'none'} "
+                "(magpend analyse attractors)."
+            )
+    return known[names[0]], known[names[1]]
+
+
+def _distinct(pairs: list[Pair], geometry: Geometry, least: float) -> tuple[list[Any], list[int]]:
+    """Return the different edge states, and the number of that of each pair, -1 for none."""
+    orbits: list[Orbit] = []
+    rests: list[Equilibrium] = []
+    sets = [pair.found for pair in pairs if isinstance(pair.found, np.ndarray)]
+    numbers = iter(group(sets, geometry, least)[0].tolist() if sets else [])
+    keys: list[tuple[str, int] | None] = []
+    for pair in pairs:
+        one = pair.found
+        if isinstance(one, Orbit):
+            k = number_of(one, orbits, geometry)
+            orbits += [one] * (k == len(orbits))
+            keys.append(("orbit", k))
+        elif isinstance(one, Equilibrium):
+            near = [k for k, r in enumerate(rests) if geometry.distance(r.state, one.state) <= SAME_EQUILIBRIUM]
+            rests += [one] * (not near)
+            keys.append(("rest", near[0] if near else len(rests) - 1))
+        else:
+            keys.append(None if one is None else ("set", next(numbers)))
+    order = sorted({key for key in keys if key is not None})
+    found = [next(pair.found for pair, key in zip(pairs, keys, strict=True) if key == wanted) for wanted in order]
+    return found, [order.index(key) if key is not None else -1 for key in keys]
+
+
+def _dataset(
+    run: OpenRun,
+    there: Destinations,
+    between: tuple[int, int],
+    pairs: list[Pair],
+    on_paths: list[Orbit],
+    initial: np.ndarray,
+    here: xr.Dataset,
+) -> xr.Dataset:
+    found, edge_of = _distinct(pairs, there.geometry, there.settings.closure)
+    tracked = [one for one in found if isinstance(one, Orbit)]
+    found += [one for one in on_paths if number_of(one, tracked, there.geometry) == len(tracked)]
+    n_states = there.geometry.n_states
+    points = [_points_of(one) for one in found]
+    section = np.full((len(found), max((len(p) for p in points), default=0), n_states), np.nan)
+    for i, own in enumerate(points):
+        section[i, : len(own)] = own
+    path = np.full((len(pairs), max((len(p.path) for p in pairs), default=0), n_states), np.nan)
+    for i, pair in enumerate(pairs):
+        path[i, : len(pair.path)] = np.array(pair.path).reshape(-1, n_states)
+    units = {"units": "see state_units"}
+    flags = {"flag_values": np.arange(len(REASONS), dtype=np.int8), "flag_meanings": " ".join(REASONS)}
+    result = xr.Dataset(
+        {
+            "section": (("edge", "point", "state"), section, {**units, "long_name": "section points"}),
+            "n_points": ("edge", np.array([len(p) for p in points], np.int32), {"long_name": "section points"}),
+            **_about(found, n_states),
+            "n_pairs": ("edge", np.bincount([k for k in edge_of if k >= 0], minlength=len(found)), {"units": "1"}),
+            "pair_edge": ("pair", np.array(edge_of, np.int32), {"long_name": "edge state, -1 none"}),
+            "pair_reason": ("pair", np.array([p.reason for p in pairs], np.int8), {"long_name": "why none", **flags}),
+            "pair_start": (("pair", "side", "state"), initial, {**units, "long_name": "initial states"}),
+            "path": (("pair", "step", "state"), path, {**units, "long_name": "path along the boundary"}),
+            "n_steps": (
+                "pair",
+                np.array([len(p.path) for p in pairs], np.int32),
+                {"long_name": "sections of the path"},
+            ),
+        }
+    )
+    scalars = {str(k): v.variable for k, v in here.coords.items() if not v.ndim}
+    states = {name: here[name].variable for name in ("state", "state_units") if name in here.coords}
+    attrs = {**told_by(here.attrs), **section_attributes(run.model.crossing), "title": "edge states"}
+    attrs |= {"between": list(between), "between_letters": " ".join(letter(i) for i in between)}
+    return result.assign_coords({**scalars, **states}).assign_attrs(attrs)
+
+
+def _points_of(one: Orbit | Equilibrium | np.ndarray) -> np.ndarray:
+    if isinstance(one, Orbit):
+        return one.points
+    return one.state[None] if isinstance(one, Equilibrium) else one
+
+
+def _about(found: list[Any], n_states: int) -> dict[str, Any]:
+    """Return the variables of the edge states that are numbers: kind, period, multipliers, eigenvalues, residual."""
+    none = np.full(n_states, np.nan + 0.0j)
+    orbits = [one if isinstance(one, Orbit) else None for one in found]
+    rests = [one if isinstance(one, Equilibrium) else None for one in found]
+    kinds = [PERIODIC_ORBIT if o else EQUILIBRIUM if r else BOUNDED_SET for o, r in zip(orbits, rests, strict=True)]
+    multipliers = np.array([none if o is None else o.multipliers for o in orbits]).reshape(len(found), n_states)
+    eigenvalues = np.array([none if r is None else r.eigenvalues for r in rests]).reshape(len(found), n_states)
+    residual = [one.residual if isinstance(one, Orbit | Equilibrium) else np.nan for one in found]
+    flags: dict[str, Any] = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
+
+    def column(
+        values: Any, dtype: str, text: str, units: str = "1", **attrs: Any
+    ) -> tuple[str, np.ndarray, dict[str, Any]]:
+        return "edge", np.array(values, dtype), {"units": units, "long_name": text, **attrs}
+
+    variables: dict[str, Any] = {
+        "kind": column(kinds, "int8", "kind of set", **flags),
+        "orbit_period": column([o.period if o else 0 for o in orbits], "int32", "period in drive periods or returns"),
+        "period_s": column([o.seconds if o else np.nan for o in orbits], "float64", "period", "s"),
+        "residual": column(residual, "float64", "scaled residual of Newton's method"),
+    }
+    for name, values, units in (("multiplier", multipliers, "1"), ("eigenvalue", eigenvalues, "1/s")):
+        for part, numbers in (("real", values.real), ("imag", values.imag)):
+            variables[f"{name}_{part}"] = (("edge", "multiplier"), numbers, {"units": units})
+    return variables
+
+
+def edge_table(ds: xr.Dataset) -> Table:
+    """Return a row per section point of each edge state; print a line per edge state, and one per reason for none."""
+    letters = str(ds.attrs["between_letters"])
+    n_pairs, found = ds.sizes["pair"], int((ds["pair_edge"] >= 0).sum())
+    head = f"between {letters.replace(' ', ' and ')}: {counted(ds.sizes['edge'], 'edge state')}"
+    lines = [f"{head}, from {found} of {counted(n_pairs, 'pair')}"]
+    lines += aligned([_words(ds.isel(edge=i)) for i in range(ds.sizes["edge"])])
+    reasons = ds["pair_reason"].values
+    for code in np.unique(reasons[reasons > 0]).tolist():
+        lines.append(f"  not decided, {counted(int((reasons == code).sum()), 'pair')}: {_SENTENCES[REASONS[code]]}")
+    nothing = "" if n_pairs else f"no cells end on both of {letters}; grow the run, or choose two others."
+    return Table(_rows(ds), lines, nothing)
+
+
+_SENTENCES = {
+    "third_attractor": "another basin lies between the two; start closer to their common boundary with a finer grid",
+    "undecided": "states between the two end on no known attractor; a larger --budget may decide",
+    "lost": "the pair diverged, did not return to the section, or left the boundary; a smaller --farthest may help",
+    "parted": "it parts too far within one section to show where the boundary is; a smaller --closest may help",
+    "not_settled": "its path has not come to a set that repeats itself; give more --returns",
+}
+
+
+def _rows(ds: xr.Dataset) -> list[Row]:
+    names = [str(name) for name in ds["state"].values]
+    rows = []
+    for i in range(ds.sizes["edge"]):
+        one = ds.isel(edge=i)
+        for k in range(int(one["n_points"])):
+            point = {name: float(value) for name, value in zip(names, one["section"].values[k], strict=True)}
+            rows.append({"edge": i, "between": str(ds.attrs["between_letters"]), **_numbers(one), "point": k, **point})
+    return rows
+
+
+def _numbers(one: xr.Dataset) -> Row:
+    row: Row = {
+        "kind": words_of(one["kind"])[int(one["kind"])],
+        "period": int(one["orbit_period"]),
+        "n_pairs": int(one["n_pairs"]),
+        "residual": float(one["residual"]),
+    }
+    for name in ("multiplier", "eigenvalue"):
+        for k in range(one.sizes["multiplier"]):
+            row |= {f"{name}{k + 1}_{part}": float(one[f"{name}_{part}"][k]) for part in ("real", "imag")}
+    return row
+
+
+def _words(one: xr.Dataset) -> Words:
+    kind = int(one["kind"])
+    name = {PERIODIC_ORBIT: "multipliers", EQUILIBRIUM: "eigenvalues [1/s]"}.get(kind)
+    values = "" if name is None else ", ".join(_complex(one, "multiplier" if kind == PERIODIC_ORBIT else "eigenvalue"))
+    point = ", ".join(f"{value:.9g}" for value in one["section"].values[0])
+    return {
+        "kind": plain(words_of(one["kind"])[kind]),
+        "period": str(int(one["orbit_period"])) if kind == PERIODIC_ORBIT else "-",
+        "found by": counted(int(one["n_pairs"]), "pair") if int(one["n_pairs"]) else "on a path",
+        "first section point": point if kind != EQUILIBRIUM else f"at {point}",
+        name or "multipliers": values or "-",
+    }
+
+
+def _complex(one: xr.Dataset, name: str) -> list[str]:
+    real, imag = one[f"{name}_real"].values, one[f"{name}_imag"].values
+    return [f"{a:.6g}" if abs(b) <= 1e-9 * abs(a) else f"{a:.6g}{b:+.6g}i" for a, b in zip(real, imag, strict=True)]

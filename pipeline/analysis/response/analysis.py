@@ -1,0 +1,283 @@
+"""Turn branches of periodic orbits into a response; integrate on where a stable orbit ends; tabulate both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Parameters, Quantity, State
+from magpend_core.models.sectioned import of_flow
+from magpend_core.sections import run_branches
+from magpend_core.status import Status
+from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import Row, Words, aligned, words_of
+from pipeline.analysis.tolerances import CLOSURE, PORTRAIT_RTOL
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameter_name, parameters_of
+from pipeline.products.branches import BranchOptions
+from pipeline.products.product import Table
+from pipeline.products.response import ResponseOptions
+
+BEYOND = 1e-3
+"""How far beyond the end of a stable orbit a trajectory is integrated, as a share of the interval."""
+
+PATIENCE, LONGEST = 20_000, 64
+"""Drive periods or returns after which a trajectory is given up, and the longest period at which it may close."""
+
+LANDINGS = ("closed", "not_closed", "diverged", "failed")
+"""Values of `jump_landing`: whether the trajectory beyond a stable orbit's end has closed on another orbit."""
+
+_LANDED = {Status.PERIODIC: "closed", Status.BOUNDED: "not_closed", Status.DIVERGED: "diverged"}
+_LEFT_OUT = ("section", "multiplier", "eigenvalue", "residual", "bifurcation_section", "bifurcation_multiplier")
+
+Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
+
+
+def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
+    """Measure all orbits on the branches of a run.
+
+    Returns
+    -------
+    Dataset
+        The branches, and over (branch, point, channel): ``amplitude`` (half of peak to peak), ``mean``, ``rms`` with
+        their largest ``error``, and ``dominant_order``; over (..., harmonic) also ``harmonic_amplitude`` and ``phase``
+        [rad], the lag behind the drive. The same at the located points, under names that begin with
+        ``bifurcation_``. Over ``jump`` the ends of stable orbits, see `_jumps`.
+    """
+    located = run.derive("branches", **options.part(BranchOptions))
+    base = parameters_of(run.cube())
+    places = [(i, j) for i in range(located.sizes["branch"]) for j in range(int(located["n_points"][i]))]
+    run.echo(f"response: {len(places)} orbits")
+    rows = tuple(np.array(places, int).reshape(-1, 2).T)
+    variables: dict[str, Any] = {}
+    for name, (dims, found, about) in _measured([_at_point(located, base, *p) for p in places], options).items():
+        whole = np.full((located.sizes["branch"], located.sizes["point"], *found.shape[1:]), np.nan)
+        whole[rows] = found
+        variables[name] = (("branch", "point", *dims), whole, about)
+    events = [_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
+    there = _measured(events, options)
+    variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
+    variables |= _jumps(located, base, events, options)
+    flow = of_flow(base).model
+    both: list[State | Quantity] = [*flow.states, *flow.quantities]
+    kept = located.drop_vars([name for name in map(str, located.variables) if name.startswith((*_LEFT_OUT, "state"))])
+    return kept.assign(variables).assign_coords(
+        channel=("channel", [v.name for v in both], {"long_name": "state or quantity"}),
+        unit=("channel", [v.unit for v in both], {"long_name": "unit of the channel"}),
+        harmonic=np.arange(1, options.harmonics + 1),
+    )
+
+
+def _measured(orbits: Sequence[Orbit], options: ResponseOptions) -> dict[str, Variable]:
+    """Return the measures of orbits as variables, without the dims of the orbits."""
+    found = measures_of(orbits, options.harmonics)
+    over = ("channel",)
+    columns = {
+        "amplitude": (found.amplitude, "half of peak to peak"),
+        "mean": (found.mean, "mean over the period"),
+        "rms": (found.rms, "root of the mean square over the period"),
+        "error": (found.error, "largest error of the amplitudes"),
+        "dominant_order": (found.dominant, "order of the largest component, in units of the drive's frequency"),
+    }
+    variables: dict[str, Variable] = {name: (over, v, {"long_name": text}) for name, (v, text) in columns.items()}
+    both = (*over, "harmonic")
+    variables["harmonic_amplitude"] = (both, np.abs(found.harmonics), {"long_name": "amplitude of the harmonic"})
+    about = {"units": "rad", "long_name": "lag of the harmonic behind that of the drive"}
+    variables["phase"] = (both, lags_of(orbits, found.harmonics), about)
+    return variables
+
+
+def _at_point(located: xr.Dataset, base: Parameters, branch: int, point: int) -> Orbit:
+    state = located["section"].values[branch, point, 0]
+    value, seconds = (float(located[name].values[branch, point]) for name in ("parameter", "period_s"))
+    return _orbit(located, base, branch, value, state, seconds)
+
+
+def _at_bifurcation(located: xr.Dataset, base: Parameters, k: int) -> Orbit:
+    state = located["bifurcation_section"].values[k, 0]
+    value, seconds = (float(located[name].values[k]) for name in ("value", "bifurcation_period_s"))
+    return _orbit(located, base, int(located["of_branch"].values[k]), value, state, seconds)
+
+
+def _orbit(
+    located: xr.Dataset, base: Parameters, branch: int, value: float, state: np.ndarray, seconds: float
+) -> Orbit:
+    given = {**fixed_of(located, branch), str(located.attrs["parameter"]): value}
+    own = {name: number for name, number in given.items() if axis_name(name) != FREQUENCY_DIM}
+    period = int(located["orbit_period"].values[branch])
+    return Orbit(base.replace(**own), state, seconds, period)
+
+
+def _jumps(
+    located: xr.Dataset, base: Parameters, events: Sequence[Orbit], options: ResponseOptions
+) -> dict[str, Variable]:
+    """Integrate trajectories from where stable orbits end, with the parameter a little beyond, until they close.
+
+    Returns, over ``jump``: ``jump_bifurcation`` (index of the end), ``jump_rises`` (whether the parameter rises),
+    ``jump_beyond`` (its value where the trajectory is integrated), ``jump_landing`` (a code of `LANDINGS`),
+    ``jump_period`` and ``jump_amplitude`` (channel) of the orbit on which it lands; NaN if it does not close.
+    """
+    assert options.low is not None
+    assert options.high is not None
+    ends = [(k, way) for k in range(len(events)) if events[k].period for way in _ways(located, k)]
+    step = BEYOND * (options.high - options.low)
+    name = str(located.attrs["parameter"])
+    beyond = [float(located["value"].values[k]) + way * step for k, way in ends]
+    starts = [
+        _orbit(located, base, int(located["of_branch"].values[k]), value, events[k].state, events[k].seconds)
+        for (k, _), value in zip(ends, beyond, strict=True)
+    ]
+    landed = _landed(starts, beyond if name == FREQUENCY_DIM else [orbit.frequency_hz for orbit in starts])
+    closed = [orbit for _, orbit in landed if orbit is not None]
+    measured = iter(measures_of(closed, 1).amplitude)
+    nothing = np.full(len(of_flow(base).model.states) + len(of_flow(base).model.quantities), np.nan)
+    amplitude = np.array([nothing if orbit is None else next(measured) for _, orbit in landed])
+    codes = np.array([LANDINGS.index(word) for word, _ in landed], np.int8)
+    columns: dict[str, tuple[Any, str]] = {
+        "jump_bifurcation": (np.array([k for k, _ in ends], np.int32), "bifurcation at which a stable orbit ends"),
+        "jump_rises": (np.array([way > 0 for _, way in ends], np.int8), "1 if the parameter rises"),
+        "jump_beyond": (np.array(beyond, float), "value of the parameter beyond it"),
+        "jump_period": (
+            np.array([0 if orbit is None else orbit.period for _, orbit in landed], np.int32),
+            "period of the orbit on which a trajectory lands",
+        ),
+    }
+    found: dict[str, Variable] = {n: (("jump",), v, {"long_name": text}) for n, (v, text) in columns.items()}
+    about = {"long_name": "where a trajectory lands", **code_flags(LANDINGS)}
+    found["jump_landing"] = (("jump",), codes, about)
+    text = {"long_name": "half of peak to peak of the orbit on which a trajectory lands"}
+    found["jump_amplitude"] = (("jump", "channel"), amplitude.reshape(-1, len(nothing)), text)
+    return found
+
+
+def _ways(located: xr.Dataset, k: int) -> list[int]:
+    """Return the directions of the parameter in which a stable orbit ends at a bifurcation without one to go on to."""
+    kind, criticality = (words_of(located[n])[int(located[n].values[k])] for n in ("kind", "criticality"))
+    before, after = (int(located[f"n_unstable_{side}"].values[k]) == 0 for side in ("before", "after"))
+    rises = 1 if located["rises_before"].values[k] else -1
+    if kind == "fold":
+        return [rises] if before or after else []
+    if criticality != "subcritical" or before == after:
+        return []
+    return [rises if before else -rises]
+
+
+def _landed(starts: Sequence[Orbit], frequency_hz: Sequence[float]) -> list[tuple[str, Orbit | None]]:
+    """Integrate trajectories until they close. Return one of `LANDINGS` for each, and the orbit if it closed."""
+    if not starts:
+        return []
+    model = starts[0].parameters.model
+    found = run_branches(
+        np.array([orbit.parameters.pack() for orbit in starts])[:, None],
+        np.array(frequency_hz)[:, None],
+        np.array([orbit.state for orbit in starts]),
+        n_transient=PATIENCE,
+        n_keep=LONGEST,
+        rtol=PORTRAIT_RTOL,
+        atol=PORTRAIT_RTOL,
+        stop_when_closed=True,
+        closure_tolerance=CLOSURE,
+        max_orbit_period=LONGEST,
+        system=model.system,
+    )
+    landed: list[tuple[str, Orbit | None]] = []
+    for i, orbit in enumerate(starts):
+        word = _LANDED.get(Status(found.status[i, 0]), "failed")
+        period = int(found.orbit_period[i, 0])
+        if word != "closed":
+            landed.append((word, None))
+            continue
+        times = found.return_time
+        seconds = period / frequency_hz[i] if times is None else float(times[i, 0, -period:].sum())
+        landed.append((word, Orbit(orbit.parameters, found.section[i, 0, -1], seconds, period)))
+    return landed
+
+
+_NOT_LANDED = {
+    "not_closed": "no orbit within 20000 periods",
+    "diverged": "beyond all bounds",
+    "failed": "not integrated",
+}
+
+
+def response_table(ds: xr.Dataset) -> Table:
+    """Return the table of a response.
+
+    Rows are those of the branches' points and channels: value of the parameter, fixed parameters, branch, period,
+    whether the orbit is stable, ``amplitude`` (half of peak to peak), ``mean``, ``rms``, ``error``,
+    ``dominant_order``, and ``harmonic_1``, ``phase_1`` [rad], ... The text shows the largest amplitude of each
+    branch, and for each jump the amplitudes before and after it, of the first channel.
+    """
+    rows = _rows(ds)
+    if not rows:
+        return Table(rows, ["no orbit to measure"], "no branch: no closed orbit to begin with")
+    name, first = parameter_name(str(ds.attrs["parameter"])), str(ds["channel"].values[0])
+    lines = [f"amplitude of {first}{_unit(ds)} along {name}, the largest of each branch"]
+    lines += ["", *aligned([_peak(ds, name, i) for i in range(ds.sizes["branch"])], "")]
+    jumps = [_jump(ds, name, k) for k in np.argsort(_jump_values(ds), kind="stable")]
+    lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", "no jump: no stable orbit ends at a fold"]
+    return Table(rows, lines)
+
+
+def _rows(ds: xr.Dataset) -> list[Row]:
+    name = parameter_name(str(ds.attrs["parameter"]))
+    rows = []
+    arrays = {key: ds[key].values for key in ("parameter", "n_unstable", "orbit_period", "harmonic_amplitude", "phase")}
+    measures = {key: ds[key].values for key in ("amplitude", "mean", "rms", "error", "dominant_order")}
+    for i in range(ds.sizes["branch"]):
+        fixed = fixed_of(ds, i)
+        for j in range(int(ds["n_points"][i])):
+            for c, channel in enumerate(ds["channel"].values):
+                row: Row = {name: float(arrays["parameter"][i, j]), **fixed, "branch": i}
+                row |= {"period": int(arrays["orbit_period"][i]), "stable": bool(arrays["n_unstable"][i, j] == 0)}
+                row |= {"channel": str(channel), **{key: float(v[i, j, c]) for key, v in measures.items()}}
+                for k, order in enumerate(ds["harmonic"].values):
+                    row[f"harmonic_{order}"] = float(arrays["harmonic_amplitude"][i, j, c, k])
+                    row[f"phase_{order}"] = float(arrays["phase"][i, j, c, k])
+                rows.append(row)
+    return rows
+
+
+def _unit(ds: xr.Dataset) -> str:
+    unit = str(ds["unit"].values[0])
+    return "" if unit in ("", "1") else f" [{unit}]"
+
+
+def _peak(ds: xr.Dataset, name: str, branch: int) -> Words:
+    n = int(ds["n_points"][branch])
+    amplitude = ds["amplitude"].values[branch, :n, 0]
+    at = int(np.nanargmax(amplitude))
+    x, stable = ds["parameter"].values[branch, :n], ds["n_unstable"].values[branch, :n] == 0
+    return {
+        "branch": str(branch),
+        **{key: f"{value:g}" for key, value in fixed_of(ds, branch).items()},
+        "period": str(int(ds["orbit_period"][branch]) or "equilibrium"),
+        name: f"{x.min():.6g} to {x.max():.6g}",
+        "largest": f"{amplitude[at]:.6g}",
+        "at": f"{x[at]:.6g}",
+        "stable": f"{stable.mean():.0%}",
+    }
+
+
+def _jump_values(ds: xr.Dataset) -> np.ndarray:
+    return np.asarray(ds["value"].values[ds["jump_bifurcation"].values])
+
+
+def _jump(ds: xr.Dataset, name: str, k: int) -> Words:
+    one: Any = ds.isel(jump=int(k))
+    event = int(one["jump_bifurcation"])
+    branch = int(ds["of_branch"][event])
+    word = words_of(ds["jump_landing"])[int(one["jump_landing"])]
+    lands = f"{float(one['jump_amplitude'][0]):.6g} (period {int(one['jump_period'])})"
+    return {
+        **{key: f"{value:g}" for key, value in fixed_of(ds, branch).items()},
+        name: f"{float(ds['value'][event]):.7g}",
+        "as it": "rises" if bool(one["jump_rises"]) else "falls",
+        "from": f"{float(ds['bifurcation_amplitude'][event, 0]):.6g} (period {int(ds['orbit_period'][branch])})",
+        "to": _NOT_LANDED.get(word, lands),
+    }

@@ -1,1 +1,0 @@
-"""Measured branches of periodic orbits, stable and unstable, beside computed ones."""
