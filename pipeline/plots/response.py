@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.run import OpenRun
-from pipeline.layout.vocabulary import parameter_name
+from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT, STABLE, UNSTABLE, stretches, with_located
 from pipeline.plots.figure import frame_of
@@ -81,9 +81,10 @@ def plot_response(
     if harmonic > ds.sizes["harmonic"]:
         raise ValueError(f"harmonic {harmonic} was not computed; it must be at most {ds.sizes['harmonic']}")
     measure = labels.quantity_measure(ds, channel, degrees)
-    has_phase = labels.model_of(ds).crossing is None and not labels.model_of(ds).autonomous
+    has_phase = model_of(ds).crossing is None and not model_of(ds).autonomous
     fig = style.new_figure(5.2 if has_phase else 4.0, _stored(ds, points), frame)
-    axes = np.atleast_1d(fig.subplots(2 if has_phase else 1, 1, sharex=True, height_ratios=[2, 1][: 1 + has_phase]))
+    ratios = [2, 1] if has_phase else [1]
+    axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
     levels = _levels(ds)
     chosen = [_amplitude(ds, channel, harmonic), _phase(ds, channel, max(harmonic, 1))][: len(axes)]
     phase = Measure("phase", "lag", "deg" if degrees else "rad", 180.0 / np.pi if degrees else 1.0, True)
@@ -126,8 +127,9 @@ def _levels(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
 
 
 def _amplitude(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:
-    name, where = ("harmonic_amplitude", {"harmonic": harmonic}) if harmonic else ("amplitude", {})
-    return ds[name].sel(channel=channel, **where), ds[f"bifurcation_{name}"].sel(channel=channel, **where)
+    where: dict[str, Any] = {"channel": channel, **({"harmonic": harmonic} if harmonic else {})}
+    name = "harmonic_amplitude" if harmonic else "amplitude"
+    return ds[name].sel(where), ds[f"bifurcation_{name}"].sel(where)
 
 
 def _phase(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:

@@ -85,11 +85,9 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
     model = of_flow(orbits[0].parameters).model if orbits else None
     n_channels = 0 if model is None else len(model.states) + len(model.quantities)
     shape = (len(orbits), n_channels)
-    found = Measures(
-        *(np.full(shape, np.nan) for _ in range(3)),
-        np.full((*shape, n_harmonics), np.nan, np.complex128),
-        *(np.full(shape, np.nan) for _ in range(2)),
-    )
+    amplitude, mean, rms, dominant, error = np.full((5, *shape), np.nan)
+    harmonics = np.full((*shape, n_harmonics), np.nan, np.complex128)
+    found = Measures(amplitude, mean, rms, harmonics, dominant, error)
     left, n = np.arange(len(orbits)), FEWEST
     while len(left) and n <= MOST:
         for rows in _blocks(orbits, left, n):
@@ -168,7 +166,7 @@ def _highest(values: Array) -> Array:
     bend = before - 2.0 * here + after
     slope = 0.5 * (after - before)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return here - np.where(bend < 0.0, 0.5 * slope**2 / bend, 0.0)
+        return np.asarray(here - np.where(bend < 0.0, 0.5 * slope**2 / bend, 0.0))
 
 
 def _harmonics(values: Array, base: int, n_harmonics: int) -> Array:

@@ -152,7 +152,7 @@ def test_subharmonics__and_turning_angles():
             c=0.25,
             b=0.6,
             A=1.0,
-        )  # fmt: skip
+        )
     )
     base = model.load(None)
     orbits, dense = [], []
