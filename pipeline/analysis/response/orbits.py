@@ -156,7 +156,7 @@ def _measure(found: Measures, rows: Array, values: Array, base: int, n_harmonics
 
 def _amplitude(values: Array) -> Array:
     """Return half of peak to peak, each extreme being that of a parabola through three samples."""
-    return 0.5 * (_highest(values) + _highest(-values))
+    return np.asarray(0.5 * (_highest(values) + _highest(-values)))
 
 
 def _highest(values: Array) -> Array:

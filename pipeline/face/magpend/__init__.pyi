@@ -92,6 +92,7 @@ branches = Run.branches
 bands = Run.bands
 curves = Run.curves
 orbits = Run.orbits
+response = Run.response
 tongues = Run.tongues
 manifolds = Run.manifolds
 tangency = Run.tangency

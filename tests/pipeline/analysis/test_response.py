@@ -26,10 +26,10 @@ def hardening(tmp_path_factory):
     )  # fmt: skip
     spec = (
         magpend.Spec("sweep", model, "hardening")
-        .axis("F", values=[0.1, 0.3])
-        .axis("frequency_hz", 0.5 / OMEGA, 2.0 / OMEGA, 9)
-        .start_random(n=4, x=(-3, 3), x_dot=(-3, 3), seed=0)
-        .integration(n_transient=300, n_keep=4)
+        .with_axis("F", values=[0.1, 0.3])
+        .with_axis("frequency_hz", 0.5 / OMEGA, 2.0 / OMEGA, 9)
+        .with_start_random(n=4, x=(-3, 3), x_dot=(-3, 3), seed=0)
+        .with_integration(n_transient=300, n_keep=4)
     )
     return magpend.run(spec, tmp_path_factory.mktemp("runs") / "hardening", workers=0)
 
