@@ -102,7 +102,7 @@ def plot_response(
     style.limits(axes[0], frame)
     if has_phase:
         axes[1].set_ylabel(labels.with_unit(f"lag of harmonic {max(harmonic, 1)}", phase.unit))
-        labels.angle_ticks(axes[1], phase)
+        labels.angle_ticks(axes[1], phase, most=4.5)
     style.caption(axes[0], labels.caption(ds, with_start=False))
     style.legend_above(fig, _handles(ds, levels, points is not None), size=fig.look.tick)
     style.finish(fig)
