@@ -14,11 +14,10 @@ class ResponseOptions(BranchOptions):
 
 RESPONSE = Analysis(
     "response",
-    """Measure the response along a parameter: amplitude, mean, rms and harmonics of every state and quantity, stable
-    or not, and the jumps.
+    """Measure amplitude, mean, rms and harmonics of every state and quantity along branches, and the jumps.
 
-    Follows branches of periodic orbits and integrates each orbit over its period. The amplitude is half of peak to
-    peak; a phase is the lag behind the drive. Where a stable orbit ends, a trajectory is integrated on beyond to see
+    Integrates each orbit, stable or not, over its period. The amplitude is half of peak to peak; a phase is the lag
+    behind the drive. Where a stable orbit ends, a trajectory is integrated on beyond to see
     where it lands.""",
     ResponseOptions,
     compute="pipeline.analysis.response.analysis:response",

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import binomtest
 
 from magpend_core.status import Status
 from pipeline.analysis.basins.analysis import basins_of, basins_table
-from pipeline.analysis.basins.numbers import basin_fractions, basin_rows
+from pipeline.analysis.basins.numbers import basin_rows
 from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
@@ -101,16 +102,23 @@ def test_basins__cells_without_an_outcome():
     assert found["n_pending"].values.tolist() == [0, 400]
 
 
-def test_basin_rows__agree_with_fractions_of_all_labels():
+def test_basin_rows__agree_with_counts_of_each_point():
     rng = np.random.default_rng(3)
     labels = xr.DataArray(rng.integers(-2, 4, (5, 6, 40)), dims=("f", "a", "start"))
     inferred = xr.DataArray(rng.random(labels.shape) < 0.3, dims=labels.dims)
-    whole = basin_fractions(labels, dims=["start"], inferred=inferred, method="clopper-pearson")
     rows = basin_rows(labels, ("f", "a"), inferred, 0.95, "clopper-pearson").assign_attrs(n_ids=4)
-    filled = dense(rows).rename(attractor="label")
-    for name in filled.data_vars:
-        known = filled[name].where(whole["count"] > 0) if "label" in filled[name].dims else filled[name]
-        np.testing.assert_array_equal(known, whole[name].where(whole["count"] > 0) if known.ndim == 3 else whole[name])
+    filled = dense(rows)
+    known = (labels != -1).sum("start")
+    np.testing.assert_array_equal(filled["n_unfinished"], 40 - known)
+    for outcome in filled["attractor"].values:
+        own, count = filled.sel(attractor=outcome), (labels == outcome).sum("start")
+        seen = count > 0
+        np.testing.assert_array_equal(own["count"].where(seen, 0), count)
+        np.testing.assert_array_equal(own["n_inferred"].where(seen, 0), ((labels == outcome) & inferred).sum("start"))
+        np.testing.assert_array_equal(own["fraction"].where(seen), (count / known).where(seen))
+        for f, a in np.argwhere(seen.values):
+            reference = binomtest(int(count[f, a]), int(known[f, a])).proportion_ci(0.95, method="exact")
+            assert [own[end].values[f, a] for end in ("low", "high")] == pytest.approx([*reference], abs=1e-12)
 
 
 def test_basins__starts_that_are_no_regular_grid():
