@@ -44,7 +44,7 @@ class Drifting(Steady):
 
     @cached_property
     def drift(self) -> Drift:
-        """How the parameters move, for the numerical core."""
+        """The motion of the parameters, in the form that the numerical core takes."""
         from magpend_core.models.drift.sections import Drift
 
         return Drift.of(self.model.system, self.ramps, self.values.names, *self.corners)

@@ -61,7 +61,7 @@ def plot_response(
     points
         Measured points: values of the parameter, ``amplitude`` and perhaps ``phase`` [rad], of equal shape.
     degrees
-        Degrees for angles and phases.
+        Degrees for phases, and for a channel that is an angle.
     frame
         Width of the figure and ranges of its axes.
 
@@ -80,7 +80,8 @@ def plot_response(
     style.check_choice("channel", channel, [str(c) for c in ds["channel"].values])
     if harmonic > ds.sizes["harmonic"]:
         raise ValueError(f"harmonic {harmonic} was not computed; it must be at most {ds.sizes['harmonic']}")
-    measure = labels.quantity_measure(ds, channel, degrees)
+    turns = str(ds["unit"].sel(channel=channel).values).startswith("rad")
+    measure = labels.quantity_measure(ds, channel, degrees and turns)
     has_phase = model_of(ds).crossing is None and not model_of(ds).autonomous
     fig = style.new_figure(5.2 if has_phase else 4.0, _stored(ds, points), frame)
     ratios = [2, 1] if has_phase else [1]
@@ -220,6 +221,8 @@ def read_points(path: str | Path, parameter: str) -> dict[str, np.ndarray]:
 
 def draw(run: OpenRun, options: ResponseFigureOptions) -> style.DataFigure:
     """Draw the figure ``response`` of a run."""
+    if options.harmonic > options.harmonics:
+        raise SpecError(f"--harmonic {options.harmonic}: only {options.harmonics} are computed; raise --harmonics.")
     points = read_points(options.points, options.parameter) if options.points else None
     found = run.derive("response", **options.part(ResponseOptions))
     return plot_response(

@@ -134,7 +134,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
 
 
 def _only_tables(data: Mapping[str, Any], problems: list[str]) -> tuple[dict[str, Any], set[str]]:
-    """Replace what must be a table and is none by an empty table; return also the names of these keys."""
+    """Put an empty table in place of each value that must be a table and is none; return also the keys."""
     wrong = {key for key in KEYS if key in data and key not in _NO_TABLES and not isinstance(data[key], dict)}
     problems += [f"{key} = {shown(data[key])}: must be a table; write [{key}]." for key in data if key in wrong]
     return {**data, **{key: {} for key in wrong}}, wrong

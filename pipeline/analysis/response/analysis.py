@@ -29,10 +29,22 @@ BEYOND = 1e-3
 PATIENCE, LONGEST = 20_000, 64
 """Drive periods or returns after which a trajectory is given up, and the longest period at which it may close."""
 
-LANDINGS = ("closed", "not_closed", "diverged", "failed")
-"""Values of `jump_landing`: whether the trajectory beyond a stable orbit's end has closed on another orbit."""
+LANDINGS = {
+    "closed": "",
+    "at_rest": "rest",
+    "not_closed": f"no orbit within {PATIENCE} periods",
+    "diverged": "beyond all bounds",
+    "no_return": "no return to the section",
+    "failed": "the integration failed",
+}
+"""Values of `jump_landing`, what became of the trajectory beyond a stable orbit's end, with the words for the table."""
 
-_LANDED = {Status.PERIODIC: "closed", Status.BOUNDED: "not_closed", Status.DIVERGED: "diverged"}
+_LANDED = {
+    Status.PERIODIC: "closed",
+    Status.BOUNDED: "not_closed",
+    Status.DIVERGED: "diverged",
+    Status.NO_RETURN: "no_return",
+}
 _LEFT_OUT = ("section", "multiplier", "eigenvalue", "residual", "bifurcation_section", "bifurcation_multiplier")
 
 Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
@@ -132,12 +144,18 @@ def _jumps(
         _orbit(located, base, int(located["of_branch"].values[k]), value, events[k].state, events[k].seconds)
         for (k, _), value in zip(ends, beyond, strict=True)
     ]
-    landed = _landed(starts, beyond if name == FREQUENCY_DIM else [orbit.frequency_hz for orbit in starts])
+    hertz = [orbit.frequency_hz for orbit in starts]
+    if base.model.crossing is not None:
+        hertz = [base.model.crossing.frequency_hz for _ in starts]  # the longest wait for a return
+    landed = _landed(starts, beyond if name == FREQUENCY_DIM else hertz)
     closed = [orbit for _, orbit in landed if orbit is not None]
     measured = iter(measures_of(closed, 1).amplitude)
     nothing = np.full(len(of_flow(base).model.states) + len(of_flow(base).model.quantities), np.nan)
     amplitude = np.array([nothing if orbit is None else next(measured) for _, orbit in landed])
-    codes = np.array([LANDINGS.index(word) for word, _ in landed], np.int8)
+    words = [word for word, _ in landed]
+    if base.model.crossing is not None:  # a flow that spirals to rest crosses the section for ever
+        words = ["at_rest" if a.max() < CLOSURE else word for a, word in zip(amplitude, words, strict=True)]
+    codes = np.array([[*LANDINGS].index(word) for word in words], np.int8)
     columns: dict[str, tuple[Any, str]] = {
         "jump_bifurcation": (np.array([k for k, _ in ends], np.int32), "bifurcation at which a stable orbit ends"),
         "jump_rises": (np.array([way > 0 for _, way in ends], np.int8), "1 if the parameter rises"),
@@ -148,7 +166,7 @@ def _jumps(
         ),
     }
     found: dict[str, Variable] = {n: (("jump",), v, {"long_name": text}) for n, (v, text) in columns.items()}
-    about = {"long_name": "where a trajectory lands", **code_flags(LANDINGS)}
+    about = {"long_name": "where a trajectory lands", **code_flags([*LANDINGS])}
     found["jump_landing"] = (("jump",), codes, about)
     text = {"long_name": "half of peak to peak of the orbit on which a trajectory lands"}
     found["jump_amplitude"] = (("jump", "channel"), amplitude.reshape(-1, len(nothing)), text)
@@ -198,13 +216,6 @@ def _landed(starts: Sequence[Orbit], frequency_hz: Sequence[float]) -> list[tupl
     return landed
 
 
-_NOT_LANDED = {
-    "not_closed": "no orbit within 20000 periods",
-    "diverged": "beyond all bounds",
-    "failed": "not integrated",
-}
-
-
 def response_table(ds: xr.Dataset) -> Table:
     """Return the table of a response.
 
@@ -220,7 +231,8 @@ def response_table(ds: xr.Dataset) -> Table:
     lines = [f"amplitude of {first}{_unit(ds)} along {name}, the largest of each branch"]
     lines += ["", *aligned([_peak(ds, name, i) for i in range(ds.sizes["branch"])], "")]
     jumps = [_jump(ds, name, k) for k in np.argsort(_jump_values(ds), kind="stable")]
-    lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", "no jump: no stable orbit ends at a fold"]
+    none = "no jump: no stable orbit ends at a fold or a subcritical bifurcation"
+    lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", none]
     return Table(rows, lines)
 
 
@@ -279,5 +291,5 @@ def _jump(ds: xr.Dataset, name: str, k: int) -> Words:
         name: f"{float(ds['value'][event]):.7g}",
         "as it": "rises" if bool(one["jump_rises"]) else "falls",
         "from": f"{float(ds['bifurcation_amplitude'][event, 0]):.6g} (period {int(ds['orbit_period'][branch])})",
-        "to": _NOT_LANDED.get(word, lands),
+        "to": LANDINGS[word] or lands,
     }

@@ -167,7 +167,7 @@ class RegionRunner:
         return spec
 
     def _watch(self, job: Job, spec: Spec, path: Path, out: Path) -> None:
-        """Compute the run of a region in a process of its own, report its progress, and wait for its end."""
+        """Run a region's specification in a process of its own; report its progress, and wait for its end."""
         plan = make_plan(spec)
         words = ["run", str(path), "--out", str(out), *(["--workers", "0"] if plan.n_tasks == 1 else [])]
         job.tell("progress", done=0, total=plan.n_cells, name=out.name)

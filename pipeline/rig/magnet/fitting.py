@@ -419,7 +419,7 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All fits to a measurement of the magnets' torque."""
+    """The fits of all laws to a measurement of the magnets' torque."""
 
     measured: Measurement
     curves: tuple[CurveFit, ...]

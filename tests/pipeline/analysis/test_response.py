@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -205,6 +207,35 @@ def test_flow__has_the_harmonics_of_its_orbit():
 
 
 @pytest.mark.slow
+def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
+    """r' = r (mu + r^2 - r^4): stable cycles of r^2 = (1 + sqrt(1 + 4 mu)) / 2, which fold at mu = -1/4."""
+    model = magpend.model(
+        "x' = x*g - 2*y\ny' = y*g + 2*x\ng = mu + x**2 + y**2 - (x**2 + y**2)**2", name="cycles", mu=0.1
+    )
+    spec = (
+        magpend.Spec("sweep", model)
+        .with_axis("mu", -0.3, 0.2, 6)
+        .with_start_list(points=[(1.0, 0.0)])
+        .with_section(of="y", value=0.0, direction="up")
+        .with_integration(n_transient=200, n_keep=4)
+    )
+    ds = magpend.run(spec, tmp_path / "run", workers=0).response(parameter="mu")
+    cycle = ds["orbit_period"].values.tolist().index(1)
+    one = ds.isel(branch=cycle, point=slice(0, int(ds["n_points"][cycle])))
+    stable = one["n_unstable"].values == 0
+    mu = one["parameter"].values[stable]
+    exact = np.sqrt((1.0 + np.sqrt(1.0 + 4.0 * mu)) / 2.0)
+    np.testing.assert_allclose(one["amplitude"].values[stable, 0], exact, rtol=1e-7, atol=0.0)
+    np.testing.assert_allclose(one["harmonic_amplitude"].values[stable, 0, 0], exact, rtol=1e-7, atol=0.0)
+    (jump,) = range(ds.sizes["jump"])
+    assert float(ds["value"][ds["jump_bifurcation"][jump]]) == pytest.approx(-0.25, abs=1e-7)
+    assert not ds["jump_rises"][jump]
+    # beyond, trajectories spiral to rest
+    assert (ds["jump_amplitude"][jump] < 1e-6).all()
+    assert re.search(r"^ *-0\.25 +falls .* rest$", "\n".join(response_table(ds).lines), re.MULTILINE)
+
+
+@pytest.mark.slow
 def test_figure__shows_levels_and_measured_points(hardening, response, tmp_path):
     file = tmp_path / "measured.csv"
     file.write_text("frequency_hz,amplitude,phase\n0.1,0.2,0.1\n0.2,0.9,0.4\n")
@@ -230,3 +261,11 @@ def test_points__are_refused_with_the_file_and_the_column(tmp_path, text, named)
     with pytest.raises(SpecError, match=named) as refused:
         read_points(file, "frequency")
     assert str(file) in str(refused.value)
+
+
+@pytest.mark.slow
+def test_figure__lags_in_degrees_and_no_harmonic_that_was_not_computed(hardening):
+    _, lower = hardening.plot.response(parameter="frequency_hz", degrees=True)
+    assert "deg" in lower.get_ylabel()
+    with pytest.raises(SpecError, match="harmonic"):
+        hardening.plot.response(parameter="frequency_hz", harmonic=6)
