@@ -10,12 +10,13 @@ import functools
 import inspect
 import linecache
 import math
+import os
+import pathlib
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from pathlib import Path
 from types import CellType, CodeType, FunctionType, MethodType, TracebackType
 from typing import Any
 
@@ -27,7 +28,21 @@ from magpend_core.models.text.grammar import parse
 from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.models.text.reading import MAX_FUNCTION, read_definition
 from magpend_core.models.text.spelling import spelled
-from magpend_core.models.text.tracing import BUILT_IN, SUBSTITUTES, Traced, UntraceableError, name, number, traced_array
+from magpend_core.models.text.tracing import (
+    BUILT_IN,
+    MOST_PATHS,
+    SUBSTITUTES,
+    TOO_MANY_PATHS,
+    Path,
+    Sheet,
+    Traced,
+    UntraceableError,
+    current_path,
+    name,
+    number,
+    traced_array,
+    where,
+)
 
 N_SAMPLES = 12
 """Random times, states and parameter values at which a function is called with plain numbers."""
@@ -108,14 +123,12 @@ def read_function(
     roots, variables, source = call.traced()
     found = call.drive_of(roots)
     define = dict(tables.get("define") or {})
+    call.write_phases(roots, found)
     if found is not None and drive is not None:
-        _write_phases(roots, call.values, found.period(call.values[drive]))
         if found.text == "f":
             _rename(roots, drive, "f")
         else:
             define = {drive: found.text, **define}
-    else:
-        _write_phases(roots, call.values, math.inf)
     rates, parts = spelled(roots, variables, [*states, *own, *define, "t", "f", "phase", "pi"])
     define |= parts
     table = {key: value for key, value in head.items() if value or key != "parameters"}
@@ -150,6 +163,69 @@ class _Trial:
     t: float
     y: np.ndarray
     values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _Way:
+    """What a function does on one path: its rates, the decisions that lead there, and its variables at the end."""
+
+    rates: list[Traced]
+    decisions: list[tuple[Traced, bool]]
+    variables: dict[str, Any]
+
+
+def _joined(ways: Sequence[_Way], depth: int, sheet: Sheet) -> list[Traced]:
+    """Return the rates of all ways as one, by ``where`` of the decisions from the one at `depth` on."""
+    if len(ways) == 1:
+        return ways[0].rates
+    condition = ways[0].decisions[depth][0]
+    yes, no = (_joined([w for w in ways if w.decisions[depth][1] is side], depth + 1, sheet) for side in (True, False))
+    return [_merged(condition, a, b, sheet) for a, b in zip(yes, no, strict=True)]
+
+
+def _merged(condition: Traced, yes: Traced, no: Traced, sheet: Sheet) -> Traced:
+    """Return a number that is `yes` where a condition holds, else `no`, with what both have in common outside."""
+    if sheet.number(yes) == sheet.number(no):
+        return yes
+    if "sum" in (yes.op, no.op):
+        own, others = ({sheet.number(term): term for term in _terms(side)} for side in (yes, no))
+        both = [term for key, term in own.items() if key in others]
+        mine = [term for key, term in own.items() if key not in others]
+        rest = [term for key, term in others.items() if key not in own]
+        if both and len(own) == len(_terms(yes)) and len(others) == len(_terms(no)):
+            return _total([*both, _merged(condition, _total(mine), _total(rest), sheet)])
+    elif (yes.op, yes.value, len(yes.args)) == (no.op, no.value, len(no.args)):
+        pairs = list(zip(yes.args, no.args, strict=True))
+        differ = [i for i, (a, b) in enumerate(pairs) if sheet.number(a) != sheet.number(b)]
+        if len(differ) == 1 and not pairs[differ[0]][0].is_condition:
+            args = list(yes.args)
+            args[differ[0]] = _merged(condition, *pairs[differ[0]], sheet)
+            return Traced(yes.op, tuple(args), yes.value)
+    return where(condition, yes, no)
+
+
+def _terms(root: Traced) -> list[Traced]:
+    """Return the terms of a sum in their order; another expression is its one term."""
+    found, pending = [], [root]
+    while pending:
+        node = pending.pop()
+        if node.op == "sum":
+            pending += node.args[::-1]
+        else:
+            found.append(node)
+    return found
+
+
+def _total(terms: Sequence[Traced]) -> Traced:
+    return functools.reduce(lambda a, b: Traced("sum", (a, b)), terms) if terms else number(0.0)
+
+
+def _common(found: Sequence[dict[str, Any]], sheet: Sheet) -> dict[str, Any]:
+    """Return the variables that are the same on all ways, in their order."""
+    if len(found) == 1:
+        return found[0]
+    values = [{key: sheet.number(v) for key, v in one.items() if isinstance(v, Traced)} for one in found]
+    return {key: v for key, v in found[0].items() if key in values[0] and len({one.get(key) for one in values}) == 1}
 
 
 class _Call:
@@ -238,7 +314,25 @@ class _Call:
     def traced(self) -> tuple[list[Traced], dict[str, Any], str]:
         """Return the traced rates, the variables of the function, and the source of it and of functions it calls."""
         made: dict[int, Any] = {}
-        function = _rebound(self.function, made)
+        function, sheet = _rebound(self.function, made), Sheet()
+        ways: list[_Way] = []
+        plan: list[bool] | None = []
+        while plan is not None:
+            path = Path(plan, sheet)
+            try:
+                if len(ways) == MOST_PATHS:
+                    raise UntraceableError(TOO_MANY_PATHS)
+                ways.append(self._way(function, path))
+            except ModelError:
+                raise
+            except Exception as error:
+                raise self.error(f"its equations cannot be read as text{_place(error)}: {_said(error)}") from None
+            plan = path.next_plan()
+        roots = _joined(ways, 0, sheet)
+        return roots, _common([way.variables for way in ways], sheet), _source([one for one, _ in made.values()])
+
+    def _way(self, function: Callable[..., Any], path: Path) -> _Way:
+        """Follow the function on one path."""
         code = getattr(_inner(function), "__code__", None)
         variables: dict[str, Any] = {}
 
@@ -247,19 +341,15 @@ class _Call:
                 variables.clear()
                 variables.update(frame.f_locals)
 
-        values = {key: name(key) for key in self.values}
-        before = sys.getprofile()
+        before, token = sys.getprofile(), current_path.set(path)
         sys.setprofile(keep)
         try:
+            values = {key: name(key) for key in self.values}
             found = self.call(function, name("t"), traced_array(map(name, self.states)), values)
-            roots = [number(rate) for rate in found]
-        except ModelError:
-            raise
-        except Exception as error:
-            raise self.error(f"its equations cannot be read as text{_place(error)}: {_said(error)}") from None
         finally:
             sys.setprofile(before)
-        return roots, variables, _source([original for original, _ in made.values()])
+            current_path.reset(token)
+        return _Way([number(rate) for rate in found], path.decisions, variables)
 
     def drive_of(self, roots: Sequence[Traced]) -> Drive | None:
         """Return what the drive's parameter is, from the period of the function; None for a function without time."""
@@ -283,6 +373,25 @@ class _Call:
             "Every part in t needs this period, such as cos(n*omega*t) with a whole number n; a second drive that has "
             "none in common is written as two states that turn"
         )
+
+    def write_phases(self, roots: Sequence[Traced], drive: Drive | None) -> None:
+        """Write ``t % T``, with the drive's period T, and ``(omega*t) % (2*pi)`` as multiples of ``phase``."""
+        period = math.inf if drive is None or self.drive is None else drive.period(self.values[self.drive])
+        for node in _nodes(roots):
+            if node.op != "remainder":
+                continue
+            (text,), parts = spelled([Traced("quotient", node.args)], {}, ())
+            known: dict[str, Any] = {**self.values, "pi": math.pi, "t": np.array([0.31, 1.7, 4.9])}
+            try:
+                turns = value_of(parse(text), known) if not parts else math.nan
+            except KeyError:  # it changes with the state
+                turns = math.nan
+            if not np.allclose(turns, known["t"] / period, rtol=1e-9, atol=0.0):
+                raise self.error(
+                    f"{text.replace('/', ' % ', 1)}: the text of a model has a remainder of the time alone, by the "
+                    "drive's period. An angle needs none: leave it as it is, and declare it with on_circle = true"
+                )
+            node.op, node.args = "product", (name("phase"), node.args[1])
 
     def repeats(self, key: str, drive: Drive) -> bool:
         """Return whether the rates are the same a period later, at trials at which they have values."""
@@ -354,27 +463,6 @@ def _rename(roots: Sequence[Traced], old: str, new: str) -> None:
             node.value = new
 
 
-def _write_phases(roots: Sequence[Traced], values: Mapping[str, Any], period: float) -> None:
-    """Write ``t % T`` with the drive's period T, or ``(omega*t) % (2*pi)``, as a multiple of the text's ``phase``."""
-    for node in _nodes(roots):
-        if node.op != "remainder":
-            continue
-        (text,), parts = spelled([Traced("quotient", node.args)], {}, ())
-        known: dict[str, Any] = {**values, "pi": math.pi, "t": np.array([0.31, 1.7, 4.9])}
-        try:
-            turns = value_of(parse(text), known) if not parts else math.nan
-        except KeyError:  # it changes with the state
-            turns = math.nan
-        if not np.allclose(turns, known["t"] / period, rtol=1e-9, atol=0.0):
-            raise ModelError(
-                [
-                    f"{text.replace('/', ' % ', 1)}: the text of a model has a remainder of the time alone, by the "
-                    "drive's period. An angle needs none: leave it as it is, and declare it with on_circle = true."
-                ]
-            )
-        node.op, node.args = "product", (name("phase"), node.args[1])
-
-
 # ---- the function with other numpy, math and built-in functions -----------------------------------
 
 
@@ -431,7 +519,7 @@ def _source(functions: Sequence[Callable[..., Any]]) -> str:
         return ""
 
 
-_OWN = tuple(str(Path(module.__file__ or "").parent) for module in (np, sys.modules[__package__]))
+_OWN = tuple(str(pathlib.Path(module.__file__ or "").parent) for module in (np, sys.modules[__package__]))
 
 
 def _place(error: BaseException) -> str:
@@ -440,7 +528,7 @@ def _place(error: BaseException) -> str:
     step: TracebackType | None = error.__traceback__
     while step is not None:
         file, line = step.tb_frame.f_code.co_filename, step.tb_lineno
-        if not file.startswith(_OWN):
+        if not file.startswith(_OWN) and f"{os.sep}scipy{os.sep}" not in file:
             text = linecache.getline(file, line).strip()
             found = f", line {line}{f', `{text}`' if text else ''}"
         step = step.tb_next

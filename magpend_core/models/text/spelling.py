@@ -15,7 +15,7 @@ import numpy as np
 
 from magpend_core.models.text.grammar import name_problem
 from magpend_core.models.text.reading import MAX_DEFINED, OF_RUNS
-from magpend_core.models.text.tracing import CONDITIONS, Traced
+from magpend_core.models.text.tracing import CONDITIONS, Sheet, Traced
 
 SHARED_SIZE = 4
 """Operations of an expression from which on it becomes a part if it is needed more than once."""
@@ -34,32 +34,6 @@ class _Text:
     depth: int = 1
 
 
-class _Sheet:
-    """Expressions by number: equal ones have one number, and arguments have lower ones."""
-
-    def __init__(self) -> None:
-        self.nodes: list[tuple[str, float | str, tuple[int, ...]]] = []
-        self._known: dict[tuple[str, float | str, tuple[int, ...]], int] = {}
-        self._numbers: dict[int, int] = {}
-
-    def number(self, root: Traced) -> int:
-        """Return the number of an expression, after numbers for all that it consists of."""
-        pending = [root]
-        while pending:
-            node = pending[-1]
-            missing = [a for a in node.args if id(a) not in self._numbers]
-            if missing:
-                pending += missing
-                continue
-            pending.pop()
-            key = node.op, node.value, tuple(self._numbers[id(a)] for a in node.args)
-            if key not in self._known:
-                self._known[key] = len(self.nodes)
-                self.nodes.append(key)
-            self._numbers[id(node)] = self._known[key]
-        return self._numbers[id(root)]
-
-
 def spelled(
     roots: Sequence[Traced], variables: Mapping[str, Any], taken: Sequence[str]
 ) -> tuple[list[str], dict[str, str]]:
@@ -74,7 +48,7 @@ def spelled(
     taken
         Names that have a meaning already.
     """
-    sheet = _Sheet()
+    sheet = Sheet()
     numbers = [sheet.number(root) for root in roots]
     uses = _uses(sheet, numbers)
     names = _names(sheet, numbers, uses, variables, taken)
@@ -93,7 +67,7 @@ def spelled(
     return [texts[i].text for i in numbers], define
 
 
-def _uses(sheet: _Sheet, roots: Sequence[int]) -> dict[int, int]:
+def _uses(sheet: Sheet, roots: Sequence[int]) -> dict[int, int]:
     """Return how often each expression stands in others that the roots need, or is a root."""
     uses = dict.fromkeys(roots, 0)
     for root in roots:
@@ -106,7 +80,7 @@ def _uses(sheet: _Sheet, roots: Sequence[int]) -> dict[int, int]:
 
 
 def _names(
-    sheet: _Sheet, roots: Sequence[int], uses: Mapping[int, int], variables: Mapping[str, Any], taken: Sequence[str]
+    sheet: Sheet, roots: Sequence[int], uses: Mapping[int, int], variables: Mapping[str, Any], taken: Sequence[str]
 ) -> dict[int, str]:
     """Return the name of each expression that becomes a part."""
     sizes: list[int] = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from functools import reduce
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -24,9 +25,12 @@ MOST_SOLVED = 4
 
 CONDITIONS = ("compare", "and", "or", "not")
 
-_DECIDES = (
-    "Python must decide here (by if, and, or, not, ==, a chain such as 0 < x < 1, or sorting) on a value that changes "
-    "with the state, the time or a parameter; write np.where(condition, a, b), and join conditions with &, | and ~"
+MOST_PATHS = 64
+"""Most ways through a function, by its decisions, that are followed."""
+
+TOO_MANY_PATHS = (
+    f"the decisions of Python (if, and, or, while, sorting) on states, time and parameters give more than {MOST_PATHS} "
+    "ways through the function; write np.where(condition, a, b), and join conditions with & and |"
 )
 _PLAIN = (
     "a plain number is needed here, and this value changes with the state, the time or a parameter; use numpy's "
@@ -39,6 +43,71 @@ _COUNTS = (
 
 class UntraceableError(Exception):
     """Error: a function does something that the text of a model cannot say. The message has the remedy."""
+
+
+class Path:
+    """One way through a function: the decisions that it takes on traced conditions.
+
+    Attributes
+    ----------
+    planned : list of bool
+        The first decisions. Later ones are true.
+    decisions : list of (Traced, bool)
+        Decisions so far, each with its condition.
+    """
+
+    def __init__(self, planned: Sequence[bool], sheet: Sheet) -> None:
+        self.planned, self.sheet = list(planned), sheet
+        self.decisions: list[tuple[Traced, bool]] = []
+        self._known: dict[int, bool] = {}
+
+    def decide(self, condition: Traced) -> bool:
+        """Return what the path takes a condition for; the same for equal conditions."""
+        key = self.sheet.number(condition)
+        if key not in self._known:
+            k = len(self.decisions)
+            if k >= MOST_PATHS:
+                raise UntraceableError(TOO_MANY_PATHS)
+            self._known[key] = self.planned[k] if k < len(self.planned) else True
+            self.decisions.append((condition, self._known[key]))
+        return self._known[key]
+
+    def next_plan(self) -> list[bool] | None:
+        """Return the decisions of the next way: the last one that was true is false. None after the last way."""
+        taken = [decision for _, decision in self.decisions]
+        while taken and not taken[-1]:
+            taken.pop()
+        return [*taken[:-1], False] if taken else None
+
+
+current_path: ContextVar[Path | None] = ContextVar("current_path", default=None)
+"""The path that a function is on."""
+
+
+class Sheet:
+    """Expressions by number: equal ones have one number, and arguments have lower ones."""
+
+    def __init__(self) -> None:
+        self.nodes: list[tuple[str, float | str, tuple[int, ...]]] = []
+        self._known: dict[tuple[str, float | str, tuple[int, ...]], int] = {}
+        self._numbers: dict[int, tuple[int, Traced]] = {}  # a number keeps its object, or another could have its id
+
+    def number(self, root: Traced) -> int:
+        """Return the number of an expression, after numbers for all that it consists of."""
+        pending = [root]
+        while pending:
+            node = pending[-1]
+            missing = [a for a in node.args if id(a) not in self._numbers]
+            if missing:
+                pending += missing
+                continue
+            pending.pop()
+            key = node.op, node.value, tuple(self._numbers[id(a)][0] for a in node.args)
+            if key not in self._known:
+                self._known[key] = len(self.nodes)
+                self.nodes.append(key)
+            self._numbers[id(node)] = self._known[key], node
+        return self._numbers[id(root)][0]
 
 
 class Traced(NDArrayOperatorsMixin):
@@ -74,7 +143,14 @@ class Traced(NDArrayOperatorsMixin):
         return _called(function, args, kwargs)
 
     def __bool__(self) -> bool:
-        raise UntraceableError(_DECIDES)
+        if self.is_number():
+            return self.value != 0.0
+        if not self.is_condition:
+            return bool(_equal(self, 0.0))
+        path = current_path.get()
+        if path is None:
+            raise UntraceableError(TOO_MANY_PATHS)
+        return path.decide(self)
 
     def __float__(self) -> float:
         raise UntraceableError(_PLAIN)
@@ -87,6 +163,10 @@ class Traced(NDArrayOperatorsMixin):
 
 class TracedArray(np.ndarray):
     """An array of `Traced` numbers and plain ones."""
+
+    def astype(self, *args: Any, **kwargs: Any) -> Any:
+        """Return a copy: traced numbers are floats already."""
+        return self.copy()
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         return _applied(ufunc, method, inputs, options)
@@ -113,7 +193,7 @@ def number(value: Any) -> Traced:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     if isinstance(value, Traced):
-        return _where(value, 1.0, 0.0) if value.is_condition else value
+        return where(value, 1.0, 0.0) if value.is_condition else value
     if not isinstance(value, numbers.Real | np.bool):
         raise UntraceableError(f"{value!r} is no real number; states, parameters and rates are real")
     plain = float(value)
@@ -133,6 +213,8 @@ def _add(a: Any, b: Any) -> Traced:
         return number(sum(plain))
     if x.is_number(0.0) or y.is_number(0.0):
         return y if x.is_number(0.0) else x
+    if y.op == "negative" and y.args[0] is x:
+        return number(0.0)
     return Traced("sum", (x, y))
 
 
@@ -190,7 +272,8 @@ def _calls(function: str) -> Callable[..., Traced]:
     return rule
 
 
-def _where(condition: Any, a: Any, b: Any) -> Traced:
+def where(condition: Any, a: Any, b: Any) -> Traced:
+    """Return a number that is `a` where a condition holds, else `b`."""
     if not isinstance(condition, Traced):
         return number(a if condition else b)
     if not condition.is_condition:
@@ -235,7 +318,7 @@ def _heaviside(x: Any, at_zero: Any) -> Traced:
     here = number(at_zero)
     if here.is_number(0.5):
         return _add(0.5, _multiply(0.5, _sign(x)))
-    return _where(_less(0.0, x), 1.0, 0.0) if here.is_number(0.0) else _where(_less(x, 0.0), 0.0, 1.0)
+    return where(_less(0.0, x), 1.0, 0.0) if here.is_number(0.0) else where(_less(x, 0.0), 0.0, 1.0)
 
 
 def _remainder(a: Any, b: Any) -> Traced:
@@ -253,6 +336,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "divide": _divide,
     "negative": _negative,
     "positive": number,
+    "conjugate": number,
     "power": _power,
     "float_power": _power,
     "square": lambda x: _power(x, 2.0),
@@ -292,7 +376,21 @@ def _method(function: str) -> Callable[[Traced], Any]:
 
 
 # numpy calls these on the numbers of arrays that are no `TracedArray`
-for _name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "arcsin", "arccos", "arctan"):
+for _name in (
+    "sin",
+    "cos",
+    "tan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "exp",
+    "log",
+    "sqrt",
+    "arcsin",
+    "arccos",
+    "arctan",
+    "conjugate",
+):
     setattr(Traced, _name, _method(_name))
 
 
@@ -319,9 +417,8 @@ def _own(value: Any) -> Any:
 
 def _applied(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Mapping[str, Any]) -> Any:
     """Apply one of numpy's elementwise functions, or a method of it such as ``reduce``, to traced numbers."""
-    if ufunc.signature is not None:  # a product of matrices, made of sums and products of numbers
-        if "mat" not in ufunc.__name__ and ufunc.__name__ != "vecdot":
-            raise UntraceableError(_no_equivalent(f"numpy's {ufunc.__name__}"))
+    # products of matrices, and functions that numpy calls with one number after the other
+    if ufunc.__name__ in ("matmul", "matvec", "vecmat", "vecdot") or ufunc.types == ["O" * ufunc.nin + "->O"]:
         found = ufunc(*(_base(value) for value in inputs))
     elif (rule := RULES.get(ufunc.__name__)) is None:
         raise UntraceableError(_no_equivalent(f"np.{ufunc.__name__}"))
@@ -343,8 +440,8 @@ def _applied(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Mappi
 
 
 def _no_equivalent(what: str) -> str:
-    known = ", ".join(f for f in RULES if f not in ("positive", "invert") and "_" not in f)
-    return f"{what} has no equivalent in the text of a model; known are {known}, np.where and sums of these"
+    known = "sqrt, exp, log, sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, tanh, abs, sign, heaviside"
+    return f"{what} has no equivalent in the text of a model; use {known}, maximum, minimum, clip, where, interp"
 
 
 def _called(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
@@ -368,12 +465,37 @@ def _arrays(value: Any) -> Any:
 def _np_where(condition: Any, *branches: Any) -> Any:
     if len(branches) != 2:
         raise UntraceableError("np.where needs a condition and two values: np.where(x < 0, a, b)")
-    return _own(np.frompyfunc(_where, 3, 1)(*(_base(value) for value in (condition, *branches))))
+    return _own(np.frompyfunc(where, 3, 1)(*(_base(value) for value in (condition, *branches))))
 
 
 def _np_select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0.0) -> Any:
     pairs = list(zip(conditions, choices, strict=True))
     return reduce(lambda rest, pair: _np_where(pair[0], pair[1], rest), reversed(pairs), default)
+
+
+def _np_interp(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None) -> Any:
+    """Interpolate a table of numbers, by a line between each two of them."""
+    places, values = np.asarray(xp), np.asarray(fp)
+    found = values[-1] if right is None else right
+    for k in range(len(places) - 2, -1, -1):
+        slope = (values[k + 1] - values[k]) / (places[k + 1] - places[k])
+        found = _np_where(np.less(x, places[k + 1]), values[k] + slope * (x - places[k]), found)
+    return _np_where(np.less(x, places[0]), values[0] if left is None else left, found)
+
+
+def _likes(value: float) -> Callable[..., Any]:
+    """Return a function that makes an array of the shape of another, filled with a number."""
+
+    def like(given: Any, *args: Any, shape: Any = None, **kwargs: Any) -> Any:
+        return _own(_full(np.shape(given) if shape is None else shape, value))
+
+    return like
+
+
+def _full(shape: Any, value: Any, *args: Any, **kwargs: Any) -> Any:
+    found = np.empty(shape, dtype=object)
+    found[...] = value
+    return found.view(TracedArray)
 
 
 def _determinant(matrix: np.ndarray) -> Traced:
@@ -416,6 +538,10 @@ def _solved(a: Any, b: Any) -> Any:
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: _np_where,
     np.select: _np_select,
+    np.interp: _np_interp,
+    np.zeros_like: _likes(0.0),
+    np.empty_like: _likes(0.0),
+    np.ones_like: _likes(1.0),
     np.linalg.solve: _solved,
     np.linalg.inv: lambda a: _solved(a, np.eye(len(a))),
     np.linalg.det: lambda a: _determinant(_base(a)),
@@ -444,12 +570,6 @@ def _fills(function: Callable[..., Any]) -> Callable[..., Any]:
     return fill
 
 
-def _full(shape: Any, value: Any, *args: Any, **kwargs: Any) -> Any:
-    found = np.empty(shape, dtype=object).view(TracedArray)
-    found[...] = value
-    return found
-
-
 def _extreme(function: Callable[..., Any], over: np.ufunc) -> Callable[..., Any]:
     def extreme(*args: Any, **kwargs: Any) -> Any:
         values = list(args if len(args) > 1 else args[0])
@@ -457,10 +577,6 @@ def _extreme(function: Callable[..., Any], over: np.ufunc) -> Callable[..., Any]
         return reduce(over, values) if is_traced else function(*args, **kwargs)
 
     return extreme
-
-
-def _float(value: Any = 0.0) -> Any:
-    return value if isinstance(value, Traced) else float(value)
 
 
 def _math_log(x: Any, *base: Any) -> Any:
@@ -502,11 +618,7 @@ _NUMPY = {
     **{f: _fills(getattr(np, f)) for f in ("zeros", "ones", "empty", "eye", "identity")},
     "full": _full,
 }
-BUILT_IN: dict[str, Callable[..., Any]] = {
-    "max": _extreme(max, np.maximum),
-    "min": _extreme(min, np.minimum),
-    "float": _float,
-}
+BUILT_IN: dict[str, Callable[..., Any]] = {"max": _extreme(max, np.maximum), "min": _extreme(min, np.minimum)}
 """Built-in functions by name that also take traced numbers."""
 
 SUBSTITUTES: dict[int, Any] = {

@@ -187,7 +187,7 @@ def test_model__takes_what_numpy_math_and_python_write():
     def g(t, y):
         x, v = y
         both = np.where((x > 0) & ~(v <= 1) | (abs(v) < 0.1), np.exp(-x), math.atan2(v, 2.0 + x**2))
-        return [both, np.heaviside(v, 0.5) + math.hypot(x, 1) - 1 / (1 + v**2) ** 1.5 * float(x) / 7e-3 * -v]
+        return [both, np.heaviside(v, 0.5) + math.hypot(x, 1) - 1 / (1 + v**2) ** 1.5 * x / 7e-3 * -v]
 
     assert equations(g) == {
         "x": "where((x > 0 and (not (v <= 1))) or abs(v) < 0.1, exp(-x), atan2(v, 2 + x**2))",
@@ -269,10 +269,39 @@ def test_model__text_has_the_rules_of_numpy():
             made(lambda t, y, u=ufunc: [u(0.9 * np.sin(y[0])) * 1.0, u(y[:1] ** 2)[0]], "x v", {})
 
 
-def branches(t, y, p):
-    if y[0] > 0:
-        return [y[1], -1.0]
-    return [y[1], 1.0]
+def test_model__follows_both_ways_of_an_if():
+    def f(t, y, p):
+        x, v = y
+        slip = v - p.v0
+        if slip > 0:
+            force = -p.mu
+        elif slip < 0:
+            force = p.mu
+        else:
+            force = 0
+        if x > 1:
+            force -= p.k * (x - 1)
+        return [v, -x + force] if 0 < p.k < 10 else [v, 2 * p.mu]
+
+    assert equations(f, v0=0.1, mu=0.2, k=2.0) == {
+        "x": "v",
+        "v": "where(k > 0, where(k < 10, -x + where(x > 1, -k*(x - 1), 0) + "
+        "where(slip > 0, -mu, where(slip < 0, mu, 0)), 2*mu), 2*mu)",
+        "slip": "v - v0",
+    }
+    # a decision that changes nothing leaves no trace, and one that is taken twice is one
+    assert equations(lambda t, y: [y[1], 1 if y[0] > 0 and not y[0] > 0 else y[1]]) == {"x": "v", "v": "v"}
+
+
+def too_many(t, y):
+    return [sum(y[0] if y[0] > k else y[1] for k in range(20)), 0.0]
+
+
+def settles(t, y):
+    x = y[0]
+    while x > 1e-3:
+        x = x / 2
+    return [x, y[1]]
 
 
 count = iter(range(10**6))
@@ -281,9 +310,9 @@ count = iter(range(10**6))
 @pytest.mark.parametrize(
     ("function", "given", "words"),
     [
-        (branches, {}, r"line \d+, `if y\[0\] > 0:`: .*np.where\(condition, a, b\)"),
-        (lambda t, y: [y[1], 0 < y[0] < 1], {}, "join conditions with &"),
-        (lambda t, y: [y[1], np.arcsinh(y[0])], {}, r"np.arcsinh has no equivalent .*known are add,"),
+        (too_many, {}, r"the decisions .* more than 64 ways .*np.where\(condition, a, b\)"),
+        (settles, {}, r"line \d+, `while x > 1e-3:`: the decisions"),
+        (lambda t, y: [y[1], np.arcsinh(y[0])], {}, r"np.arcsinh has no equivalent ; use sqrt,"),
         (lambda t, y: [y[1], int(y[0])], {}, "a plain number is needed"),
         (lambda t, y, p: [y[1], sum(range(p.n))], {"n": 3}, "constant of the program"),
         (lambda t, y: [y[1], y[0] % 1.0], {}, "x % 1: .*on_circle"),
