@@ -111,6 +111,8 @@ def read_function(
     """
     states = tables.get("states") or {}
     states = dict(states) if isinstance(states, Mapping) else dict.fromkeys(states, "1")
+    if not states:
+        raise ModelError(['states: name the states of the function in the order of y: states=("x", "v").'])
     parameters = {**(tables.get("parameters") or {}), **values}
     own = {key: value for key, value in parameters.items() if key != drive}
     head = {"name": _name_of(function), **tables, "states": states, "parameters": own}
@@ -432,9 +434,9 @@ class _Call:
 def _differs(a: np.ndarray, b: np.ndarray) -> tuple[int, int] | None:
     """Return the place (trial, state) of the largest difference of rates, if it is no rounding."""
     size = np.abs(a).max(axis=0) + 1e-300
-    off = np.abs(a - b) / size
-    k, i = np.unravel_index(np.nanargmax(off), off.shape)
-    return None if off[k, i] <= SAME and np.isfinite(b).all() else (int(k), int(i))
+    off = np.where(np.isfinite(b), np.abs(a - b) / size, np.inf)
+    k, i = np.unravel_index(np.argmax(off), off.shape)
+    return None if off[k, i] <= SAME else (int(k), int(i))
 
 
 def _period(drive: Drive, key: str) -> str:

@@ -127,6 +127,9 @@ class Traced(NDArrayOperatorsMixin):
     def __init__(self, op: str, args: tuple[Traced, ...] = (), value: float | str = "") -> None:
         self.op, self.args, self.value = op, args, value
 
+    def __repr__(self) -> str:
+        return str(self.value) if self.op in ("name", "number") else f"<{self.value or self.op}>"
+
     @property
     def is_condition(self) -> bool:
         """Whether it is true or false and not a number."""

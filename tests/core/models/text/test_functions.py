@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import magpend
 from magpend_core.models import ModelError
+from magpend_core.models.text.numeric import rates_of
 from magpend_core.models.text.tracing import RULES
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
@@ -255,6 +256,38 @@ def test_model__solves_systems_and_splits_what_is_too_large():
     assert {"part1", "x"} < set(equations(deep, "u"))
 
 
+VECTORS = {
+    "max": lambda t, y: y * np.max(y) + max(y[0], 0.2),
+    "mean": lambda t, y: y - np.mean(y) + np.std(y) ** 2,
+    "prod": lambda t, y: np.cumsum(y) * np.prod(y),
+    "einsum": lambda t, y: np.einsum("ij,j->i", np.eye(3), y) * np.einsum("i,i", y, y),
+    "outer": lambda t, y: np.outer(y, y)[0] + np.kron(y, [1.0]),
+    "cross": lambda t, y: np.cross([y[0], y[1], 1.0], [1.0, 2.0, y[2]]),
+    "norm": lambda t, y: y / np.linalg.norm(y) + np.vdot(y, y) + np.trace(np.diag(y)),
+    "polyval": lambda t, y: np.polyval([1.0, 2.0, 3.0], y) + np.polyval([0.5, 0.1], y[0]),
+    "interp": lambda t, y: np.interp(y, [-0.5, 0.0, 0.7], [1.0, 0.0, 3.0]) + np.interp(y[0], [0.0, 1.0], [0.0, 2.0]),
+    "piecewise": lambda t, y: np.piecewise(y, [y < 0, y >= 0], [lambda x: -x, lambda x: x**2]),
+    "select": lambda t, y: np.select([y < -0.2, y > 0.2], [y + 0.2, y - 0.2], 0.0),
+    "vectorize": lambda t, y: np.vectorize(lambda a: a**2)(y),
+    "gradient": lambda t, y: np.gradient(y) + np.convolve(y, [1.0, 2.0, 1.0], "same"),
+    "block": lambda t, y: np.block([[np.zeros((1, 3))], [np.ones((2, 3))]]).dot(y) + np.array([y[1], 0.0, 1.0]),
+    "types": lambda t, y: y.astype(float) + np.zeros(3, dtype=float) + np.asarray(y, dtype=float).copy(),
+    "indices": lambda t, y: y[[2, 0, 1]][::-1] * np.tile(y[:1], 3) + np.repeat(y[1], 3) + np.full(3, y[2]),
+    "stack": lambda t, y: np.sum([y, np.roll(y, 1)], axis=0) + np.column_stack([y, y])[:, 1] + np.append(y[:2], 1.0),
+}
+
+
+@pytest.mark.parametrize("what", VECTORS)
+def test_model__follows_vectors(what):
+    """`read_function` compares the text with the function; here its text is compared once more, at other states."""
+    function = VECTORS[what]
+    model = made(function, "a b c_", {})
+    for state in np.random.default_rng(2).uniform(-1.0, 1.0, (5, 3)):
+        known = {"a": state[0], "b": state[1], "c_": state[2], "pi": math.pi, "t": 0.0, "f": 1.0, "phase": 0.0}
+        found = rates_of(model.definition, known)
+        np.testing.assert_allclose(list(found.values()), function(0.0, state), rtol=1e-12, atol=1e-12)
+
+
 def test_model__text_has_the_rules_of_numpy():
     """Each rule against numpy's own function."""
     binary = {name for name in RULES if getattr(getattr(np, name), "nin", 3) == 2}
@@ -344,5 +377,7 @@ def test_model__refuses_in_words(function, given, words):
 
 
 def test_model__drive_belongs_to_functions():
+    with pytest.raises(ModelError, match=r'in the order of y: states=\("x", "v"\)'):
+        magpend.model(duffing)
     with pytest.raises(magpend.SpecError, match="parameter of a function"):
         magpend.model("x' = -x", drive="omega")
