@@ -27,6 +27,7 @@ _DEGREE_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 45, 90, 180, 360)
 _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 
+OMEGA = r"$\omega$"
 MATH_SPACE = r"\ "
 
 
@@ -171,12 +172,16 @@ def parameter_label(coordinate: xr.DataArray) -> str:
     name = str(coordinate.attrs.get("long_name", coordinate.name))
     if coordinate.name == "frequency":
         name = "drive frequency"
+    if coordinate.name == "omega":
+        name = f"{name} {OMEGA}".removeprefix("omega ")
     return with_unit(name, shown_unit(coordinate.attrs, "Hz" if coordinate.name == "frequency" else ""))
 
 
 def swept_label(name: str, units: str) -> str:
     """Return the axis label of the parameter along which branches are continued."""
-    return "drive frequency [Hz]" if name in ("frequency", "frequency_hz") else with_unit(name, units)
+    if name in ("frequency", "frequency_hz"):
+        return "drive frequency [Hz]"
+    return with_unit(OMEGA if name == "omega" else name, units)
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:

@@ -18,11 +18,11 @@ import numpy as np
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.layout.conventions import shown_unit
+from pipeline.layout.own_words import in_own_words
 from pipeline.layout.vocabulary import is_grid_dim, letter, parameter_name, split_dims
-from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
-from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.derive import AnalysedRun, shown_table
 from pipeline.runs.drawing import figure
 from pipeline.runs.status import state
 from pipeline.runs.versions import current
@@ -200,8 +200,8 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield Note(str(error))
         return
     command = command_of("analyse attractors", options, shown.directory)
-    table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
-    rows = list(table.rows)
+    table, told = shown_table("attractors", found), sentence(in_own_words(found))
+    rows: list[dict[str, Any]] = [dict(row) for row in table.rows]
     most, n_others = leading(rows, "attractor_id", "n_cells")
     yield Grid(*_attractor_grid(found, most, shown.axes), _counted(rows, told), command, n_others)
     for remark in table.lines[table.lines.index(told) + 1 :]:
@@ -304,7 +304,7 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     path = str(found.attrs.get("path", ""))
     unit = shown_unit(found[path].attrs) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
-    rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
+    rows = [_with_letters(row, axis) for row in shown_table(name, found).rows]
     # the settled options, so that a page made from the stored result is the same
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
