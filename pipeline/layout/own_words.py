@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,11 @@ def rate_attribute(word: str) -> dict[str, str]:
     return {} if word == FREQUENCY else {RATE: word}
 
 
+def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:
+    """Return the names of dims with that of the drive's frequency as the word of its rate."""
+    return tuple(RATES[word].column if dim == FREQUENCY_DIM and word != FREQUENCY else dim for dim in dims)
+
+
 def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset with the drive's rate in the word of its specification, for tables and figures.
 
@@ -43,28 +48,28 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
             about = {**variable.attrs, "units": unit}
             if name == FREQUENCY_DIM:
                 about["long_name"] = about["long_name"].replace("drive frequency", rate.meaning)
-            values = rate.given(variable.values)
-            if (of := _ERRORS.get(str(name))) is not None:
-                values = variable.values * rate.slope(ds[of].values)
+            of = _ERRORS.get(str(name))
+            values = rate.given(variable.values) if of is None else variable.values * rate.slope(ds[of].values)
             found[name] = (variable.dims, _rounded(values), about)
         elif rate.inverse and name in _FLIPPED:
             found[name] = (variable.dims, 1 - variable.values, variable.attrs)
     coordinates = {name: value for name, value in found.items() if name in ds.coords}
     shown = ds.assign_coords(coordinates).assign({n: v for n, v in found.items() if n not in ds.coords})
-    named = {FREQUENCY: word, FREQUENCY_DIM: word, "Hz": unit}
+    named = {FREQUENCY: rate.column, FREQUENCY_DIM: rate.column, "Hz": unit}
     shown.attrs = {k: named.get(v, v) if isinstance(v, str) else v for k, v in ds.attrs.items()}
     if FREQUENCY_DIM not in ds.variables:
         return shown
-    shown = shown.rename({FREQUENCY_DIM: word})
-    return shown.sortby(word) if rate.inverse and word in shown.dims else shown
+    shown = shown.rename({FREQUENCY_DIM: rate.column})
+    return shown.sortby(rate.column) if rate.inverse and rate.column in shown.dims else shown
 
 
 def hertz_of(ds: xr.Dataset) -> xr.DataArray | None:
     """Return the drive frequency of a dataset [Hz], also of one from `in_own_words`; None if there is none."""
     word = str(ds.attrs.get(RATE, FREQUENCY))
-    if FREQUENCY_DIM in ds.coords or word not in ds.coords:
+    rate = RATES[word]
+    if FREQUENCY_DIM in ds.coords or rate.column not in ds.coords:
         return ds.coords.get(FREQUENCY_DIM)
-    found: xr.DataArray = RATES[word].hertz(ds.coords[word])
+    found: xr.DataArray = rate.hertz(ds.coords[rate.column])
     return found
 
 
@@ -73,17 +78,15 @@ def arguments_in_own_words(given: Mapping[str, Any]) -> dict[str, Any]:
     first = next((value for value in given.values() if isinstance(value, xr.Dataset)), None)
     if first is None or RATE not in first.attrs:
         return {}
-    word, found = str(first.attrs[RATE]), dict[str, Any]()
+    rate, found = RATES[str(first.attrs[RATE])], dict[str, Any]()
     for name, value in given.items():
         if isinstance(value, xr.Dataset):
             found[name] = in_own_words(value)
         elif isinstance(value, xr.DataArray):
             found[name] = in_own_words(value.to_dataset(name="value").assign_attrs(first.attrs))["value"]
         elif name == "at" and value and FREQUENCY_DIM in value:
-            own = float(_rounded(RATES[word].given(value[FREQUENCY_DIM])))
-            found[name] = {
-                word if n == FREQUENCY_DIM else n: own if n == FREQUENCY_DIM else v for n, v in value.items()
-            }
+            own = float(_rounded(rate.given(value[FREQUENCY_DIM])))
+            found[name] = {key: at for key, at in value.items() if key != FREQUENCY_DIM} | {rate.column: own}
     return found
 
 

@@ -28,6 +28,8 @@ _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 
 OMEGA = r"$\omega$"
+RATE_AXES = ("frequency", "omega", "drive_period")
+"""Dims of the drive's rate, which maps show on the horizontal axis."""
 MATH_SPACE = r"\ "
 
 
@@ -181,7 +183,7 @@ def swept_label(name: str, units: str) -> str:
     """Return the axis label of the parameter along which branches are continued."""
     if name in ("frequency", "frequency_hz"):
         return "drive frequency [Hz]"
-    return with_unit(OMEGA if name == "omega" else name, units)
+    return with_unit({"omega": OMEGA, "drive_period": "drive period"}.get(name, name), units)
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, grid_dim, is_grid_dim, parameter_name
 from pipeline.products.product import Options
 from pipeline.specification.problems import SpecError, unknown_name
-from pipeline.specification.tables import FREQUENCY, RATES, Rate
+from pipeline.specification.tables import FREQUENCY, RATES, Rate, word_named
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -70,7 +70,7 @@ def _rate(run: RunDirectory, name: str, options: Options) -> str:
     """Return the word for the drive's rate that an option's name is; that of the run if no name was given."""
     if name == FREQUENCY and getattr(options, "parameter", name) == "":
         return run.spec.rate
-    return name if name in RATES and name not in run.model.parameter_names else ""
+    return "" if name in run.model.parameter_names else word_named(name)
 
 
 def _bounds(role: str, given: Mapping[str, Any], rate: Rate, convert: Callable[[Any], Any]) -> dict[str, Any]:
@@ -148,6 +148,6 @@ def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> t
             turned = axis in cube.coords and str(cube[axis].attrs.get("units", "")).startswith("rad")
             in_degrees = is_grid_dim(axis) and turned and (degrees or name != plain)
             return axis, math.radians(value) if in_degrees else value
-    if name in RATES and FREQUENCY_DIM in dims:
-        return FREQUENCY_DIM, RATES[name].hertz(value)
+    if (word := word_named(name)) and FREQUENCY_DIM in dims:
+        return FREQUENCY_DIM, RATES[word].hertz(value)
     raise SpecError(unknown_name("axis", name, [d for d in dims if d in cube.coords] or dims))

@@ -22,6 +22,7 @@ FREQUENCY = "frequency_hz"
 class Rate:
     """A word for the drive's rate, with its unit and the factor that converts it to Hz."""
 
+    column: str  # in tables, where period is the number of drive periods of an orbit
     meaning: str
     unit: str
     factor: float = 1.0
@@ -41,15 +42,20 @@ class Rate:
 
 
 RATES = {
-    FREQUENCY: Rate("drive frequency", "Hz"),
-    "omega": Rate("angular drive frequency", "rad/s", 2.0 * math.pi),
-    "period": Rate("drive period", "s", inverse=True),
+    FREQUENCY: Rate(FREQUENCY, "drive frequency", "Hz"),
+    "omega": Rate("omega", "angular drive frequency", "rad/s", 2.0 * math.pi),
+    "period": Rate("drive_period", "drive period", "s", inverse=True),
 }
 """Words by which the drive's rate may be given. Cubes hold the frequency."""
 
 MAX_POINTS = 10_000_000
 EXACT = 2**53
 """Largest bound up to which all whole numbers are exact in float64."""
+
+
+def word_named(name: str) -> str:
+    """Return the word for the drive's rate that a name of it in options or tables stands for; empty if it is none."""
+    return next((word for word, rate in RATES.items() if name in (word, rate.column)), "")
 
 
 class Table(BaseModel):

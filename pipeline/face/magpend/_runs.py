@@ -267,7 +267,7 @@ class Run(RunDirectory):
         out
             Directory of the wider run. By default it replaces this run, which is renamed to ``DIR.before``.
         axes
-            New ranges by ``frequency_hz``, parameter, or state of a grid:
+            New ranges by ``frequency_hz``, ``omega``, ``period``, parameter, or state of a grid:
             ``{"frequency_hz": {"start": 2.0, "stop": 3.0, "num": 201}}``.
         products
             Additional products, with their options: ``{"lyapunov": {}}``.
@@ -306,7 +306,8 @@ class Run(RunDirectory):
         Parameters
         ----------
         ranges
-            Lowest and highest value by ``frequency_hz``, parameter or state (with ``_deg`` in degrees).
+            Lowest and highest value by ``frequency_hz``, ``omega``, ``period``, parameter or state (with ``_deg`` in
+            degrees).
         at
             One value by key, as in `ranges`.
         num
