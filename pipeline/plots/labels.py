@@ -220,6 +220,7 @@ def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
         # under a recorded drive the mean one
         mean = "mean " if str(coordinate.attrs.get("long_name", "")).startswith("mean") else ""
         return _assignment(f"{mean}$f$", value, "Hz")
+    name = {"omega": OMEGA, "drive_period": "drive period"}.get(name, name)
     return _assignment(name, value, unit)
 
 

@@ -112,8 +112,8 @@ class Spec:
 
     Examples
     --------
-    >>> spec = Spec("sweep", "x' = -x + A*cos(2*pi*f*t)\nA = 1.0").with_axis("A", 0.5, 1.0, 3)
-    >>> spec = spec.with_parameters(frequency_hz=0.2).with_start_grid(x=(-1, 1, 4)).with_integration(n_keep=2)
+    >>> spec = Spec("sweep", "x' = -x + A*cos(omega*t)\nA = 1.0").with_axis("A", 0.5, 1.0, 3)
+    >>> spec = spec.with_parameters(omega=1.0).with_start_grid(x=(-1, 1, 4)).with_integration(n_keep=2)
     >>> spec.tables["axes"]
     {'A': {'start': 0.5, 'stop': 1.0, 'num': 3}}
     >>> spec.integration.rtol
