@@ -15,6 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, t
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
 from pipeline.analysis.run import OpenRun
@@ -23,7 +24,7 @@ from pipeline.analysis.sets import rows_by_number
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, letter, parameter_name
 from pipeline.plots import labels, palette, style
-from pipeline.plots.branches import DASHES, KINDS, NAMES, draw_over, line_note, mark_points
+from pipeline.plots.branches import DASHES, NAMES, draw_over, line_note, mark_points
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.branches import CurveOptions
 from pipeline.products.figures import CurveFigureOptions, RegimeOptions
@@ -383,7 +384,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
             color=_CURVE_COLOURS[kind],
             linestyle=DASHES[periods.index(period) % len(DASHES)],
             linewidth=1.2,
-            label=f"{NAMES[kind]}, period {period}",
+            label=f"{LABELS[kind]} {NAMES[kind]}, period {period}",
         )
         seen.setdefault((period, kind), line)
     style.label_axes(

@@ -13,6 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, words_of
@@ -294,6 +295,7 @@ def _jump(ds: xr.Dataset, name: str, k: int) -> Words:
     return {
         **{key: f"{value:g}" for key, value in fixed_of(ds, branch).items()},
         name: f"{float(ds['value'][event]):.7g}",
+        "label": LABELS[words_of(ds["kind"])[int(ds["kind"][event])]],
         "as it": "rises" if bool(one["jump_rises"]) else "falls",
         "from": f"{float(ds['bifurcation_amplitude'][event, 0]):.6g} (period {int(ds['orbit_period'][branch])})",
         "to": LANDINGS[word] or lands,
