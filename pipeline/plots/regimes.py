@@ -211,9 +211,8 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
         raise ValueError(
             f"a map of regimes has two swept parameters, and {left_of}; sweep two, and choose values of any others"
         )
-    return (
-        ("frequency", next(d for d in chosen if d != "frequency")) if "frequency" in chosen else (chosen[0], chosen[1])
-    )
+    (x, y) = chosen
+    return (y, x) if y in labels.RATE_AXES else (x, y)
 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
