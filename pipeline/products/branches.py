@@ -25,6 +25,12 @@ class BranchOptions(Options):
     recurrences: int = option(
         0, "Also start from orbits up to this period, near close recurrences of bounded cells.", ge=0
     )
+    isolas: int = option(
+        0,
+        "Number of parameter values, evenly spaced, at which all orbits are searched, also those of detached "
+        "branches, up to --period or the longest period of the run's orbits.",
+        ge=0,
+    )
 
 
 class CurveOptions(BranchOptions):
