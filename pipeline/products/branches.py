@@ -28,7 +28,7 @@ class BranchOptions(Options):
     isolas: int = option(
         0,
         "Number of parameter values, evenly spaced, at which all orbits are searched, also those of detached "
-        "branches, up to --period or the longest period of the run's orbits.",
+        "branches; up to --period, or the longest period of the run's orbits, at most 4.",
         ge=0,
     )
 

@@ -17,7 +17,6 @@ from pipeline.analysis.tabular import Row, Words, aligned, counted, values, word
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
-from pipeline.products.reporting import track
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -60,8 +59,9 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
         found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
         starts += [s for s in found if low <= s.value <= high]
     searched = places_of(cube, base, parameter, interval, options.isolas)
-    periods = np.arange(1, 1 + (options.max_period or max([1, *(s.family.period for s in starts)])))
-    for place in track(searched, "searching detached branches"):
+    own = max([1, *(s.family.period for s in starts)])
+    periods = np.arange(1, 1 + (options.max_period or min(own, LEAST_PERIOD)))
+    for place in searched:
         place.search(periods)
         starts += place.starts()
     run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")

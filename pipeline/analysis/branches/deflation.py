@@ -79,6 +79,7 @@ def search_orbits(
     system: System,
     *,
     rounds: int = ROUNDS,
+    what: str = "searching orbits",
 ) -> list[FoundOrbit]:
     """Find the periodic orbits near many starts by plain and then by deflated Newton iterations, each orbit once.
 
@@ -96,6 +97,8 @@ def search_orbits(
         System of equations to integrate.
     rounds
         Largest number of rounds with deflation.
+    what
+        Name of the work in progress reports.
 
     Returns
     -------
@@ -105,7 +108,7 @@ def search_orbits(
     found: list[FoundOrbit] = []
     generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)
     for number in range(1 + rounds):
-        report("searching orbits", number, 1 + rounds)
+        report(what, number, 1 + rounds)
         moved = starts + spread * generator.standard_normal(starts.shape) if number else starts
         ends = _iterate(moved, periods, frequency_hz, packed, system, found)
         n_before = len(found)
