@@ -12,6 +12,7 @@ import magpend
 from pipeline.analysis.branches import searching
 from pipeline.analysis.branches.analysis import branches_table, isolas_of
 from pipeline.analysis.branches.bifurcations import KINDS, PITCHFORK
+from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.searching import VERDICTS, places_of
 from pipeline.analysis.response.analysis import response_table
 from pipeline.layout.vocabulary import parameters_of
@@ -165,6 +166,13 @@ def test_deflation__needs_fewer_starts(run, monkeypatch):
     for place in whole:
         place.search(np.array([1]))
     assert [len(place.found) for place in whole] == [3, 3, 3, 3]
+    # branches that pass a value bring the same orbits
+    scope = Scope(*ends, max_period=1, max_generations=0)
+    branches = explore([start for place in whole[:2] for start in place.starts()], scope)
+    fresh = places_of(cube, base, "frequency", ends, 4)[3]
+    fresh.add_branches(branches, 1)
+    own, other = (sorted(tuple(one.points[0]) for one in place.found) for place in (fresh, whole[3]))
+    np.testing.assert_allclose(own, other, atol=1e-8)
     # a sum that differs proves that an orbit is missing; the two orbits of an isola have opposite indices
     place = whole[0]
     saddle = next(one for one in place.found if one.index() == -1)
