@@ -157,7 +157,7 @@ def branches_table(ds: xr.Dataset) -> Table:
         return Table(rows, lines, _why_none(ds))
     head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
-    return Table(rows, [*lines, *_isolas(ds), *searched_lines(ds), *_listed(ds, "stuck"), *_left_out(ds)])
+    return Table(rows, [*lines, *_detached(ds), *searched_lines(ds), *_listed(ds, "stuck"), *_left_out(ds)])
 
 
 def _why_none(ds: xr.Dataset) -> str:
@@ -287,23 +287,38 @@ def _listed(ds: xr.Dataset, name: str) -> list[str]:
 
 def isolas_of(ds: xr.Dataset) -> list[int]:
     """Return the branches that are isolas: closed curves that no bifurcation connects to a branch of their period."""
+    return [i for i in _unconnected(ds) if _ends_of(ds, i)[0] == "closed"]
+
+
+def cut_of(ds: xr.Dataset) -> list[int]:
+    """Return the branches that are detached within the interval of the parameter, and leave it twice at one bound.
+
+    Beyond the bound they may close or be connected to another branch.
+    """
+    cut = [i for i in _unconnected(ds) if _ends_of(ds, i) == ("bound", "bound")]
+    line, last = ds["parameter"].values, ds["n_points"].values - 1
+    return [i for i in cut if np.isclose(line[i, 0], line[i, last[i]], rtol=1e-9, atol=0.0)]
+
+
+def _unconnected(ds: xr.Dataset) -> list[int]:
+    """Return the branches that spring from no other one and are connected to none by a branch point."""
     crossing = np.isin(ds["kind"].values, [KINDS.index(kind) for kind in (BRANCHING, PITCHFORK, TRANSCRITICAL)])
     connected = {*ds["of_branch"].values[crossing].tolist(), *ds["to_branch"].values[crossing].tolist()}
-    return [
-        i
-        for i in range(ds.sizes["branch"])
-        if _ends_of(ds, i)[0] == "closed" and int(ds["origin"][i]) < 0 and i not in connected
-    ]
+    return [i for i in range(ds.sizes["branch"]) if int(ds["origin"][i]) < 0 and i not in connected]
 
 
-def _isolas(ds: xr.Dataset) -> list[str]:
+def _detached(ds: xr.Dataset) -> list[str]:
     lines = []
-    for i in isolas_of(ds):
-        line = ds["parameter"].values[i, : int(ds["n_points"][i])]
-        name = parameter_name(str(ds.attrs["parameter"]))
-        what = f"period {int(ds['orbit_period'][i])}, branch {i}{_at(ds, i)}"
-        lines.append(f"  {what}: {name} {line.min():.7f} to {line.max():.7f}")
-    return ["", "isolas: closed curves that no bifurcation connects to another branch", *lines] if lines else []
+    for branches, head in (
+        (isolas_of(ds), "isolas: closed curves that no bifurcation connects to another branch"),
+        (cut_of(ds), "detached within the interval, which they leave twice at one bound: widen it"),
+    ):
+        lines += ["", head] if branches else []
+        for i in branches:
+            line = ds["parameter"].values[i, : int(ds["n_points"][i])]
+            what = f"period {int(ds['orbit_period'][i])}, branch {i}{_at(ds, i)}"
+            lines.append(f"  {what}: {line.min():.7f} to {line.max():.7f}")
+    return lines
 
 
 _VERDICTS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from magpend_core.models.model import Parameters, Quantity, State
 from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
-from pipeline.analysis.branches.analysis import fixed_of, isolas_of, searched_lines
+from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, searched_lines
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, words_of
@@ -229,8 +229,8 @@ def response_table(ds: xr.Dataset) -> Table:
         return Table(rows, ["no orbit to measure"], "no branch: no closed orbit to begin with")
     name, first = parameter_name(str(ds.attrs["parameter"])), str(ds["channel"].values[0])
     lines = [f"amplitude of {first}{_unit(ds)} along {name}, the largest of each branch"]
-    isolas = isolas_of(ds)
-    lines += ["", *aligned([_peak(ds, name, i, isolas) for i in range(ds.sizes["branch"])], "")]
+    detached = dict.fromkeys(isolas_of(ds), "isola") | dict.fromkeys(cut_of(ds), "detached within the interval")
+    lines += ["", *aligned([_peak(ds, name, i, detached) for i in range(ds.sizes["branch"])], "")]
     jumps = [_jump(ds, name, k) for k in np.argsort(_jump_values(ds), kind="stable")]
     none = "no jump: no stable orbit ends at a fold or a subcritical bifurcation"
     lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", none]
@@ -264,7 +264,7 @@ def _unit(ds: xr.Dataset) -> str:
     return "" if unit in ("", "1") else f" [{unit}]"
 
 
-def _peak(ds: xr.Dataset, name: str, branch: int, isolas: Sequence[int]) -> Words:
+def _peak(ds: xr.Dataset, name: str, branch: int, detached: Mapping[int, str]) -> Words:
     n = int(ds["n_points"][branch])
     amplitude = ds["amplitude"].values[branch, :n, 0]
     at = int(np.nanargmax(amplitude))
@@ -277,7 +277,7 @@ def _peak(ds: xr.Dataset, name: str, branch: int, isolas: Sequence[int]) -> Word
         "largest": f"{amplitude[at]:.6g}",
         "at": f"{x[at]:.6g}",
         "stable": f"{stable.mean():.0%}",
-        "closed": "isola" if branch in isolas else None,
+        "curve": detached.get(branch),
     }
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import fsolve
 
 import magpend
 from pipeline.analysis.branches import searching
-from pipeline.analysis.branches.analysis import branches_table, isolas_of
+from pipeline.analysis.branches.analysis import branches_table, cut_of, isolas_of
 from pipeline.analysis.branches.bifurcations import KINDS, PITCHFORK
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.searching import VERDICTS, places_of
@@ -138,6 +138,19 @@ def test_isola__ends_at_folds_of_harmonic_balance(found):
     assert isolas_of(found.assign(origin=found["origin"] * 0)) == []
     kinds = np.where(found["of_branch"] == isola, KINDS.index(PITCHFORK), found["kind"])
     assert isolas_of(found.assign(kind=("bifurcation", kinds))) == []
+
+
+@pytest.mark.slow
+def test_cut_isola__is_detached_within_the_interval(run, found):
+    """Up to 0.15 Hz the isola leaves the interval twice; the main curve passes from bound to bound."""
+    part = run.branches(high=0.15, isolas=4, generations=0)
+    assert isolas_of(part) == []
+    (cut,) = cut_of(part)
+    line = part["parameter"].values[cut, : int(part["n_points"][cut])]
+    assert line.max() == pytest.approx(0.15, rel=1e-12)
+    assert line.min() == pytest.approx(float(found["parameter"].values[isolas_of(found)[0]].min()), abs=1e-5)
+    assert any("widen" in text for text in branches_table(part).lines)
+    assert cut_of(found) == []
 
 
 @pytest.mark.slow
