@@ -10,13 +10,15 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, KINDS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, KINDS, LABELS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values, words_of
+from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
+from pipeline.specification.tables import FREQUENCY as FREQUENCY_HZ
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -69,7 +71,9 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     followed = explore(starts, scope)
     if starts and not followed:
         left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
-    return dataset_of(followed, parameter, base, left_out).assign(searched_variables(searched, followed, periods))
+    return dataset_of(followed, parameter, base, left_out).assign(
+        searched_variables(searched, followed, periods, base.model)
+    )
 
 
 def _ends(options: BranchOptions) -> tuple[float, float]:
@@ -185,6 +189,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
             {
                 parameter: float(one["value"]),
                 "bracket": float(one["bracket"]),
+                "label": LABELS[told["kind"]],
                 "type": told["kind"],
                 "criticality": "" if told["criticality"] == "unknown" else told["criticality"],
                 "period": int(ds["orbit_period"].values[branch]),
@@ -229,6 +234,7 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
     to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
     return {
         name if unit == "1" else f"{name} {unit}".rstrip(): f"{row[parameter_name(name)]:.7f}",
+        "label": row["label"],
         "type": row["type"],
         "criticality": row["criticality"],
         "normal_form": _with_error(row["normal_form"], row["normal_form_error"]),
@@ -334,16 +340,18 @@ def searched_lines(ds: xr.Dataset) -> list[str]:
     """Return text lines on the points at which all orbits were searched; none if there was no search."""
     if "searched_value" not in ds:
         return []
+    word = str(ds.attrs.get(RATE, FREQUENCY_HZ))
+    dims = {n: str(n).removeprefix("searched_") for n in ds.data_vars if str(n).startswith("searched_")}
+    dims["searched_value"] = str(ds.attrs["parameter"])
+    names = {n: parameter_name(dims_in_own_words([dim], word)[0]) for n, dim in dims.items()}
     rows = []
     for k in range(ds.sizes["searched"]):
         one = ds.isel(searched=k)
         told = {words_of(ds["index_verdict"])[code] for code in one["index_verdict"].values.tolist()}
-        axes = {str(n).removeprefix("searched_"): float(one[n]) for n in ds.data_vars if str(n).startswith("searched_")}
         counts = zip(ds["times"].values.tolist(), one["n_orbits"].values, one["index_sum"].values, strict=True)
         rows.append(
             {
-                parameter_name(str(ds.attrs["parameter"])): f"{axes.pop('value'):.7g}",
-                **{name: f"{value:g}" for name, value in axes.items()},
+                **{name: f"{float(one[n]):.7g}" for n, name in names.items()},
                 **{f"period {p}": f"{n} ({total:+d})" for p, n, total in counts},
                 "coverage": f"{float(one['coverage']):.0%}" if np.isfinite(one["coverage"]) else "?",
                 "sum": _VERDICTS["missing" if "missing" in told else told.pop()],
@@ -460,8 +468,10 @@ def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
     one = ds.isel(special=k)
     ranges = [float(np.nanmax(ds[role].values) - np.nanmin(ds[role].values)) for role in ("first", "second")]
     errors = [float(one[f"special_{role}_error"]) for role in ("first", "second")]
+    kind = values(one, "special_kind")["special_kind"]
     return {
-        "type": values(one, "special_kind")["special_kind"],
+        "label": LABELS[kind],
+        "type": kind,
         names[0]: float(one["special_first"]),
         names[1]: float(one["special_second"]),
         "period": int(one["special_period"]),
@@ -480,4 +490,5 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     lines = [one[role].values[:n] for role in ("first", "second")]
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
     ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
-    return f"  {number}: {told['kind']}, period {told['orbit_period']}: {spans}" + (f"; ends: {ends}" if ends else "")
+    what = f"{LABELS[told['kind']]} {told['kind']}, period {told['orbit_period']}"
+    return f"  {number}: {what}: {spans}" + (f"; ends: {ends}" if ends else "")

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.model import Parameters
+from magpend_core.models.model import Model, Parameters
 from magpend_core.pointwise import jacobian_at, rates_at
 from pipeline.analysis.branches.deflation import (
     FoundOrbit,
@@ -30,10 +30,10 @@ from pipeline.analysis.branches.deflation import (
 )
 from pipeline.analysis.branches.following import Branch
 from pipeline.analysis.branches.known import Start, chords_at, same_others
-from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.problems import Family, parameter_units
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, sections_of
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, parameter_name, split_dims
+from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, split_dims
 
 STARTS = (100, 400)
 """Starts per period: of the search, and of a second one where the sum of the indices shows that orbits are missing."""
@@ -52,7 +52,7 @@ class Place:
 
     family: Family  # of period 1, with the parameter's value among its parameters
     value: float  # value of the continuation parameter
-    where: Mapping[str, float]  # values of the run's other axes
+    where: Mapping[str, float]  # values of the run's other axes, by dim
     seen: np.ndarray  # section points of the run's cells with these values, (any, n_states)
     reach: np.ndarray  # least and largest initial state of these cells, (2, n_states)
     hindrance: str  # verdict if the sum of the indices is not known, else empty
@@ -140,7 +140,7 @@ def places_of(
     places = []
     for index in np.ndindex(*(cube.sizes[d] for d in dims)):
         cells = cube.isel(dict(zip(dims, index, strict=True)))
-        where = {parameter_name(d): float(cells.coords[d]) for d in dims}
+        where = {d: float(cells.coords[d]) for d in dims}
         frequency, packed = parameters_at(cells.isel({parameter: 0}, missing_dims="ignore"), parameters)
         family = family_of(parameters.model.system, 1, frequency, packed, parameter, high - low)
         seen, reach, hindrance = sections_of(cells), _reach(cells, parameters), _hindrance(cells, parameters)
@@ -166,7 +166,9 @@ def _hindrance(cells: xr.Dataset, parameters: Parameters) -> str:
     return "unfinished" if np.isin(status, (PENDING, *FAILED)).any() else ""
 
 
-def searched_variables(places: Sequence[Place], branches: Sequence[Branch], periods: np.ndarray) -> dict[str, Any]:
+def searched_variables(
+    places: Sequence[Place], branches: Sequence[Branch], periods: np.ndarray, model: Model
+) -> dict[str, Any]:
     """Count the orbits at each place, with those on branches, and return variables on the counts; none without places.
 
     Returns, over ``searched``: ``searched_value`` and the values of other axes (``searched_...``), and ``coverage``,
@@ -181,16 +183,15 @@ def searched_variables(places: Sequence[Place], branches: Sequence[Branch], peri
     counts = [[sum(one.period == p for one in place.found) for p in periods.tolist()] for place in places]
     sums = [list(index_sums(place.found, int(periods[-1])).values()) for place in places]
     codes = [[VERDICTS.index(verdict) for verdict in place.verdicts(periods)] for place in places]
-    axes = {f"searched_{name}": [place.where[name] for place in places] for name in places[0].where}
+    columns = {"value": [p.value for p in places], **{d: [p.where[d] for p in places] for d in places[0].where}}
+    units = {name: parameter_units(places[0].family.free[0] if name == "value" else name, model) for name in columns}
     about = f"whether the indices add up to {expected_index(places[0].system)}"
     both = ("searched", "times")
     return {
-        "searched_value": (
-            "searched",
-            [p.value for p in places],
-            {"long_name": "parameter where orbits were searched"},
-        ),
-        **{name: ("searched", values, {"long_name": name}) for name, values in axes.items()},
+        **{
+            f"searched_{name}": ("searched", values, {"units": units[name], "long_name": "where orbits were searched"})
+            for name, values in columns.items()
+        },
         "coverage": ("searched", [p.coverage for p in places], {"units": "1", "long_name": "share of starts"}),
         "n_orbits": (both, np.array(counts, np.int32), {"units": "1", "long_name": "orbits of this least period"}),
         "index_sum": (both, np.array(sums, np.int32), {"units": "1", "long_name": "sum of the fixed-point indices"}),
