@@ -130,7 +130,7 @@ def test_isola__ends_at_folds_of_harmonic_balance(found):
     assert len(ends) == 2
     balance = Balance(np.arange(1, 14, 2))
     for end, inside in zip(ends, (1e-3, -1e-3), strict=True):
-        assert balance.fold((end, end + inside), 0.75) == pytest.approx(end, rel=1e-7)
+        assert balance.fold((end, end + inside), 0.75) == pytest.approx(end, rel=1e-9)
     line = OMEGA * found["parameter"].values[isola, : int(found["n_points"][isola])]
     assert ends[0] - 1e-4 < line.min() < line.max() < ends[1] + 1e-4
     assert any("isolas" in text for text in branches_table(found).lines)
