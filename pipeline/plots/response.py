@@ -11,8 +11,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
-from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.analysis import fixed_of, isolas_of
 from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import model_of, parameter_name
@@ -50,6 +51,7 @@ def plot_response(
 
     Each value of a further swept parameter, such as the level of the force, has its colour. All bifurcations are
     marked. Arrows lead from the end of a stable orbit to the amplitude of the orbit on which a trajectory lands.
+    Isolas are named.
 
     Parameters
     ----------
@@ -96,6 +98,7 @@ def plot_response(
             _draw_branch(ax, ds, i, of_points, of_bifurcations, shown, levels)
     if not harmonic:
         _draw_jumps(axes[0], ds, channel, measure, levels)
+    _name_isolas(axes[0], ds, measure.shown(chosen[0][0].values))
     _draw_points(axes, points, (measure, phase))
     name = str(ds.attrs["parameter"])
     what = "amplitude" if not harmonic else f"harmonic {harmonic}"
@@ -179,6 +182,21 @@ def _draw_jumps(ax: Axes, ds: xr.Dataset, channel: str, measure: Measure, levels
     for k in np.flatnonzero(np.isfinite(to)):
         x, colour = float(ends["value"][k]), levels[tuple(fixed_of(ds, int(ends["of_branch"][k])).items())]
         ax.annotate("", (x, to[k]), (x, before[k]), arrowprops={**_ARROW, "color": colour}, zorder=7.0)
+
+
+def _name_isolas(ax: Axes, ds: xr.Dataset, amplitude: np.ndarray) -> None:
+    """Write ``isola`` above each branch that is one."""
+    isolas = isolas_of(ds)
+    if isolas:
+        ax.margins(y=0.1)  # room for the name of the highest one
+    for i in isolas:
+        highest = int(np.nanargmax(amplitude[i]))
+        at = float(ds["parameter"].values[i, highest]), amplitude[i, highest]
+        halo = [withStroke(linewidth=1.5, foreground="white")]
+        ax.annotate(
+            "isola", at, (0.0, 4.0), textcoords="offset points", ha="center", va="bottom",
+            fontsize=style.figure_of(ax).look.tick, zorder=9.0, path_effects=halo,
+        )  # fmt: skip
 
 
 def _draw_points(axes: np.ndarray, points: Mapping[str, np.ndarray] | None, measures: tuple[Measure, Measure]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from magpend_core.models.model import Parameters, Quantity, State
 from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
-from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, searched_lines
 from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun
@@ -226,19 +226,21 @@ def response_table(ds: xr.Dataset) -> Table:
     """Return the table of a response.
 
     Rows are those of the branches' points and channels: value of the parameter, fixed parameters, branch, period,
-    whether the orbit is stable, ``amplitude`` (half of peak to peak), ``mean``, ``rms``, ``error``,
-    ``dominant_order``, and ``harmonic_1``, ``phase_1`` [rad], ... The text shows the largest amplitude of each
-    branch, and for each jump the amplitudes before and after it, of the first channel.
+    whether the branch is an isola, whether the orbit is stable, ``amplitude`` (half of peak to peak), ``mean``,
+    ``rms``, ``error``, ``dominant_order``, and ``harmonic_1``, ``phase_1`` [rad], ... The text shows the largest
+    amplitude of each branch, and for each jump the amplitudes before and after it, of the first channel.
     """
     rows = _rows(ds)
     if not rows:
         return Table(rows, ["no orbit to measure"], "no branch: no closed orbit to begin with")
     name, first = parameter_name(str(ds.attrs["parameter"])), str(ds["channel"].values[0])
     lines = [f"amplitude of {first}{_unit(ds)} along {name}, the largest of each branch"]
-    lines += ["", *aligned([_peak(ds, name, i) for i in range(ds.sizes["branch"])], "")]
+    detached = dict.fromkeys(isolas_of(ds), "isola") | dict.fromkeys(cut_of(ds), "detached within the interval")
+    lines += ["", *aligned([_peak(ds, name, i, detached) for i in range(ds.sizes["branch"])], "")]
     jumps = [_jump(ds, name, k) for k in np.argsort(_jump_values(ds), kind="stable")]
     none = "no jump: no stable orbit ends at a fold or a subcritical bifurcation"
     lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", none]
+    lines += searched_lines(ds)
     return Table(rows, lines)
 
 
@@ -246,13 +248,15 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     name = parameter_name(str(ds.attrs["parameter"]))
     rows = []
     arrays = {key: ds[key].values for key in ("parameter", "n_unstable", "orbit_period", "harmonic_amplitude", "phase")}
+    isolas = isolas_of(ds)
     measures = {key: ds[key].values for key in ("amplitude", "mean", "rms", "error", "dominant_order")}
     for i in range(ds.sizes["branch"]):
         fixed = fixed_of(ds, i)
         for j in range(int(ds["n_points"][i])):
             for c, channel in enumerate(ds["channel"].values):
                 row: Row = {name: float(arrays["parameter"][i, j]), **fixed, "branch": i}
-                row |= {"period": int(arrays["orbit_period"][i]), "stable": bool(arrays["n_unstable"][i, j] == 0)}
+                row |= {"period": int(arrays["orbit_period"][i]), "isola": i in isolas}
+                row |= {"stable": bool(arrays["n_unstable"][i, j] == 0)}
                 row |= {"channel": str(channel), **{key: float(v[i, j, c]) for key, v in measures.items()}}
                 for k, order in enumerate(ds["harmonic"].values):
                     row[f"harmonic_{order}"] = float(arrays["harmonic_amplitude"][i, j, c, k])
@@ -266,7 +270,7 @@ def _unit(ds: xr.Dataset) -> str:
     return "" if unit in ("", "1") else f" [{unit}]"
 
 
-def _peak(ds: xr.Dataset, name: str, branch: int) -> Words:
+def _peak(ds: xr.Dataset, name: str, branch: int, detached: Mapping[int, str]) -> Words:
     n = int(ds["n_points"][branch])
     amplitude = ds["amplitude"].values[branch, :n, 0]
     at = int(np.nanargmax(amplitude))
@@ -279,6 +283,7 @@ def _peak(ds: xr.Dataset, name: str, branch: int) -> Words:
         "largest": f"{amplitude[at]:.6g}",
         "at": f"{x[at]:.6g}",
         "stable": f"{stable.mean():.0%}",
+        "curve": detached.get(branch),
     }
 
 
