@@ -1,0 +1,40 @@
+"""Declare the analysis of backbone curves: phase resonance, and nonlinear normal modes."""
+
+from __future__ import annotations
+
+from pipeline.products.product import Analysis, Options, option
+
+_ROOM = "pipeline.analysis.response.backbone"
+
+
+class BackboneOptions(Options):
+    """Options of backbone curves."""
+
+    channel: str = option("", "State or quantity that lags 90 degrees behind the drive; by default the first state.")
+    low: float | None = option(None, "Least frequency; by default the run's.", unit="Hz", flag="--from", gt=0.0)
+    high: float | None = option(None, "Largest frequency; by default the run's.", unit="Hz", flag="--to", gt=0.0)
+    force: str = option("", "Parameter that is the drive's amplitude; by default the only one that scales the drive.")
+    force_low: float | None = option(None, "Least force; by default a hundredth of the run's.", unit="SI")
+    force_high: float | None = option(None, "Largest force; by default twice the run's.", unit="SI")
+    undamped: dict[str, float] = option(
+        {}, "Value of a parameter for normal modes, such as c=0 and F=0, which switch damping and drive off."
+    )
+    reach: float = option(
+        10.0, "Largest distance of a normal mode from its equilibrium.", unit="scales of the states", gt=0.02
+    )
+
+
+BACKBONE = Analysis(
+    "backbone",
+    """Follow phase resonance, a lag of 90 degrees, in frequency and force; and nonlinear normal modes.
+
+    Phase resonance starts where a branch of the response of period 1 passes a lag of 90 degrees. Normal modes are the
+    periodic orbits of the system without damping and drive: give the values that switch these off by --undamped. They
+    start from the linear modes of all equilibria that are found from the cells' sections and from the zero state.""",
+    BackboneOptions,
+    compute=f"{_ROOM}:backbone",
+    table=f"{_ROOM}:backbone_table",
+    settle=f"{_ROOM}:settle_backbone",
+    builds_on=("branches", "response"),
+    figure="backbone",
+)
