@@ -13,9 +13,13 @@ class BackboneOptions(Options):
     channel: str = option("", "State or quantity that lags 90 degrees behind the drive; by default the first state.")
     low: float | None = option(None, "Least frequency; by default the run's.", unit="Hz", flag="--from", gt=0.0)
     high: float | None = option(None, "Largest frequency; by default the run's.", unit="Hz", flag="--to", gt=0.0)
-    force: str = option("", "Parameter that is the drive's amplitude; by default the only one that scales the drive.")
-    force_low: float | None = option(None, "Least force; by default a hundredth of the run's.", unit="SI")
-    force_high: float | None = option(None, "Largest force; by default twice the run's.", unit="SI")
+    drive: str = option("", "Parameter that is the drive's amplitude; by default the only one that scales the drive.")
+    drive_low: float | None = option(
+        None, "Least amplitude of the drive; by default a hundredth of the run's.", unit="SI", flag="--drive-from"
+    )
+    drive_high: float | None = option(
+        None, "Largest amplitude of the drive; by default twice the run's.", unit="SI", flag="--drive-to"
+    )
     undamped: dict[str, float] = option(
         {}, "Value of a parameter for normal modes, such as c=0 and F=0, which switch damping and drive off."
     )

@@ -68,7 +68,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "Orbits and branches, stable or not": {
             "branches": ("branches", ""),
             "response": ("response", ""),
-            "backbone": ("backbone", "the drive frequency as an axis; or a system without damping and drive"),
+            "backbone": ("backbone", ""),
             "bands": ("branches", "a posterior of magpend identify"),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
@@ -109,7 +109,7 @@ _FIGURES = {
         "multipliers": "",
         "curves": "",
         "response": "",
-        "backbone": "as the analysis",
+        "backbone": "",
         "rotation": f"{_ROTATION}, and {_ONE}, or {_TWO}",
         "tongues": f"{_ROTATION}, and {_ONE}",
         "manifolds": _POINT,

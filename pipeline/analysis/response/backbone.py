@@ -104,20 +104,20 @@ def _swing(base: Parameters, frequency_hz: float) -> Array:
 def _settled_force(base: Parameters, options: BackboneOptions, frequency_hz: float) -> dict[str, Any]:
     """Return the parameter that scales the drive, and its bounds."""
     scaling = [name for name in base.names if _scales_drive(base, name, frequency_hz)]
-    force = options.force or (scaling[0] if len(scaling) == 1 else "")
+    force = options.drive or (scaling[0] if len(scaling) == 1 else "")
     if not force:
         several = f"{', '.join(scaling)} all scale" if scaling else "no parameter scales"
-        raise SpecError(f"{several} the drive; name its amplitude with --force, one of {', '.join(base.names)}.")
+        raise SpecError(f"{several} the drive; name its amplitude with --drive, one of {', '.join(base.names)}.")
     if force not in base.names:
         raise SpecError(unknown_name("parameter", force, base.names))
     ends = sorted((0.01 * base[force], 2.0 * base[force]))
-    low = ends[0] if options.force_low is None else options.force_low
-    high = ends[1] if options.force_high is None else options.force_high
+    low = ends[0] if options.drive_low is None else options.drive_low
+    high = ends[1] if options.drive_high is None else options.drive_high
     if not low < high:
-        raise SpecError(f"--force-low {low:g} of {force}: must be less than --force-high {high:g}.")
+        raise SpecError(f"--drive-from {low:g} of {force}: must be less than --drive-to {high:g}.")
     for value in (low, high):
         base.replace(**{force: value})
-    return {"force": force, "force_low": low, "force_high": high}
+    return {"drive": force, "drive_low": low, "drive_high": high}
 
 
 def _scales_drive(base: Parameters, name: str, frequency_hz: float) -> bool:
@@ -159,9 +159,9 @@ def backbone(run: OpenRun, options: BackboneOptions) -> xr.Dataset:
     """
     curves: list[Curve] = []
     left_out: list[str] = []
-    if options.force:
+    if options.drive:
         _follow_resonance(run, options, curves, left_out)
-    if options.undamped or not options.force:
+    if options.undamped or not options.drive:
         _follow_modes(run, options, curves, left_out)
     return _dataset(run, options, curves, left_out)
 
@@ -177,8 +177,8 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
         found = run_alone(phase_resonance(problem, guess))
         if found is None:
             frequency, force = problem.family.values(guess)
-            where = f"{frequency:g} Hz, {options.force} {force:g}"
-            left_out.append(f"phase resonance at {where}: Newton's method found no orbit")
+            where = f"{frequency:g} Hz, {options.drive} {force:g}"
+            left_out.append(f"phase resonance at {where}: Newton's method found no orbit within the bounds")
         elif not any(lies_on(c.points, c.problem.family, _nearest(found, guess)) for c in own):
             curves.append(found)
 
@@ -196,10 +196,10 @@ def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[Reson
     asked = {"parameter": parameter_name(FREQUENCY), "low": options.low, "high": options.high}
     located, response = (run.derive(name, **asked) for name in ("branches", "response"))
     base = parameters_of(run.cube())
-    system, force = base.model.system, options.force
-    assert options.force_low is not None
-    assert options.force_high is not None
-    bounds = (_interval(options), (options.force_low, options.force_high))
+    system, force = base.model.system, options.drive
+    assert options.drive_low is not None
+    assert options.drive_high is not None
+    bounds = (_interval(options), (options.drive_low, options.drive_high))
     scales = (bounds[0][1] - bounds[0][0], bounds[1][1] - bounds[1][0])
     channel = response["channel"].values.tolist().index(options.channel)
     for i in np.flatnonzero(located["orbit_period"].values == 1):
@@ -207,7 +207,7 @@ def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[Reson
         near = np.abs(away) < 0.5 * np.pi
         own = base.replace(**{n: v for n, v in fixed_of(located, int(i)).items() if n in base.names})
         family = Family(system, 1, np.nan, own.pack(), (FREQUENCY, force), scales)
-        problem = ResonanceProblem(family, own.replace(**{force: options.force_high}), channel, bounds)
+        problem = ResonanceProblem(family, own.replace(**{force: options.drive_high}), channel, bounds)
         for j in np.flatnonzero(near[:-1] & near[1:] & (away[:-1] * away[1:] < 0.0)):
             share = away[j] / (away[j] - away[j + 1])
             first, second = located["section"].values[i, j : j + 2, 0]
@@ -290,13 +290,13 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         whole[rows] = measures
         variables[name] = (("curve", "point", *dims), whole, attrs)
     over, unit = ("curve", "point"), {"units": "1"}
-    force_units = parameter_units(options.force, model) if options.force else "1"
+    force_units = parameter_units(options.drive, model) if options.drive else "1"
     linear = [c.problem.linear_hz if isinstance(c.problem, ModeProblem) else np.nan for c in curves]
     first, last = ([ENDS.index(c.ends[k]) for c in curves] for k in (0, 1))
     about = "multipliers that decide the stability"
     variables |= {
         "frequency": (over, frequency, {"units": "Hz", "long_name": "frequency"}),
-        "force": (over, force, {"units": force_units, "long_name": options.force or "force"}),
+        "force": (over, force, {"units": force_units, "long_name": options.drive or "force"}),
         "section": ((*over, "state"), section, {"long_name": "point of the orbit"}),
         "residual": (over, residual, {**unit, "long_name": "scaled gap between the ends of the orbit"}),
         "n_unstable": (over, unstable, {**unit, "long_name": "multipliers outside the unit circle, -1 beyond"}),
@@ -315,7 +315,7 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
             "model": model_attribute(run.model),
             **section_attributes(run.model.crossing),
             "of_channel": options.channel,
-            "force": options.force,
+            "force": options.drive,
             "left_out": "\n".join(left_out),
         },
     )

@@ -200,8 +200,8 @@ def test_figure__shows_both_curves_over_the_response(hardening, duffing):
     ("options", "named"),
     [
         ({"channel": "y"}, "'y'.*energy"),
-        ({"force": "gain"}, "'gain'"),
-        ({"force_low": 1.0, "force_high": 0.5}, "force_low=1"),
+        ({"drive": "gain"}, "'gain'"),
+        ({"drive_low": 1.0, "drive_high": 0.5}, "drive_low=1"),
         ({"undamped": {"c": 0.0}}, "'c'.*damping"),
         ({"undamped": {"damping": 0.0}}, "sweeps amplitude.*undamped="),
         ({"undamped": {"amplitude": 0.2}}, "system without drive"),
