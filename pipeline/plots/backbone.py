@@ -14,6 +14,7 @@ from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain
 from pipeline.layout.vocabulary import FREQUENCY_DIM, parameter_name
 from pipeline.plots import labels, style
+from pipeline.plots.branches import UNSTABLE
 from pipeline.plots.figure import frame_of
 from pipeline.plots.response import amplitude_of, draw_branch, levels_of
 from pipeline.products.backbone import BackboneOptions
@@ -25,9 +26,10 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 """Lines by kind: a mode is a broad band below, so that phase resonance on it is seen."""
 
-DIMS = ("branch", "point", "channel")
+DASHES = {"phase_resonance": (0, (3, 1.5)), "normal_mode": (0, (1.0, 0.6))}
+"""Dashes by kind, in units of the line's width, where unstable."""
 
-SOLID, DASHED = "-", (0, (4, 2))
+DIMS = ("branch", "point", "channel")
 
 
 @style.drawn
@@ -67,12 +69,12 @@ def plot_backbone(
         n = int(ds["n_points"][i])
         x, y = ds["frequency"].values[i, :n], measure.shown(ds["amplitude"].sel(channel=channel).values[i, :n])
         solid = ds["n_unstable"].values[i, :n] == 0
-        look = LOOKS[kinds[int(ds["kind"][i])]]
+        kind = kinds[int(ds["kind"][i])]
         for stable in (True, False):
             # a step between a stable and an unstable orbit is drawn as unstable
             steps = solid[:-1] & solid[1:] if stable else ~(solid[:-1] & solid[1:])
             shown = np.append(steps, False) | np.insert(steps, 0, False)
-            line = {**look, "linestyle": SOLID if stable else DASHED}
+            line = {**LOOKS[kind], "linestyle": "-" if stable else DASHES[kind]}
             ax.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), **line)
     name = labels.with_unit(f"amplitude of {measure.symbol}", measure.unit)
     style.label_axes(ax, labels.swept_label(FREQUENCY_DIM, "Hz") if levels else "frequency [Hz]", name)
@@ -96,7 +98,7 @@ def _handles(ds: xr.Dataset, kinds: Sequence[str], levels: Mapping[Any, str]) ->
     for level, colour in levels.items():
         where = ", ".join(f"{name} = {value:g}" for name, value in level)
         lines.append({"color": colour, "label": f"response, {where}" if where else "response"})
-    lines += [{"color": "black", "linewidth": 1.0, "linestyle": DASHED, "label": "unstable"}]
+    lines.append({**UNSTABLE, "label": "unstable"})
     return [Line2D([], [], **{k: v for k, v in look.items() if k != "zorder"}) for look in lines]
 
 

@@ -10,7 +10,7 @@ _ROOM = "pipeline.analysis.response.backbone"
 class BackboneOptions(Options):
     """Options of backbone curves."""
 
-    channel: str = option("", "State or quantity that lags 90 degrees behind the drive; by default the first state.")
+    channel: str = option("", "State or quantity that is in quadrature with the drive; by default the first state.")
     low: float | None = option(None, "Least frequency; by default the run's.", unit="Hz", flag="--from", gt=0.0)
     high: float | None = option(None, "Largest frequency; by default the run's.", unit="Hz", flag="--to", gt=0.0)
     drive: str = option("", "Parameter that is the drive's amplitude; by default the only one that scales the drive.")
@@ -30,11 +30,12 @@ class BackboneOptions(Options):
 
 BACKBONE = Analysis(
     "backbone",
-    """Follow phase resonance, a lag of 90 degrees, in frequency and force; and nonlinear normal modes.
+    """Follow phase resonance (motion and drive in quadrature) in frequency and force; and nonlinear normal modes.
 
-    Phase resonance starts where a branch of the response of period 1 passes a lag of 90 degrees. Normal modes are the
-    periodic orbits of the system without damping and drive: give the values that switch these off by --undamped. They
-    start from the linear modes of all equilibria that are found from the cells' sections and from the zero state.""",
+    Phase resonance starts where a branch of period 1 of the response passes a lag of 90 or -90 degrees. Normal modes
+    are the periodic orbits of the system without damping and drive: give the values that switch these off by
+    --undamped. They start from the linear modes of all equilibria that are found from the cells' sections and from the
+    zero state.""",
     BackboneOptions,
     compute=f"{_ROOM}:backbone",
     table=f"{_ROOM}:backbone_table",

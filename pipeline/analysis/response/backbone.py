@@ -167,11 +167,11 @@ def backbone(run: OpenRun, options: BackboneOptions) -> xr.Dataset:
 
 
 def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_out: list[str]) -> None:
-    """Append curves of phase resonance, each once, from the points at which the run's response passes 90 degrees."""
+    """Append curves of phase resonance, each once, from the points at which the run's response passes quadrature."""
     starts = list(_quadratures(run, options))
     run.echo(f"backbone: {counted(len(starts), 'point')} of phase resonance on the response")
     if not starts:
-        left_out.append(f"phase resonance: no branch of period 1 passes a lag of 90 degrees of {options.channel}")
+        left_out.append(f"phase resonance: {options.channel} is on no branch of period 1 in quadrature")
     for problem, guess in starts:
         own = [c for c in curves if _is_alike(c.problem, problem)]
         found = run_alone(phase_resonance(problem, guess))
@@ -192,7 +192,7 @@ def _nearest(curve: Curve, guess: Array) -> Point:
 
 
 def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[ResonanceProblem, Array]]:
-    """Yield, for each point between which the lag passes 90 degrees, the equations and a guess."""
+    """Yield the equations and a guess for each step of a branch on which the cosine of the lag changes its sign."""
     asked = {"parameter": parameter_name(FREQUENCY), "low": options.low, "high": options.high}
     located, response = (run.derive(name, **asked) for name in ("branches", "response"))
     base = parameters_of(run.cube())
@@ -203,13 +203,14 @@ def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[Reson
     scales = (bounds[0][1] - bounds[0][0], bounds[1][1] - bounds[1][0])
     channel = response["channel"].values.tolist().index(options.channel)
     for i in np.flatnonzero(located["orbit_period"].values == 1):
-        away = response["phase"].values[i, : int(located["n_points"][i]), channel, 0] - 0.5 * np.pi
-        near = np.abs(away) < 0.5 * np.pi
+        lag = response["phase"].values[i, : int(located["n_points"][i]), channel, 0]
+        near = np.abs(np.angle(np.exp(1j * np.diff(lag)))) < 0.5 * np.pi
         own = base.replace(**{n: v for n, v in fixed_of(located, int(i)).items() if n in base.names})
         family = Family(system, 1, np.nan, own.pack(), (FREQUENCY, force), scales)
         problem = ResonanceProblem(family, own.replace(**{force: options.drive_high}), channel, bounds)
-        for j in np.flatnonzero(near[:-1] & near[1:] & (away[:-1] * away[1:] < 0.0)):
-            share = away[j] / (away[j] - away[j + 1])
+        cosine = np.cos(lag)
+        for j in np.flatnonzero(near & (cosine[:-1] * cosine[1:] < 0.0)):
+            share = cosine[j] / (cosine[j] - cosine[j + 1])
             first, second = located["section"].values[i, j : j + 2, 0]
             state = first + share * wrap_angles(second - first, system)
             frequency = located["parameter"].values[i, j : j + 2] @ [1.0 - share, share]

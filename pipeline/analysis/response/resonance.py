@@ -1,7 +1,7 @@
 """Follow phase resonance in frequency and force, and normal modes of conservative systems in frequency and energy.
 
-At phase resonance the first harmonic of a channel lags 90 degrees behind that of the drive. Unknowns are a section
-point, the frequency and the force.
+At phase resonance the first harmonic of a channel is in quadrature with that of the drive: it lags by 90 degrees, or
+by -90 if the channel moves against the force. Unknowns are a section point, the frequency and the force.
 
 A normal mode is a periodic orbit of a system without damping and drive. Unknowns are a point of it and the frequency.
 The equations phi_T(x) = x are redundant, since the energy returns by itself: the derivative of their n rows has the
@@ -13,7 +13,7 @@ orbit before. An orbit counts if all n rows vanish, so that a system which loses
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -28,10 +28,12 @@ from pipeline.analysis.branches.problems import FREQUENCY, ONE_SIDED_STEP, Ends,
 from pipeline.analysis.response.orbits import FEWEST, Orbit, harmonics_of, lags_of, sampled
 
 RESONANCE = Settings(5e-3, 4e-2, 1e-5, max_points=1000, tolerance=1e-9, max_iterations=8)
-"""Settings of phase resonance; the residual includes the cosine of the lag."""
+"""Settings of phase resonance; the residual includes the cosine of the lag. A start further than 1 from the origin
+has longer steps in proportion."""
 
-MODE = Settings(1e-2, 5e-2, 1e-5, max_points=2000, tolerance=1e-11, max_iterations=8)
-"""Settings of normal modes; the frequency of the linear mode counts as 1."""
+MODE = Settings(1e-2, 5e-3, 1e-5, max_points=2000, tolerance=1e-11, max_iterations=8)
+"""Settings of normal modes; the frequency of the linear mode counts as 1. The longest step is in units of the longest
+distance from the equilibrium."""
 
 SMALL = 1e-2
 """Scaled distance from its equilibrium at which a normal mode begins."""
@@ -207,8 +209,10 @@ def phase_resonance(problem: ResonanceProblem, guess: Array) -> Steps[Curve | No
         return None
     tangent = kernel_of(found.value)
     start = Point(found.u, tangent * np.copysign(1.0, tangent[-1]), found.value, found.n_iterations)
-    back = yield from trace(problem, opposite(start), RESONANCE, _goes_on, _any_step)
-    ahead = yield from trace(problem, start, RESONANCE, _goes_on, _any_step)
+    size = max(1.0, float(np.linalg.norm(found.u[: problem.system.n_states])))
+    settings = replace(RESONANCE, longest_step=size * RESONANCE.longest_step)
+    back = yield from trace(problem, opposite(start), settings, _goes_on, _any_step)
+    ahead = yield from trace(problem, start, settings, _goes_on, _any_step)
     points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
     return Curve(problem, points, (_end(problem, back), _end(problem, ahead)))
 
@@ -238,7 +242,8 @@ def normal_mode(problem: ModeProblem, direction: Array) -> Steps[Curve | None]:
     found = yield from correct(problem, start, normal, MODE)
     if found is None or not (yield from is_closed(found, found)):
         return None
-    followed = yield from trace(problem, found, MODE, _goes_on, is_closed)
+    settings = replace(MODE, longest_step=problem.bounds[1][1] * MODE.longest_step)
+    followed = yield from trace(problem, found, settings, _goes_on, is_closed)
     return Curve(problem, followed.points, ("linear_mode", _end(problem, followed)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import fsolve
+from scipy.optimize import brentq, fsolve
 from scipy.special import ellipk
 
 import magpend
@@ -94,6 +94,36 @@ def test_phase_resonance__agrees_with_harmonic_balance(duffing):
     # the determinant is that of the damping: exp(-0.1 T)
     mu = (one["multiplier_real"] + 1j * one["multiplier_imag"]).values
     np.testing.assert_allclose(np.prod(mu, axis=1), np.exp(-0.1 / one["frequency"].values), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_phase_resonance__of_two_linear_masses_is_exact(tmp_path):
+    """Quadrature where the real part of the response function vanishes: of x1 also at its antiresonance."""
+    model = magpend.model(
+        "x1'' = -(2*x1 - x2) - c*(2*x1' - x2') + F*cos(2*pi*f*t)\nx2'' = -(2*x2 - x1) - c*(2*x2' - x1')",
+        name="linear", c=0.05, F=0.1, states={name: {"scale": 4.0} for name in ("x1", "x2", "x1_dot", "x2_dot")},
+    )  # fmt: skip
+    spec = (
+        magpend.Spec("sweep", model)
+        .with_axis("frequency_hz", 0.5 / OMEGA, 2.5 / OMEGA, 3)
+        .with_start_list(points=[(0.0, 0.0, 0.0, 0.0)])
+        .with_integration(n_transient=200, n_keep=4)
+    )
+    run = magpend.run(spec, tmp_path / "run", workers=0)
+
+    def response(omega):
+        own = 2.0 + 0.1j * omega - omega**2
+        return np.linalg.solve([[own, -1 - 0.05j * omega], [-1 - 0.05j * omega, own]], [1.0, 0.0])
+
+    for c, brackets in ((0, [(0.9, 1.1), (1.2, 1.6), (1.6, 1.9)]), (1, [(0.9, 1.1), (1.6, 1.9)])):
+        ds = run.backbone(channel=("x1", "x2")[c], drive_low=0.05)
+        exact = [brentq(lambda w, c=c: response(w)[c].real, *ends, xtol=1e-14) for ends in brackets]
+        assert ds.sizes["curve"] == len(exact)
+        np.testing.assert_allclose(OMEGA * ds["frequency"].min("point"), exact, rtol=1e-8)
+        np.testing.assert_allclose(OMEGA * ds["frequency"].max("point"), exact, rtol=1e-8)
+        gain = [abs(response(w)[c]) for w in exact]
+        own = ds["amplitude"].sel(channel=("x1", "x2")[c]) / ds["force"]
+        np.testing.assert_allclose(own.isel(point=-1 - (int(ds["n_points"].max()) - ds["n_points"])), gain, rtol=1e-8)
 
 
 @pytest.mark.slow
