@@ -67,7 +67,7 @@ def plot_backbone(
     kinds = ds["kind"].attrs["flag_meanings"].split()
     for i in range(ds.sizes["curve"]):
         n = int(ds["n_points"][i])
-        x, y = ds["frequency"].values[i, :n], measure.shown(ds["amplitude"].sel(channel=channel).values[i, :n])
+        x, y = ds["parameter"].values[i, :n], measure.shown(ds["amplitude"].sel(channel=channel).values[i, :n])
         solid = ds["n_unstable"].values[i, :n] == 0
         kind = kinds[int(ds["kind"][i])]
         for stable in (True, False):
@@ -77,7 +77,8 @@ def plot_backbone(
             line = {**LOOKS[kind], "linestyle": "-" if stable else DASHES[kind]}
             ax.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), **line)
     name = labels.with_unit(f"amplitude of {measure.symbol}", measure.unit)
-    style.label_axes(ax, labels.swept_label(FREQUENCY_DIM, "Hz") if levels else "frequency [Hz]", name)
+    swept = labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"])
+    style.label_axes(ax, swept if levels else "frequency [Hz]", name)
     style.limits(ax, frame)
     style.complete(fig, ax, labels.caption(ds, with_start=False), _handles(ds, kinds, levels))
     return fig

@@ -13,6 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, words_of
@@ -184,6 +185,7 @@ def _jumps(
     }
     found: dict[str, Variable] = {n: (("jump",), v, {"long_name": text}) for n, (v, text) in columns.items()}
     about = {"long_name": "where a trajectory lands", **code_flags([*LANDINGS])}
+    found["jump_beyond"][2]["units"] = str(located.attrs["parameter_units"])
     found["jump_landing"] = (("jump",), codes, about)
     text = {"long_name": "half of peak to peak of the orbit on which a trajectory lands"}
     found["jump_amplitude"] = (("jump", "channel"), amplitude.reshape(-1, len(nothing)), text)
@@ -307,6 +309,7 @@ def _jump(ds: xr.Dataset, name: str, k: int) -> Words:
     return {
         **{key: f"{value:g}" for key, value in fixed_of(ds, branch).items()},
         name: f"{float(ds['value'][event]):.7g}",
+        "label": LABELS[words_of(ds["kind"])[int(ds["kind"][event])]],
         "as it": "rises" if bool(one["jump_rises"]) else "falls",
         "from": f"{float(ds['bifurcation_amplitude'][event, 0]):.6g} (period {int(ds['orbit_period'][branch])})",
         "to": LANDINGS[word] or lands,

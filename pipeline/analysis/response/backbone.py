@@ -151,11 +151,11 @@ def backbone(run: OpenRun, options: BackboneOptions) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Over (curve, point), NaN beyond a curve's points: ``frequency`` [Hz], ``force`` (NaN for a normal mode),
-        ``section`` (state), the multipliers that decide the stability, ``n_unstable``, and ``residual``, the scaled
-        gap between the ends of the orbit. Over (..., channel) the measures of the analysis ``response``. Over
-        ``curve``: ``kind``, ``n_points``, ``first_end``, ``last_end``, ``linear_hz`` (of a normal mode). The attribute
-        ``left_out`` has a line for each start that was not followed.
+        Over (curve, point), NaN beyond a curve's points: ``parameter`` (the frequency [Hz]), ``force`` (NaN for a
+        normal mode), ``section`` (state), the multipliers that decide the stability, ``n_unstable``, and ``residual``,
+        the scaled gap between the ends of the orbit. Over (..., channel) the measures of the analysis ``response``.
+        Over ``curve``: ``kind``, ``n_points``, ``first_end``, ``last_end``, ``linear_frequency`` (of a normal mode).
+        The attribute ``left_out`` has a line for each start that was not followed.
     """
     curves: list[Curve] = []
     left_out: list[str] = []
@@ -296,7 +296,7 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
     first, last = ([ENDS.index(c.ends[k]) for c in curves] for k in (0, 1))
     about = "multipliers that decide the stability"
     variables |= {
-        "frequency": (over, frequency, {"units": "Hz", "long_name": "frequency"}),
+        "parameter": (over, frequency, {"units": "Hz", "long_name": "frequency"}),
         "force": (over, force, {"units": force_units, "long_name": options.drive or "force"}),
         "section": ((*over, "state"), section, {"long_name": "point of the orbit"}),
         "residual": (over, residual, {**unit, "long_name": "scaled gap between the ends of the orbit"}),
@@ -307,7 +307,11 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         "n_points": ("curve", np.array([len(c.points) for c in curves], np.int32), unit),
         "first_end": ("curve", np.array(first, np.int8), code_flags(ENDS)),
         "last_end": ("curve", np.array(last, np.int8), code_flags(ENDS)),
-        "linear_hz": ("curve", np.array(linear, float), {"units": "Hz", "long_name": "frequency of the linear mode"}),
+        "linear_frequency": (
+            "curve",
+            np.array(linear, float),
+            {"units": "Hz", "long_name": "frequency of the linear mode"},
+        ),
     }
     return xr.Dataset(
         variables,
@@ -315,6 +319,8 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         attrs={
             "model": model_attribute(run.model),
             **section_attributes(run.model.crossing),
+            "parameter": FREQUENCY,
+            "parameter_units": "Hz",
             "of_channel": options.channel,
             "force": options.drive,
             "left_out": "\n".join(left_out),
@@ -343,15 +349,16 @@ def backbone_table(ds: xr.Dataset) -> Table:
 
 def _rows(ds: xr.Dataset) -> list[Row]:
     rows: list[Row] = []
+    name = parameter_name(str(ds.attrs["parameter"]))
     kinds = words_of(ds["kind"])
     moduli = np.abs(ds["multiplier_real"].values + 1j * ds["multiplier_imag"].values)
     measures = {key: ds[key].values for key in ("amplitude", "mean", "rms", "error", "harmonic_amplitude", "phase")}
-    single = {key: ds[key].values for key in ("frequency", "force", "residual", "n_unstable")}
+    single = {key: ds[key].values for key in ("parameter", "force", "residual", "n_unstable")}
     for i in range(ds.sizes["curve"]):
         for j in range(int(ds["n_points"][i])):
             at: Mapping[str, float] = {key: float(values[i, j]) for key, values in single.items()}
             for c, channel in enumerate(ds["channel"].values):
-                row: Row = {"curve": i, "kind": kinds[int(ds["kind"][i])], "frequency_hz": at["frequency"]}
+                row: Row = {"curve": i, "kind": kinds[int(ds["kind"][i])], name: at["parameter"]}
                 row |= {"force": at["force"], "stable": at["n_unstable"] == 0, "residual": at["residual"]}
                 row |= {"largest_multiplier": float(np.nanmax(moduli[i, j], initial=0.0)), "channel": str(channel)}
                 row |= {key: float(measures[key][i, j, c]) for key in ("amplitude", "mean", "rms", "error")}
@@ -369,7 +376,7 @@ def _words(ds: xr.Dataset, i: int, channel: str, force: str) -> Words:
     return {
         "curve": str(i),
         "kind": plain(words_of(ds["kind"])[int(ds["kind"][i])]),
-        "frequency_hz": _range(ds["frequency"].values[i, :n]),
+        parameter_name(str(ds.attrs["parameter"])): _range(ds["parameter"].values[i, :n]),
         force or "force": None if not force else "" if is_mode else _range(ds["force"].values[i, :n]),
         "amplitude": _range(ds["amplitude"].sel(channel=channel).values[i, :n]),
         "stable": f"{(ds['n_unstable'].values[i, :n] == 0).mean():.0%}",
