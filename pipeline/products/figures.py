@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pipeline.products.backbone import BackboneOptions
 from pipeline.products.branches import BranchOptions, CurveOptions, TongueOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
@@ -113,6 +114,10 @@ class ResponseFigureOptions(ResponseOptions, FigureOptions):
     channel: str = option("", "State or quantity to draw; by default the model's first state.")
     harmonic: int = option(0, "Draw the amplitude of this harmonic; 0 draws half of peak to peak.", ge=0)
     points: str = option("", "CSV file of measured points: columns of the parameter, amplitude and, if known, phase.")
+
+
+class BackboneFigureOptions(BackboneOptions, FigureOptions):
+    """Options of a figure of backbone curves."""
 
 
 class TongueFigureOptions(TongueOptions, FigureOptions):
@@ -263,6 +268,13 @@ RESPONSE = Figure(
     ResponseFigureOptions,
     "pipeline.plots.response:draw",
     panels="several",
+)
+
+BACKBONE = Figure(
+    "backbone",
+    "Draw backbone curves over the frequency: phase resonance over the response, and normal modes.",
+    BackboneFigureOptions,
+    "pipeline.plots.backbone:draw_backbone",
 )
 
 TONGUES = Figure(

@@ -68,6 +68,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "Orbits and branches, stable or not": {
             "branches": ("branches", ""),
             "response": ("response", ""),
+            "backbone": ("backbone", ""),
             "bands": ("branches", "a posterior of magpend identify"),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
@@ -108,6 +109,7 @@ _FIGURES = {
         "multipliers": "",
         "curves": "",
         "response": "",
+        "backbone": "",
         "rotation": f"{_ROTATION}, and {_ONE}, or {_TWO}",
         "tongues": f"{_ROTATION}, and {_ONE}",
         "manifolds": _POINT,

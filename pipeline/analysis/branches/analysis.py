@@ -214,9 +214,12 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     values.
     """
     parameter = str(ds.attrs["parameter"])
-    names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
-    names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
-    return {parameter_name(n): float(ds[n].values[branch]) for n in names}
+    found = {FREQUENCY: ds[FREQUENCY]} if parameter != FREQUENCY and FREQUENCY in ds else {}
+    for variable in ds.data_vars.values():
+        told = str(variable.attrs.get("long_name", ""))
+        if variable.dims == ("branch",) and told.startswith("value of "):
+            found[told.removeprefix("value of ")] = variable
+    return {parameter_name(name): float(variable.values[branch]) for name, variable in found.items()}
 
 
 def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:

@@ -93,6 +93,7 @@ bands = Run.bands
 curves = Run.curves
 orbits = Run.orbits
 response = Run.response
+backbone = Run.backbone
 tongues = Run.tongues
 manifolds = Run.manifolds
 tangency = Run.tangency

@@ -38,6 +38,7 @@ class Plots:
     curves = OnePanel(options.CurveFigureOptions)
     rotation = OnePanel(FigureOptions)
     response = SeveralPanels(options.ResponseFigureOptions)
+    backbone = OnePanel(options.BackboneFigureOptions)
     tongues = OnePanel(options.TongueFigureOptions)
     manifolds = OnePanel(options.ManifoldFigureOptions)
     drift = OnePanel(options.DriftFigureOptions)

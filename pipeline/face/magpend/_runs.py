@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from magpend._methods import AnalysisMethod
 from pipeline.products.attractors import AttractorOptions
+from pipeline.products.backbone import BackboneOptions
 from pipeline.products.basins import BasinOptions
 from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions, TongueOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
@@ -74,6 +75,7 @@ class Run(RunDirectory):
     orbits = AnalysisMethod(OrbitOptions)
     tongues = AnalysisMethod(TongueOptions)
     response = AnalysisMethod(ResponseOptions)
+    backbone = AnalysisMethod(BackboneOptions)
     manifolds = AnalysisMethod(ManifoldOptions)
     tangency = AnalysisMethod(TangencyOptions)
     tipping = AnalysisMethod(TippingOptions)
