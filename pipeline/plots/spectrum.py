@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
@@ -239,14 +240,14 @@ def plot_waterfall(
     low = top * 10.0 ** -(DECADES_OF_COLOURS * (2 if is_density else 1))
     norm = LogNorm(low, top)
     shown = np.ma.masked_invalid(np.where(image < low, np.nan, image))
-    ax.set_facecolor("white")
-    ax.pcolormesh(style.edges(x), style.edges(y), shown, norm=norm, cmap="viridis_r", rasterized=True, gid="waterfall")
+    ramp = colormaps[rcParams["image.cmap"]].reversed()  # faint values are light, as the paper beside them
+    ax.pcolormesh(style.edges(x), style.edges(y), shown, norm=norm, cmap=ramp, rasterized=True, gid="waterfall")
     style.limits(ax, frame, None, (0.0, float(y.max())))
     coordinate = ds[row_axis(along)].rename(along)
     style.label_axes(ax, labels.parameter_label(coordinate), _label(ds, column))
     unit = power_unit(measure.unit, "density") if is_density else measure.unit
     text = f"{'density' if is_density else 'amplitude'} of {measure.symbol}"
-    bar = fig.colorbar(ScalarMappable(norm, "viridis_r"), ax=ax, pad=0.015, aspect=32, extend="min")
+    bar = fig.colorbar(ScalarMappable(norm, ramp), ax=ax, pad=0.015, aspect=32, extend="min")
     style.style_bar(bar, labels.with_unit(text, unit if unit != "1" else ""))
     style.caption(ax, _told(data, column))
     style.finish(fig)
