@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
+from matplotlib.patheffects import withStroke
+from scipy.signal import find_peaks
 
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.spectrum.analysis import AVERAGE, LINES, NONE, axes_of, row_axis
@@ -25,14 +29,14 @@ MOST_PANELS = 6
 DECADES_OF_LINES, DECADES_OF_POWER = 6.0, 11.0
 """Decades below the largest value that are drawn: further down are errors of the integration."""
 
-DECADES_OF_COLOURS = 4.0
+DECADES_OF_COLOURS = 3.0
 """Decades that the colours of a waterfall span."""
 
 ROWS = 720
 """Rows of the image of a waterfall."""
 
-NAMES_APART = 0.03
-"""Least distance of the names of two lines of a torus, as a share of the axis."""
+MOST_NAMED, MOST_NAMES, APART = 3, 6, (0.055, 0.07)
+"""Of a torus: largest sum of multiples in the name of a line, number of names, their least distances on the axes."""
 
 
 @style.drawn
@@ -151,7 +155,7 @@ def _draw_one(ax: Axes, one: xr.Dataset, column: str, measure: Measure, colour: 
         scaling = str(one.attrs["scaling"])
         what, unit = "density" if scaling == "density" else "power", power_unit(measure.unit, scaling)
     if len(y):
-        ax.set_ylim(max(low, 0.3 * y.min()), 4.0 * y.max())
+        ax.set_ylim(max(low, 0.3 * y.min()), 10.0 * y.max())
     else:
         ax.text(0.5, 0.5, "at rest", transform=ax.transAxes, ha="center", va="center")
     style.label_axes(ax, None, labels.with_unit(f"{what} of {measure.symbol}", unit if unit != "1" else ""))
@@ -173,29 +177,47 @@ def _evidence(one: xr.Dataset, column: str) -> list[str]:
 
 
 def _name_lines(ax: Axes, one: xr.Dataset, column: str) -> None:
-    """Name the lines f, f2 and their sidebands of a torus, where their names do not collide."""
+    """Name the largest lines of a torus by its two frequencies, such as 2f - f2, where the names do not collide."""
     if "second_hz" not in one or not np.isfinite(float(one["second_hz"])):
         return
+    x, y = np.asarray(ax.get_lines()[0].get_xydata()).T
+    (left, right), (low, high) = ax.get_xlim(), np.log10(ax.get_ylim())
+    level = np.maximum(np.log10(y), low)
+    peaks, _ = find_peaks(level, prominence=1.0)
+    names = _names(one, column)
+    taken: list[tuple[float, float]] = []
+    for peak in peaks[np.argsort(-level[peaks])]:
+        name = next((text for place, text in names if abs(place - x[peak]) <= x[1] - x[0]), "")
+        spot = (x[peak] - left) / (right - left), (level[peak] - low) / (high - low)
+        free = all(abs(spot[0] - a) > APART[0] or abs(spot[1] - b) > APART[1] for a, b in taken)
+        if name and free and 0.03 < spot[0] < 0.97 and len(taken) < MOST_NAMES:
+            taken.append(spot)
+            size = style.look_of(ax).tick
+            look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": size}
+            halo = [withStroke(linewidth=2.0, foreground="white")]
+            ax.annotate(name, (x[peak], y[peak]), (0, 2), path_effects=halo, **look)
+
+
+def _names(one: xr.Dataset, column: str) -> list[tuple[float, str]]:
+    """Return places and names of the combinations of the two frequencies of a torus, the simplest first."""
     first, second = float(one["first_hz"]), float(one["second_hz"])
     unit = first if column == "order" else 1.0
-    named = {"$f$": first, "$f_2$": second, "$f+f_2$": first + second, "$|f-f_2|$": abs(first - second)}
-    low, high = ax.get_xlim()
-    taken: list[float] = []
-    for name, hertz in named.items():
-        x = hertz / unit
-        if not low < x < high or any(abs(x - other) < NAMES_APART * (high - low) for other in taken):
-            continue
-        taken.append(x)
-        ax.axvline(x, color="0.6", linewidth=0.6, linestyle=(0, (1, 2)), zorder=0.5)
-        ax.annotate(
-            name,
-            (x, 1.0),
-            (1.5, -2.0),
-            xycoords=ax.get_xaxis_transform(),
-            textcoords="offset points",
-            va="top",
-            fontsize=style.look_of(ax).tick,
-        )
+    both = [(m, n) for m in range(-MOST_NAMED, MOST_NAMED + 1) for n in range(-MOST_NAMED, MOST_NAMED + 1)]
+    places = [
+        ((m * first + n * second) / unit, m, n) for m, n in sorted(both, key=lambda one: abs(one[0]) + abs(one[1]))
+    ]
+    return [(place, _combination(m, n)) for place, m, n in places if place > 0.0]
+
+
+def _combination(first: int, second: int) -> str:
+    """Return the name of a combination of the frequencies f and f2, its positive part first."""
+    parts = sorted(((first, "f"), (second, "f_2")), key=lambda part: part[0] < 0)
+    text = ""
+    for number, name in parts:
+        if number:
+            sign = "-" if number < 0 else "+" if text else ""
+            text += f"{sign}{abs(number) if abs(number) > 1 else ''}{name}"
+    return f"${text}$"
 
 
 @style.drawn
@@ -299,7 +321,9 @@ def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str) -> tuple[np
             continue
         amplitude = one["amplitude"].values[: len(own)]
         shown = 0.5 * amplitude**2 / float(one["bandwidth_hz"]) if is_density else amplitude
-        rows = np.floor(own / np.nanmax(bins) * ROWS).astype(int)
+        rows = np.floor(own / np.nanmax(bins) * ROWS + 1e-6).astype(
+            int
+        )  # of equal orders the same, in spite of rounding
         for thick in (-1, 0, 1):
             near = np.clip(rows + thick, 0, ROWS - 1)
             image[near, place] = np.fmax(image[near, place], shown)
