@@ -133,6 +133,13 @@ def test_follow__a_page_that_does_not_hold(tmp_path, change, said):
         follow(tmp_path, **change)
 
 
+def test_index__begins_with_the_example_of_a_followed_page():
+    index, page = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("index", "response"))
+    first = index.partition("```python\n")[2].partition("```")[0]
+    assert first.count("\n") <= 10
+    assert f"<!-- run -->\n```python\n{first}```" in page
+
+
 def test_navigation__every_page_is_in_it():
     """The first page lists all pages, once; the site's navigation is made of its lists."""
     docs = ROOT / "docs"
