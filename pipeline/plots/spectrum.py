@@ -14,9 +14,9 @@ from matplotlib.patheffects import withStroke
 from scipy.signal import find_peaks
 
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.spectrum.analysis import AVERAGE, LINES, NONE, axes_of, row_axis
+from pipeline.analysis.spectrum.analysis import AVERAGE, LINES, NONE, axes_of
 from pipeline.analysis.spectrum.estimate import power_unit
-from pipeline.layout.vocabulary import ATTRACTS, KINDS, STABILITIES, TORUS, letter, split_dims
+from pipeline.layout.vocabulary import ATTRACTS, KINDS, STABILITIES, TORUS, letter
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
@@ -110,7 +110,7 @@ def _end(ax: Axes) -> float:
 
 def _fixed(data: xr.Dataset) -> str:
     """Return a caption with the parameter values that all rows share."""
-    rows = {name: data[row_axis(name)] for name in axes_of(data)}
+    rows = {name.removeprefix("at_"): data[name] for name in axes_of(data)}
     own = {name: ((), float(v[0]), v.attrs) for name, v in rows.items() if (v == v[0]).all()}
     plain = data.drop_vars([n for n, v in data.coords.items() if v.dims])
     return labels.caption(plain.assign_coords(own), with_start=False)
@@ -119,11 +119,11 @@ def _fixed(data: xr.Dataset) -> str:
 def _column(ds: xr.Dataset, axis: str) -> str:
     if axis == "order" and "order" not in ds.coords:
         raise ValueError("axis order: there is no drive whose multiples orders could be; take Hz.")
-    return "order" if "order" in ds.coords and axis != "Hz" else "frequency"
+    return "order" if "order" in ds.coords and axis != "Hz" else "frequency_hz"
 
 
 def _label(ds: xr.Dataset, column: str) -> str:
-    return "frequency [Hz]" if column == "frequency" else "order [multiples of the drive frequency]"
+    return "frequency [Hz]" if column == "frequency_hz" else "order [multiples of the drive frequency]"
 
 
 def _measure(ds: xr.Dataset, degrees: bool) -> Measure:
@@ -222,7 +222,7 @@ def _combination(first: int, second: int) -> str:
 
 @style.drawn
 def plot_waterfall(
-    ds: xr.Dataset, along: str, *, axis: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
+    ds: xr.Dataset, *, axis: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
     """Draw spectra over a swept parameter, as colours: at each value that of the set with the largest share.
 
@@ -230,8 +230,6 @@ def plot_waterfall(
     ----------
     ds
         From the analysis ``spectrum``.
-    along
-        Swept parameter.
     axis, degrees, frame
         See `plot_spectrum`.
 
@@ -245,13 +243,17 @@ def plot_waterfall(
     Raises
     ------
     ValueError
-        If nothing could be measured, or orders are asked for without a drive.
+        If nothing could be measured, there is not one axis, or orders are asked for without a drive.
     """
+    swept = [name for name in axes_of(ds) if len(np.unique(ds[name])) > 1]
+    if len(swept) != 1:
+        raise ValueError(f"a waterfall is drawn along one axis, and the spectra have {', '.join(swept) or 'none'}.")
+    along = swept[0]
     data = ds.isel(spectrum=_largest(ds, along))
     if not data.sizes["spectrum"]:
         raise ValueError("no spectrum could be measured: every trajectory failed.")
     column, measure = _column(ds, axis), _measure(ds, degrees)
-    x = np.unique(ds[row_axis(along)].values)
+    x = np.unique(ds[along].values)
     y, image = _image(data, along, x, column)
     is_density = str(ds.attrs["scaling"]) == "density"
     image = image * measure.factor ** (2 if is_density else 1)
@@ -265,7 +267,7 @@ def plot_waterfall(
     ramp = colormaps[rcParams["image.cmap"]].reversed()  # faint values are light, as the paper beside them
     ax.pcolormesh(style.edges(x), style.edges(y), shown, norm=norm, cmap=ramp, rasterized=True, gid="waterfall")
     style.limits(ax, frame, None, (0.0, float(y.max())))
-    coordinate = ds[row_axis(along)].rename(along)
+    coordinate = ds[along].rename(along.removeprefix("at_"))
     style.label_axes(ax, labels.parameter_label(coordinate), _label(ds, column))
     unit = power_unit(measure.unit, "density") if is_density else measure.unit
     text = f"{'density' if is_density else 'amplitude'} of {measure.symbol}"
@@ -292,7 +294,7 @@ def _told(data: xr.Dataset, column: str) -> str:
 
 def _largest(ds: xr.Dataset, along: str) -> np.ndarray:
     """Return for each value of the parameter the row of the set with the largest share, those that attract first."""
-    values = ds[row_axis(along)].values
+    values = ds[along].values
     order = np.lexsort(
         (ds["attractor"].values, -np.nan_to_num(ds["share"].values), ds["stability"].values != ATTRACTS, values)
     )
@@ -309,7 +311,7 @@ def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str) -> tuple[np
     is_density = str(data.attrs["scaling"]) == "density"
     for k in range(data.sizes["spectrum"]):
         one = data.isel(spectrum=k)
-        place = int(np.searchsorted(x, float(one[row_axis(along)])))
+        place = int(np.searchsorted(x, float(one[along])))
         own = bins[k][np.isfinite(bins[k])]
         if not len(own):
             continue
@@ -357,7 +359,6 @@ def _looks(run: OpenRun, found: xr.Dataset, cell: int | None) -> list[tuple[str,
 def draw_waterfall(run: OpenRun, options: WaterfallOptions) -> style.DataFigure:
     """Draw the figure ``waterfall`` of a run."""
     at, notes = values_of(run, options)
-    (along,) = [d for d in split_dims(run.cube()["status"])[0] if run.cube().sizes[d] > 1 and d not in at]
     found = run.derive("spectrum", **{**options.part(SpectraOptions), "at": at})
-    figure = plot_waterfall(found, along, axis=options.axis, degrees=options.degrees, frame=frame_of(options))
+    figure = plot_waterfall(found, axis=options.axis, degrees=options.degrees, frame=frame_of(options))
     return noted(figure, notes)

@@ -21,9 +21,11 @@ from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.products.spectrum import SpectrumOptions
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
 from pipeline.runs.derive import AnalysedRun, shown_table
 from pipeline.runs.drawing import figure
+from pipeline.runs.naming import in_own_words as options_in_own_words
 from pipeline.runs.status import state
 from pipeline.runs.versions import current
 from pipeline.specification.problems import SpecError, unknown_name
@@ -308,15 +310,16 @@ def _spectra(shown: Shown) -> Iterator[Block]:
     """Draw spectra at the gallery's point, and those that the run keeps; if they are asked for, along an axis."""
     try:
         if shown.computed:
-            rows = list(function_of(ANALYSES["attractors"].table)(shown.run.derive("attractors")).rows)
-            if rows:
+            found = in_own_words(shown.run.derive("attractors"))
+            if rows := [dict(row) for row in shown_table("attractors", found).rows]:
                 shown.run.derive("spectrum", at=_richest(rows, shown.axes))
         if "spectrum" in shown.computed and len(_long_axes(shown)) == 1:
             shown.run.derive("spectrum", scaling="spectrum")
     except SpecError as error:
         yield Note(str(error))
     for options in stored_options(shown.run, "spectrum"):
-        at, along = options.get("at", {}), [d for d in _long_axes(shown) if d not in options.get("at", {})]
+        at: dict[str, float] = options_in_own_words(shown.run, SpectrumOptions(**options)).at
+        along = [d for d in _long_axes(shown) if d not in at]
         if not along or "cell" in options:
             place = ", ".join(f"{name} = {value:g}" for name, value in at.items())
             yield from _drawn(shown, "spectrum", f"Spectra at {place}" if place else "Spectra", **options)

@@ -28,9 +28,11 @@ from pipeline.analysis.spectrum.estimate import ALL, Averaged, averaged, frequen
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain, words_of
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.conventions import code_flags
+from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import (
     BOUNDED_SET,
     EQUILIBRIUM,
+    FREQUENCY_DIM,
     KINDS,
     NOT_SETTLED,
     PERIODIC_ORBIT,
@@ -46,6 +48,7 @@ from pipeline.products.figures import SpectrumFigureOptions, WaterfallOptions
 from pipeline.products.product import Table
 from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
 from pipeline.specification.problems import unknown_name
+from pipeline.specification.tables import FREQUENCY
 
 FEWEST, MOST = 128, 2048
 """Samples per drive period or return of a motion that does not close: at first, and at most."""
@@ -137,10 +140,10 @@ def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
     -------
     Dataset
         Over ``spectrum`` (rows) and ``bin``: ``amplitude`` of each line of a closed orbit, in the channel's unit;
-        ``power`` of other motions, in unit^2/Hz or unit^2; both have the coordinates ``frequency`` [Hz] and, with a
-        drive, ``order``. Rows have the swept parameters (``at_NAME``), ``attractor``, ``kind``, ``stability``,
-        ``orbit_period``, ``share`` and ``estimate``, a code of `ESTIMATES`. Evidence: ``n_averages``,
-        ``resolution_hz``, ``bandwidth_hz``; ``variance``, and ``kept``, the share of it in the bins; of lines
+        ``power`` of other motions, in unit^2/Hz or unit^2; both have the coordinates ``frequency_hz`` and, with a
+        drive, ``order``. Rows have the swept parameters (``frequency``, others as ``at_NAME``), ``attractor``,
+        ``kind``, ``stability``, ``orbit_period``, ``share`` and ``estimate``, a code of `ESTIMATES`. Evidence:
+        ``n_averages``, ``resolution_hz``, ``bandwidth_hz``; ``variance``, and ``kept``, its share in the bins; of lines
         ``error``; of a torus ``first_hz``, ``second_hz`` (NaN if undecided) and ``explained``, the share of its power
         at their combinations.
     """
@@ -227,7 +230,7 @@ def _lines(motions: Sequence[Motion], place: int, options: SpectrumOptions) -> l
         at_rest = motion.kind == EQUILIBRIUM
         frequency = np.full(n, np.nan) if at_rest else np.arange(1, n + 1) / orbit.seconds
         kept = np.nan if at_rest or variance <= 0.0 else 0.5 * float((amplitude**2).sum()) / variance
-        row = {"estimate": LINES, "frequency": frequency, "amplitude": amplitude, "variance": max(variance, 0.0)}
+        row = {"estimate": LINES, "frequency_hz": frequency, "amplitude": amplitude, "variance": max(variance, 0.0)}
         row |= {"kept": kept, "error": float(found.error[i, place]), "rate_hz": orbit.frequency_hz}
         rows.append(row)
     return rows
@@ -266,7 +269,7 @@ def _row(
     n = options.orders * options.segment + 1
     row = {
         "estimate": AVERAGE,
-        "frequency": found.frequency_hz[:n],
+        "frequency_hz": found.frequency_hz[:n],
         "power": found.power[:n],
         "n_averages": found.n_averages,
         "resolution_hz": found.resolution_hz,
@@ -329,8 +332,8 @@ def _dataset(
 ) -> xr.Dataset:
     model, cube = run.model, run.cube()
     unit = next(v.unit for v in _channels(model) if v.name == options.channel)
-    bins = max((len(row["frequency"]) for row in rows if "frequency" in row), default=0)
-    table = {name: np.full((len(rows), bins), np.nan) for name in ("frequency", "amplitude", "power")}
+    bins = max((len(row["frequency_hz"]) for row in rows if "frequency_hz" in row), default=0)
+    table = {name: np.full((len(rows), bins), np.nan) for name in ("frequency_hz", "amplitude", "power")}
     for i, row in enumerate(rows):
         for name, values in table.items():
             if name in row:
@@ -352,16 +355,17 @@ def _dataset(
     for name, (units, text) in _NUMBERS.items():
         variables[name] = (over, _column(rows, name), {"units": units, "long_name": text})
     coords: dict[str, Any] = {
-        "frequency": (both, table["frequency"], {"units": "Hz", "long_name": "frequency"}),
+        "frequency_hz": (both, table["frequency_hz"], {"units": "Hz", "long_name": "frequency"}),
         "attractor": (over, np.array([m.attractor for m in motions], np.int32), {"long_name": "attractor id"}),
     }
     if not model.autonomous:
         about = {"units": "1", "long_name": "multiple of the drive frequency"}
-        coords["order"] = (both, table["frequency"] / rate[:, None], about)
+        coords["order"] = (both, table["frequency_hz"] / rate[:, None], about)
+    coords |= {str(k): v for k, v in cube.coords.items() if not v.ndim and v.dtype.kind == "f"}
     for name in motions[0].where:
         coords[row_axis(name)] = (over, np.array([m.where[name] for m in motions]), dict(cube[name].attrs))
     attrs = {"title": "spectra", "channel": options.channel, "unit": unit, "scaling": options.scaling}
-    attrs |= {"window": options.window, "axes": " ".join(motions[0].where), **told_by(cube.attrs)}
+    attrs |= {"window": options.window, "axes": " ".join(map(row_axis, motions[0].where)), **told_by(cube.attrs)}
     return xr.Dataset(variables, coords, attrs)
 
 
@@ -370,13 +374,13 @@ def _column(rows: Sequence[dict[str, Any]], name: str) -> Array:
 
 
 def axes_of(ds: xr.Dataset) -> list[str]:
-    """Return the names of the swept parameters of spectra."""
-    return str(ds.attrs.get("axes", "")).split()
+    """Return the names of the coordinates with the swept parameters along the rows."""
+    return list(dims_in_own_words(str(ds.attrs.get("axes", "")).split(), str(ds.attrs.get(RATE, FREQUENCY))))
 
 
 def row_axis(name: str) -> str:
-    """Return the name of a swept parameter along the rows, which is none of a variable's."""
-    return f"at_{name}"
+    """Return the name of the coordinate with a swept parameter along the rows, which is none of a variable's."""
+    return name if name == FREQUENCY_DIM else f"at_{name}"
 
 
 _EVIDENCE = ("variance", "kept", "n_averages", "resolution_hz", "bandwidth_hz", "error")
@@ -386,7 +390,7 @@ _EVIDENCE_OF_TORI = ("first_hz", "second_hz", "explained")
 def spectrum_table(ds: xr.Dataset) -> Table:
     """Return the table of spectra, also of those that `magpend.spectrum_of` returns.
 
-    Rows are bins: swept parameters (``at_NAME``), ``attractor_id``, ``kind``, ``stability``,
+    Rows are bins: swept parameters (``at_NAME``, and the drive's rate), ``attractor_id``, ``kind``, ``stability``,
     ``estimate``, ``frequency_hz``, ``order`` (with a drive), ``amplitude``, ``power``, and the evidence of the whole
     spectrum. The text has a line for each spectrum.
     """
@@ -395,15 +399,14 @@ def spectrum_table(ds: xr.Dataset) -> Table:
     lines: list[Words] = []
     for i in range(ds.sizes["spectrum"]):
         one = ds.isel(spectrum=i).load()
-        head: Row = {row_axis(name): float(one[row_axis(name)]) for name in axes_of(ds)}
+        head: Row = {name: float(one[name]) for name in axes_of(ds)}
         head |= {"attractor_id": int(one["attractor"])} if "attractor" in one.coords else {}
         head |= {name: words[int(one[name])] for name, words in coded.items()}
         evidence = {name: float(one[name]) for name in (*_EVIDENCE, *_EVIDENCE_OF_TORI) if name in one}
-        names = [name for name in ("frequency", "order", "amplitude", "power") if name in one.variables]
+        names = [name for name in ("frequency_hz", "order", "amplitude", "power") if name in one.variables]
         for values in zip(*(one[name].values.tolist() for name in names), strict=True):
             if np.isfinite(values[0]):
-                bins = dict(zip(names, values, strict=True))
-                rows.append({**head, "frequency_hz": bins.pop("frequency"), **bins, **evidence})
+                rows.append({**head, **dict(zip(names, values, strict=True)), **evidence})
         lines.append(_words(one, head))
     unit = str(ds.attrs["unit"])
     heading = f"spectrum of {ds.attrs['channel']}" + ("" if unit == "1" else f" [{unit}]")
@@ -411,7 +414,7 @@ def spectrum_table(ds: xr.Dataset) -> Table:
 
 
 def _words(one: xr.Dataset, head: Row) -> Words:
-    column, unit = ("order", "") if "order" in one.coords else ("frequency", " Hz")
+    column, unit = ("order", "") if "order" in one.coords else ("frequency_hz", " Hz")
     is_average = head.get("estimate", "average") == "average"
     values = np.nan_to_num(one["power" if is_average else "amplitude"].values)
     places = signal.find_peaks(values, distance=3)[0] if is_average else np.flatnonzero(values)

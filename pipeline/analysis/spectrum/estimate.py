@@ -170,7 +170,7 @@ def spectrum_of(
     Returns
     -------
     Dataset
-        Over ``spectrum`` (one) and ``bin``: ``power`` in unit^2/Hz or unit^2, with the coordinates ``frequency`` [Hz]
+        Over ``spectrum`` (one) and ``bin``: ``power`` in unit^2/Hz or unit^2, with the coordinates ``frequency_hz``
         and, with a drive, ``order``. ``n_averages``, ``resolution_hz``, ``bandwidth_hz`` (the window's equivalent noise
         bandwidth), ``variance``, and ``kept``, the share of it in the bins.
 
@@ -202,7 +202,7 @@ def spectrum_of(
     numbers |= {"kept": ("spectrum", [found.power_below(len(found.power), scaling) / found.variance])}
     result = xr.Dataset({"power": (("spectrum", "bin"), found.power[None], about), **numbers})
     own: dict[str, Any] = {
-        "frequency": (("spectrum", "bin"), found.frequency_hz[None], {"units": "Hz", "long_name": "frequency"})
+        "frequency_hz": (("spectrum", "bin"), found.frequency_hz[None], {"units": "Hz", "long_name": "frequency"})
     }
     if drive_hz:
         order = found.frequency_hz[None] / float(drive_hz)

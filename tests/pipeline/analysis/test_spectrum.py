@@ -23,11 +23,11 @@ def test_spectrum_of__sines_have_half_of_their_squared_amplitudes():
     t = np.arange(16_384) / 64.0
     x = 3.0 + 2.0 * np.cos(TURN * 5.0 * t + 0.3) + 0.01 * np.sin(TURN * 12.5 * t)
     found = magpend.spectrum_of(series(x, 64.0), nperseg=512, scaling="spectrum", drive_hz=2.5)
-    power = found["power"].isel(spectrum=0).swap_dims(bin="frequency")
+    power = found["power"].isel(spectrum=0).swap_dims(bin="frequency_hz")
     assert found["power"].attrs["units"] == "m^2"
     for hertz, amplitude in ((5.0, 2.0), (12.5, 0.01)):
-        assert float(power.sel(frequency=hertz)) == pytest.approx(amplitude**2 / 2, rel=1e-10)
-        assert float(power["order"].sel(frequency=hertz)) == pytest.approx(hertz / 2.5, rel=1e-12)
+        assert float(power.sel(frequency_hz=hertz)) == pytest.approx(amplitude**2 / 2, rel=1e-10)
+        assert float(power["order"].sel(frequency_hz=hertz)) == pytest.approx(hertz / 2.5, rel=1e-12)
     assert float(found["kept"][0]) == pytest.approx(1.0, rel=1e-3)
     assert int(found["n_averages"][0]) == 63
     # of a Hann window: 1.5 bins
@@ -44,7 +44,7 @@ def test_spectrum_of__an_ornstein_uhlenbeck_process_has_its_lorentzian():
     for i in range(1, n):
         x[i] = decay * x[i - 1] + kick * draws[i]
     found = magpend.spectrum_of(series(x, rate), nperseg=2048)
-    f, power = found["frequency"].values[0, 1:-1], found["power"].values[0, 1:-1]
+    f, power = found["frequency_hz"].values[0, 1:-1], found["power"].values[0, 1:-1]
     exact = 2.0 * kick**2 / rate / np.abs(1.0 - decay * np.exp(-1j * TURN * f / rate)) ** 2
     low = f < 5.0
     np.testing.assert_allclose(exact[low], 2.0 * s**2 / (g**2 + (TURN * f[low]) ** 2), rtol=0.01)  # hardly aliased
@@ -185,7 +185,7 @@ def test_spectrum__of_a_torus_has_the_frequencies_of_its_uncoupled_oscillators(t
     assert float(one["second_hz"]) == pytest.approx(f2, rel=1e-8)
     assert float(one["explained"]) > 0.9999
     a = 1.0 / abs(1.0 - (TURN * f) ** 2 + 0.5j * TURN * f)
-    power, frequency = one["power"].values, one["frequency"].values
+    power, frequency = one["power"].values, one["frequency_hz"].values
     # the power of a line between two bins: that of its lobe over the bandwidth
     width = float(one["resolution_hz"] / one["bandwidth_hz"])
     for hertz, amplitude in ((f, a), (f2, 1.0), (f + f2, 0.1 * a), (f - f2, 0.1 * a)):
@@ -217,7 +217,7 @@ def test_spectrum__of_a_flow_is_in_hertz(tmp_path):
     closed = found["orbit_period"].values == 1
     mu = found["at_mu"].values[closed]
     np.testing.assert_allclose(found["amplitude"].values[closed, 0], np.sqrt(0.5 + np.sqrt(0.25 + mu)), rtol=1e-8)
-    np.testing.assert_allclose(found["frequency"].values[closed, 0], 1.0 / np.pi, rtol=1e-8)
+    np.testing.assert_allclose(found["frequency_hz"].values[closed, 0], 1.0 / np.pi, rtol=1e-8)
     np.testing.assert_allclose(found["amplitude"].values[closed, 1:], 0.0, atol=1e-8)
     assert not np.nan_to_num(found["amplitude"].values[~closed]).any()  # at rest
     with pytest.raises(SpecError, match="no drive"):
@@ -256,3 +256,29 @@ def test_figures__show_lines_densities_and_orders(duffing):
 def test_spectrum__wrong_options_are_refused(duffing, options, named):
     with pytest.raises(SpecError, match=named):
         duffing.spectrum(**options)
+
+
+@pytest.mark.slow
+def test_spectra__along_omega_stay_in_hertz_and_orders(tmp_path):
+    """x'' + .2 x' + x = cos(omega t): one line at omega / 2 pi, of the amplitude in closed form."""
+    spec = (
+        magpend.Spec("sweep", "x'' = cos(omega*t) - 0.2*x' - x")
+        .with_axis("omega", values=[0.5, 1.0, 2.0])
+        .with_start_list(points=[(0.0, 0.0)])
+        .with_integration(n_transient=200, n_keep=4)
+    )
+    run = magpend.run(spec, tmp_path / "run", workers=0)
+    omega = np.array([0.5, 1.0, 2.0])
+    found = run.spectrum(channel="x_dot")
+    np.testing.assert_allclose(found["frequency_hz"][:, 0], omega / TURN, rtol=1e-12)
+    exact = omega / np.abs(1.0 - omega**2 + 0.2j * omega)
+    np.testing.assert_allclose(found["amplitude"][:, 0], exact, rtol=1e-9)
+    np.testing.assert_allclose(found["amplitude"][:, 1:], 0.0, atol=1e-9)
+    table = run.table("spectrum", channel="x_dot")
+    first = table[table["order"].round(9) == 1.0]
+    np.testing.assert_allclose(first["omega"], omega, rtol=1e-12)
+    np.testing.assert_allclose(first["frequency_hz"], omega / TURN, rtol=1e-12)
+    assert "omega" in run.plot.waterfall().get_xlabel()
+    (panel,) = run.plot.spectrum(at={"omega": 2.0}, axis="Hz")
+    assert panel.get_xlabel() == "frequency [Hz]"
+    assert panel.collections[0].get_segments()[0][0, 0] == pytest.approx(2.0 / TURN)
