@@ -98,8 +98,9 @@ def _watch(event, arguments):
     """Refuse what Windows refuses of any program."""
     if event in ("os.rename", "os.remove"):
         for path in map(os.path.realpath, arguments[: 2 if event == "os.rename" else 1]):
-            if path in _opened() and not path.endswith("lock"):
-                raise PermissionError(errno.EACCES, "a file that is open", path)
+            # where there is no lock of Windows, `filelock` removes its file before it closes it
+            if not path.endswith("lock") and any(one == path or one.startswith(f"{path}/") for one in _opened()):
+                raise PermissionError(errno.EACCES, "open, or a folder with an open file", path)
     is_moved = event == "os.rename"
     made = is_moved or event == "os.mkdir" or (event == "open" and (arguments[2] or 0) & os.O_CREAT)
     path = arguments[1 if is_moved else 0] if made else ""
