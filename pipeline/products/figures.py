@@ -12,6 +12,7 @@ from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, Options, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
+from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
 
 Per = Literal["s", "period"]
 
@@ -118,6 +119,26 @@ class ResponseFigureOptions(ResponseOptions, FigureOptions):
 
 class BackboneFigureOptions(BackboneOptions, FigureOptions):
     """Options of a figure of backbone curves."""
+
+
+Axis = Literal["", "order", "Hz"]
+
+_AXIS = "Frequencies as orders, multiples of the drive's, or in hertz; by default orders where there is a drive."
+
+
+class SpectrumFigureOptions(SpectrumOptions, FigureOptions):
+    """Options of a figure of spectra at one parameter point."""
+
+    axis: Axis = option("", _AXIS)
+
+
+class WaterfallOptions(SpectraOptions, FigureOptions):
+    """Options of a figure of spectra along a parameter."""
+
+    scaling: Literal["density", "spectrum"] = option(
+        "spectrum", "Colours show amplitudes, or power per hertz, as in scipy.signal.welch."
+    )
+    axis: Axis = option("", _AXIS)
 
 
 class TongueFigureOptions(TongueOptions, FigureOptions):
@@ -232,6 +253,25 @@ DIMENSION = Figure(
     DimensionFigureOptions,
     "pipeline.plots.dimension:draw",
     panels="several",
+)
+
+SPECTRUM = Figure(
+    "spectrum",
+    "Draw the spectrum of each attractor of a parameter point: lines of closed orbits, otherwise densities.",
+    SpectrumFigureOptions,
+    "pipeline.plots.spectrum:draw_spectrum",
+    needs="pipeline.analysis.spectrum.analysis:needs_axis",
+    panels="several",
+)
+
+WATERFALL = Figure(
+    "waterfall",
+    """Draw spectra along the swept parameter, as colours.
+
+    At each value the spectrum is that of the attractor on which most cells end, or of --attractor.""",
+    WaterfallOptions,
+    "pipeline.plots.spectrum:draw_waterfall",
+    needs="pipeline.analysis.spectrum.analysis:needs_axis",
 )
 
 BRANCHES = Figure(

@@ -67,7 +67,7 @@ class Measures:
     error: Array
 
 
-def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
+def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = False) -> Measures:
     """Integrate orbits over one period each, and measure them. Samples are doubled until the measures settle.
 
     Parameters
@@ -76,6 +76,8 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
         Of one model.
     n_harmonics
         Number of harmonics.
+    of_orbit
+        Whether the harmonics are those of the orbit's own period, with a drive as well.
 
     Returns
     -------
@@ -92,7 +94,7 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
     while len(left) and n <= MOST:
         for rows in _blocks(orbits, left, n):
             values = sampled([orbits[i] for i in rows], n)
-            base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven else 1
+            base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven and not of_orbit else 1
             _measure(found, rows, values, base, n_harmonics)
         scale = np.abs(found.mean[left]) + found.amplitude[left]
         left, n = left[(found.error[left] > SETTLED * scale).any(axis=1)], 2 * n

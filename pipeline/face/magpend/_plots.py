@@ -33,6 +33,8 @@ class Plots:
     lyapunov = AnyPanels(options.LyapunovFigureOptions)
     convergence = SeveralPanels(options.ConvergenceOptions)
     dimension = SeveralPanels(options.DimensionFigureOptions)
+    spectrum = SeveralPanels(options.SpectrumFigureOptions)
+    waterfall = OnePanel(options.WaterfallOptions)
     branches = OnePanel(options.BranchFigureOptions)
     multipliers = OnePanel(options.MultiplierOptions)
     curves = OnePanel(options.CurveFigureOptions)

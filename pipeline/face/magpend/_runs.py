@@ -18,6 +18,7 @@ from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
+from pipeline.products.spectrum import SpectrumOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
 from pipeline.runs.arguments import names_arguments
 from pipeline.runs.derive import shown_table, stale, stored_each
@@ -69,6 +70,7 @@ class Run(RunDirectory):
     settling = AnalysisMethod(Options)
     chaos = AnalysisMethod(ChaosOptions)
     dimension = AnalysisMethod(DimensionOptions)
+    spectrum = AnalysisMethod(SpectrumOptions)
     branches = AnalysisMethod(BranchOptions)
     bands = AnalysisMethod(BandOptions)
     curves = AnalysisMethod(CurveOptions)
