@@ -13,6 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
+from pipeline.analysis.branches.analysis import isolas_of
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
@@ -22,9 +24,7 @@ from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions, MultiplierOptions
 
-KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point", "hopf", "pitchfork", "transcritical")
 MARKERS = dict(zip(KINDS, "^soDpvX", strict=True))
-SHORT = dict(zip(KINDS, ("F", "PD", "NS", "BP", "H", "PF", "TC"), strict=True))
 NAMES = {
     "fold": "fold",
     "period_doubling": "period doubling",
@@ -55,7 +55,7 @@ def plot_branches(
     """Draw branches of periodic orbits over a parameter by their section points: stable solid, unstable dashed.
 
     All bifurcations are marked. Where a stable orbit appears or disappears, the name and period (for example
-    PD1) stand beside the curves if there is room.
+    PD1) stand beside the curves if there is room, and so does ``isola``.
 
     Parameters
     ----------
@@ -93,6 +93,8 @@ def plot_branches(
     names = _draw_lines(ax, ds, chosen, measure, below is None)
     if below is None:
         _dress(ax, frame, measure)
+    elif frame.ylim is None:
+        _hold_isolas(ax, ds, chosen, measure)
     style.label_axes(ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label)
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
     if bands is not None:
@@ -212,8 +214,28 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
             scaley=scale,
         )
         if stable:
-            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{SHORT[kind]}{period or ''}"))
+            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{LABELS[kind]}{period or ''}"))
+    names += [_isola(ds, i, measure) for i in isolas_of(ds) if i in chosen]
     return sorted(names, key=lambda n: (n.period, n.x, n.low))
+
+
+def _hold_isolas(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure) -> None:
+    """Widen the range of a diagram to hold the isolas, on which cells of the diagram need not end."""
+    own = [i for i in isolas_of(ds) if i in chosen]
+    if own:
+        y = measure.shown(ds["section"].sel(state=measure.name).values[own])
+        low, high = float(np.nanmin(y)), float(np.nanmax(y))
+        margin = 0.06 * (high - low)
+        ax.set_ylim(min(ax.get_ylim()[0], low - margin), max(ax.get_ylim()[1], high + margin))
+
+
+def _isola(ds: xr.Dataset, branch: int, measure: Measure) -> _Name:
+    """Return the label of an isola, at its highest section point."""
+    y = measure.shown(ds["section"].sel(state=measure.name).values[branch])
+    point, phase = np.unravel_index(int(np.nanargmax(y)), y.shape)
+    highest = float(y[point, phase])
+    x = float(ds["parameter"].values[branch, point])
+    return _Name(int(ds["orbit_period"][branch]), x, highest, highest, "isola")
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
@@ -302,7 +324,7 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
                 markerfacecolor="white",
                 markeredgecolor="black",
                 markeredgewidth=0.7,
-                label=f"{SHORT[kind]} {NAMES[kind]}",
+                label=f"{LABELS[kind]} {NAMES[kind]}",
             )
             for kind in KINDS
             if kind in present
@@ -338,22 +360,6 @@ DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)
 
 _ON_MAP = dict(zip(KINDS[:3], DASHES[:3], strict=True))
 _STYLE_NAMES = dict(zip(KINDS[:3], ("solid:", "dashed:", "dotted:"), strict=True))
-
-POINT_NAMES = {
-    "cusp": "CP",
-    "generalised_doubling": "GPD",
-    "chenciner": "CH",
-    "r1": "R1",
-    "r2": "R2",
-    "r3": "R3",
-    "r4": "R4",
-    "fold_flip": "LPPD",
-    "fold_neimark_sacker": "LPNS",
-    "doubling_neimark_sacker": "PDNS",
-    "double_neimark_sacker": "NSNS",
-}
-"""Short names of points of codimension two, as MatContM writes them."""
-
 
 ROOM = (0.045, 0.045)
 """Room that a short name takes, in units of the axes."""
@@ -398,7 +404,7 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
 def line_note(ds: xr.Dataset) -> str:
     """Return a text on which line style stands for which kind of bifurcation."""
     present = {KINDS[int(kind)] for kind in ds["kind"].values}
-    return ", ".join(f"{_STYLE_NAMES[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
+    return ", ".join(f"{_STYLE_NAMES[kind]} {LABELS[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
@@ -415,7 +421,7 @@ def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, 
         if not (named and take_room(ax, at, taken)):
             continue
         ax.annotate(
-            POINT_NAMES[names[int(ds["special_kind"][k])]],
+            LABELS[names[int(ds["special_kind"][k])]],
             at,
             (3.0, 3.0),
             textcoords="offset points",
@@ -521,7 +527,7 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
         turning = kind == "neimark_sacker"
         for value in {mu, mu.conjugate()} if turning else {mu}:
             ax.plot(value.real, value.imag, marker=MARKERS[kind], markersize=5.5, markeredgewidth=1.0, **look)
-        text = f"{SHORT[kind]} {float(ds['value'][here[i]]):.4f}"
+        text = f"{LABELS[kind]} {float(ds['value'][here[i]]):.4f}"
         text += f", {np.degrees(np.angle(mu)):.0f}°" if turning else ""
         handles.append(Line2D([], [], marker=MARKERS[kind], markersize=5.0, label=text, **look))
     return handles

@@ -18,16 +18,18 @@ import numpy as np
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.layout.conventions import shown_unit
-from pipeline.layout.vocabulary import is_grid_dim, letter, parameter_name, split_dims
-from pipeline.products.product import function_of
+from pipeline.layout.own_words import dims_in_own_words, in_own_words
+from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.products.spectrum import SpectrumOptions
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
-from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.derive import AnalysedRun, shown_table
 from pipeline.runs.drawing import figure
+from pipeline.runs.naming import in_own_words as options_in_own_words
 from pipeline.runs.status import state
 from pipeline.runs.versions import current
 from pipeline.specification.problems import SpecError, unknown_name
-from pipeline.specification.tables import FREQUENCY
+from pipeline.specification.tables import RATES
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in, read_product_attrs
@@ -80,6 +82,7 @@ SHOWN = {
     "tangency": ("Homoclinic tangencies", "Parameter values at which manifolds of a saddle orbit first touch"),
     "chaos": ("Regular and chaotic", "Kind of motion of each attractor"),
     "dimension": ("Dimensions", "Correlation dimensions of the attractors that do not close"),
+    "spectrum": ("Spectra", "Spectra"),
     "settling": ("Transient or attractor", "Sets that do not close, and the results of extending their cells"),
     "escapes": ("Escapes", "Rates at which cells with noise leave a set, and where they go"),
     "density": ("Densities", "Moments and peaks of the density of section points"),
@@ -92,7 +95,7 @@ class Shown:
 
     def __init__(self, run: AnalysedRun, computed: tuple[str, ...]) -> None:
         self.run, self.computed = run, computed
-        self.cube = run.cube()
+        self.cube = in_own_words(run.cube())
         self.axes, self.starts = split_dims(self.cube["status"])
 
     @property
@@ -154,8 +157,9 @@ def _parameters(shown: Shown) -> Iterator[Block]:
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
     rows = []
-    if run.spec.frequency_hz and parameter_name(FREQUENCY) not in swept and run.spec.section is None:
-        rows.append(("drive's frequency", f"{run.spec.frequency_hz:g}", "Hz", "of the forcing", "the specification"))
+    rate, hertz = RATES[run.spec.rate], run.spec.frequency_hz
+    if hertz and rate.column not in swept and run.spec.section is None:
+        rows.append((rate.meaning, f"{rate.given(hertz):g}", rate.unit, "of the forcing", "the specification"))
     for p in run.model.parameters:
         source = chosen.provenance.get(p.name, f"preset {chosen.name}")
         value = f"{run.parameters[p.name]:g}"
@@ -181,7 +185,9 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
     continuation = shown.run.spec.continuation
-    path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
+    path = shown.axes[0]
+    if continuation is not None:
+        (path,) = dims_in_own_words([axis_name(continuation.path)], shown.run.spec.rate)
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
 
 
@@ -200,8 +206,9 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield Note(str(error))
         return
     command = command_of("analyse attractors", options, shown.directory)
-    table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
-    rows = list(table.rows)
+    found = in_own_words(found)
+    table, told = shown_table("attractors", found), sentence(found)
+    rows: list[dict[str, Any]] = [dict(row) for row in table.rows]
     most, n_others = leading(rows, "attractor_id", "n_cells")
     yield Grid(*_attractor_grid(found, most, shown.axes), _counted(rows, told), command, n_others)
     for remark in table.lines[table.lines.index(told) + 1 :]:
@@ -278,6 +285,9 @@ def _analyses(shown: Shown) -> Iterator[Part]:
     for name, (heading, _) in SHOWN.items():
         if name == "attractors" or not _suits(shown, name):
             continue
+        if name == "spectrum":
+            yield Part(heading, list(_spectra(shown)))
+            continue
         known = shown.options_of(name)
         blocks: list[Block] = [] if known else [_missing(shown, name)]
         for options in known:
@@ -292,7 +302,33 @@ def _suits(shown: Shown, name: str) -> bool:
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
     if name == "basins":
         return sum(map(is_grid_dim, shown.starts)) >= 2
-    return name in ("branches", "chaos") or bool(stored_options(shown.run, name))
+    known = name in shown.computed or bool(stored_options(shown.run, name))
+    return known or name in ("branches", "chaos") or (name == "spectrum" and bool(shown.computed))
+
+
+def _spectra(shown: Shown) -> Iterator[Block]:
+    """Draw spectra at the gallery's point, and those that the run keeps; if they are asked for, along an axis."""
+    try:
+        if shown.computed:
+            found = in_own_words(shown.run.derive("attractors"))
+            if rows := [dict(row) for row in shown_table("attractors", found).rows]:
+                shown.run.derive("spectrum", at=_richest(rows, shown.axes))
+        if "spectrum" in shown.computed and len(_long_axes(shown)) == 1:
+            shown.run.derive("spectrum", scaling="spectrum")
+    except SpecError as error:
+        yield Note(str(error))
+    for options in stored_options(shown.run, "spectrum"):
+        at: dict[str, float] = options_in_own_words(shown.run, SpectrumOptions(**options)).at
+        along = [d for d in _long_axes(shown) if d not in at]
+        if not along or "cell" in options:
+            place = ", ".join(f"{name} = {value:g}" for name, value in at.items())
+            yield from _drawn(shown, "spectrum", f"Spectra at {place}" if place else "Spectra", **options)
+        elif len(along) == 1:
+            yield from _drawn(shown, "waterfall", f"Spectra along {along[0]}", **options)
+
+
+def _long_axes(shown: Shown) -> list[str]:
+    return [d for d in shown.axes if shown.cube.sizes[d] > 1]
 
 
 def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[Block]:
@@ -301,10 +337,11 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     except SpecError as error:
         yield Note(str(error))
         return
+    found = in_own_words(found)
     path = str(found.attrs.get("path", ""))
     unit = shown_unit(found[path].attrs) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
-    rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
+    rows = [_with_letters(row, axis) for row in shown_table(name, found).rows]
     # the settled options, so that a page made from the stored result is the same
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)

@@ -207,7 +207,7 @@ def model(
     equations
         A function ``f(t, y, p)`` as for `scipy.integrate.solve_ivp`, which returns the rates of `states`: it is
         called once with symbols, and its equations are then text like any others. Or lines ``x' = v`` (rates),
-        ``drive = A*cos(2*pi*f*t)`` (parts with a name) and ``d = 0.2`` (parameters); ``x'' = ...`` makes the
+        ``drive = A*cos(omega*t)`` (parts with a name) and ``d = 0.2`` (parameters); ``x'' = ...`` makes the
         states ``x`` and ``x_dot``. Or a dict of right sides by state. In expressions ``t`` is the time [s] and
         ``f`` the frequency of the drive [Hz]. The states have the order of the equations, all derivatives last.
         Otherwise the name of a model that ships, the path of a model's file or of a specification, TOML text of
@@ -221,7 +221,7 @@ def model(
         For a function: the names of the states, in the order of ``y``, and the parameters, in the order of ``p``.
     drive
         Of a function that depends on ``t``: the parameter that is the angular frequency, the frequency or the period of
-        its drive. Specifications give its value as ``frequency_hz``; in the text it is an expression of ``f``.
+        its drive. Specifications give the rate of the drive; in the text the parameter is an expression of ``f``.
     impacts, drawing, mirror, presets, classifier
         Tables with the keys of ``[model]``.
     values
@@ -245,7 +245,7 @@ def model(
 
     Examples
     --------
-    >>> duffing = model("x'' = -d*x' + x - x**3 + A*cos(2*pi*f*t)", d=0.2, A=0.3)
+    >>> duffing = model("x'' = -d*x' + x - x**3 + A*cos(omega*t)", d=0.2, A=0.3)
     >>> duffing.state_names
     ('x', 'x_dot')
     >>> model(lambda t, y, p: [y[1], -p.k * y[0]], states=("x", "v"), k=2.0)
