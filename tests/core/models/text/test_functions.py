@@ -322,6 +322,10 @@ def test_model__follows_both_ways_of_an_if():
         "where(slip > 0, -mu, where(slip < 0, mu, 0)), 2*mu), 2*mu)",
         "slip": "v - v0",
     }
+    assert equations(lambda t, y, p: [y[1], p.a * y[0] if y[0] > 0 else p.b * y[1]], a=1.0, b=2.0) == {
+        "x": "v",
+        "v": "where(x > 0, a*x, b*v)",
+    }
     # a decision that changes nothing leaves no trace, and one that is taken twice is one
     assert equations(lambda t, y: [y[1], 1 if y[0] > 0 and not y[0] > 0 else y[1]]) == {"x": "v", "v": "v"}
 
