@@ -111,6 +111,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
         raise ValueError(f"exponent is {exponent}, and the cube has 1 to {part.sizes['exponent']}")
     place = style.join([labels.caption(part, with_start=False), left_out(part)])
     model = model_of(part)
+    per = "period" if model.is_map else per
     scale = period_seconds(part) if per == "period" else 1.0
     chosen = xr.Dataset(
         {

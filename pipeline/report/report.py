@@ -154,7 +154,7 @@ def _parameters(shown: Shown) -> Iterator[Block]:
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
     rows = []
-    if run.spec.frequency_hz and parameter_name(FREQUENCY) not in swept and run.spec.section is None:
+    if run.spec.frequency_hz and parameter_name(FREQUENCY) not in swept and run.model.clock_hz is None:
         rows.append(("drive's frequency", f"{run.spec.frequency_hz:g}", "Hz", "of the forcing", "the specification"))
     for p in run.model.parameters:
         source = chosen.provenance.get(p.name, f"preset {chosen.name}")

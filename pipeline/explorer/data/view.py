@@ -97,7 +97,7 @@ def _model(run: ExploredRun) -> dict[str, Any]:
         "title": model.title,
         "section": _section(model),
         "period": period_of(model),
-        "forced": not model.autonomous,
+        "forced": not (model.autonomous or model.is_map),
         "states": [_named(s, s.on_circle, s.scale, s.rate or None) for s in model.states],
         "quantities": [_named(q, False, 1.0, None) for q in model.quantities],
         "parameters": [_parameter(run, p) for p in model.parameters],
