@@ -279,14 +279,19 @@ def _drift_problems(
     return moving.system_problems(model, ramps, values, axes, table.frequency_hz)
 
 
-_NOT_OF_MAPS = ("section", "drive", "drift", "noise")
-"""Tables of a specification that a map cannot have."""
+_NOT_OF_MAPS = {
+    "section": "whose sections are its iterations",
+    "drive": "which has no drive",
+    "drift": "and parameters move in time",
+    "noise": "and noise acts on the rates of a flow",
+}
+"""Tables of a specification that a map cannot have, with the reason."""
 
 
 def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
     """Return the problems of tables and keys that a map, which has no time and no steps, cannot have."""
     what = f"{model.name} is a map"
-    problems = [f"{name}: {what}, which has no {name}; drop the table." for name in _NOT_OF_MAPS if name in data]
+    problems = [f"{name}: {what}, {why}; drop the table." for name, why in _NOT_OF_MAPS.items() if name in data]
     for table in ("parameters", "axes"):
         if FREQUENCY in data.get(table, {}):
             problems.append(f"{table}.{FREQUENCY}: {what}, which has no drive; drop the key.")

@@ -116,7 +116,8 @@ class _Reading(ViewsReader):
         mirror = self._mirror(table.get("mirror"), state_names)
         classifier = self._classifier(table.get("classifier"), define)
         presets = self._presets(table.get("presets", {}), parameters, values, head["source"])
-        is_map = self._is_map(table.get("kind", "flow"), {**define, **equations, **quantities}, impacts, mirror)
+        trees = {"define": define, "equations": equations, "quantities": quantities}
+        is_map = self._is_map(table.get("kind", "flow"), trees, impacts, mirror)
         if self.problems:
             return None
         return Definition(
@@ -142,17 +143,17 @@ class _Reading(ViewsReader):
             self.report(self.at("name"), f"{shown(name)} must be a letter, then letters, digits, - and _, 60 at most.")
 
     def _is_map(
-        self, kind: Any, trees: Mapping[str, Tree], impacts: tuple[Impact, ...], mirror: Mirror | None
+        self, kind: Any, tables: Mapping[str, Mapping[str, Tree]], impacts: tuple[Impact, ...], mirror: Mirror | None
     ) -> bool:
         """Return whether the key ``kind`` says that the model is a map; report what a map cannot have."""
         if kind not in KINDS:
             self.report(self.at("kind"), f"{shown(kind)} must be one of {', '.join(KINDS)}.")
         if kind != "map":
             return False
-        for name, tree in trees.items():
-            timed = [n for n, _ in names(tree) if n in ("t", "f", "phase")]
-            if timed:
-                self.report(self.place, f"{name} needs {timed[0]!r}; a map has no time, make a count of iterations a state.")
+        for key, trees in tables.items():
+            for name, tree in trees.items():
+                for timed in [n for n, _ in names(tree) if n in ("t", "f", "phase")][:1]:
+                    self.report(self.at(key, name), f"needs {timed!r}; a map has no time: count iterations by a state.")
         if impacts:
             self.report(self.at("impacts"), 'a map has none between its iterations; write "where" in its equations.')
         if mirror is not None and mirror.half_period:

@@ -163,12 +163,12 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
     out.
     """
-    lines = []
+    lines, what = [], "the map" if model_of(ds).is_map else "the flow"
     if any(row["evidence"] == "volume" for row in rows):
         if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
-            lines.append("the flow preserves volume on some sets: none of them attracts")
+            lines.append(f"{what} preserves volume on some sets: none of them attracts")
         else:
-            lines.append("the flow preserves volume: a conservative system has no attractors")
+            lines.append(f"{what} preserves volume: a conservative system has no attractors")
     above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
     longest = int(ds.attrs.get("identify_max_orbit_period", 0))
     unsettled = [row for row in rows if row["stability"] == "not_settled"]
