@@ -103,7 +103,7 @@ class Steady:
     def unsuited(self, analysis: Analysis) -> str:
         """Return the sentences that refuse an analysis that is for another kind of motion; empty if it suits."""
         if self.model.is_map and analysis.name in NOT_OF_MAPS:
-            return f"{analysis.name} follows the motion over a period; {self.model.name} is a map, which has iterates only."
+            return f"{analysis.name} follows the motion over a period; {self.model.name} is a map, of iterates alone."
         if analysis.motion == self.kind:
             return ""
         if not self.obstacle:

@@ -99,8 +99,10 @@ def _variables(options: LyapunovOptions, model: Any) -> tuple[Variable, ...]:
         "lyapunov_blocks": "mean growth rate in each block of iterations",
         "divergence": "mean logarithm of the change of volumes in an iteration",
     }
-    own = {v.name: {"units": "1", "long_name": words.get(v.name, v.long_name)} for v in LYAPUNOV_VARIABLES}
-    return tuple(replace(v, attrs={}, **own[v.name]) if v.units == "1/s" else v for v in LYAPUNOV_VARIABLES)
+    return tuple(
+        replace(v, units="1", long_name=words.get(v.name, v.long_name), attrs={}) if v.units == "1/s" else v
+        for v in LYAPUNOV_VARIABLES
+    )
 
 
 def _sizes(options: LyapunovOptions, model: Any) -> dict[str, int]:

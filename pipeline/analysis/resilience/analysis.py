@@ -363,7 +363,7 @@ def _head(ds: xr.Dataset) -> str:
     periods = periods_of(model_of(ds))
     n_phases = samples_per_period(model_of(ds), int(ds.attrs["resilience_phases"]))
     return (
-        f"shocks of {ds.attrs['resilience_states']} at {n_phases} phase{"s" * (n_phases > 1)}, distances of all "
+        f"shocks of {ds.attrs['resilience_states']} at {n_phases} phase{'s' * (n_phases > 1)}, distances of all "
         f"states; sizes: {norm} of the jumps over their scales ({units}); times in {periods}"
     )
 

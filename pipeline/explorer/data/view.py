@@ -15,7 +15,16 @@ from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import Axis, ExploredRun
 from pipeline.explorer.data.orbits import fixed_points
 from pipeline.explorer.data.verticals import plain, verticals
-from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim, period_of, section_name, time_unit
+from pipeline.layout.vocabulary import (
+    DIVERGED,
+    FAILED,
+    FREQUENCY_DIM,
+    PENDING,
+    grid_dim,
+    period_of,
+    section_name,
+    time_unit,
+)
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError

@@ -26,10 +26,16 @@ products.lyapunov = { n_periods = 64, n_blocks = 4 }
 """
 DELAYED = """
 kind = "sweep"
-model = { name = "delayed", kind = "map", states = { x = {}, y = {} }, parameters = { a = 2.0 }, equations = { x = "a*x*(1 - y)", y = "x" } }
 axes.a = { values = [1.7, 1.8, 1.9] }
 initial_conditions = { kind = "list", points = [[0.3, 0.3]] }
 integration = { n_transient = 600, n_keep = 40 }
+
+[model]
+name = "delayed"
+kind = "map"
+states = { x = {}, y = {} }
+parameters = { a = 2.0 }
+equations = { x = "a*x*(1 - y)", y = "x" }
 """
 BALL = """
 kind = "sweep"

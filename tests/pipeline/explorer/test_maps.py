@@ -18,7 +18,9 @@ HENON = """
 kind = "sweep"
 model = "henon"
 axes.a = { values = [0.3, 0.5] }
-initial_conditions = { kind = "grid", x = { start = -0.5, stop = 0.5, num = 3 }, y = { start = -0.2, stop = 0.2, num = 3 } }
+initial_conditions.kind = "grid"
+initial_conditions.x = { start = -0.5, stop = 0.5, num = 3 }
+initial_conditions.y = { start = -0.2, stop = 0.2, num = 3 }
 integration = { n_transient = 200, n_keep = 20 }
 """
 
@@ -38,7 +40,11 @@ def ask(run, name, **words):
 def test_answers__of_a_map_name_iterations_and_no_frequency(henon):
     run = ExploredRun.of(RunDirectory.open(henon))
     view = json.loads(ask(run, "view").content)
-    assert (view["model"]["period"], view["model"]["time"], view["model"]["forced"]) == ("iteration", "iteration", False)
+    assert (view["model"]["period"], view["model"]["time"], view["model"]["forced"]) == (
+        "iteration",
+        "iteration",
+        False,
+    )
     assert [axis["name"] for axis in view["axes"]] == ["a"]
     for name, words in {
         "diagram": {"x": "a", "y": view["verticals"][0]["name"]},
