@@ -11,7 +11,7 @@ import tomllib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -108,8 +108,10 @@ def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Mode
             return None
     if not isinstance(reference, Mapping) or not isinstance(reference.get("states"), Mapping):
         return None
-    rate, quantities = ("0*t" if forced else "0"), reference.get("quantities", {})
+    is_map, quantities = reference.get("kind") == "map", reference.get("quantities", {})
+    rate = "0*t" if forced and not is_map else "0"
     table = {
+        "kind": "map" if is_map else "flow",
         "name": "stand-in",
         "states": reference["states"],
         "parameters": reference.get("parameters", {}),
@@ -185,6 +187,7 @@ def model(
     /,
     *,
     name: str | None = None,
+    kind: Literal["flow", "map"] | None = None,
     title: str | None = None,
     source: str | None = None,
     section: str | None = None,
@@ -212,6 +215,8 @@ def model(
         the frequency of the drive [Hz], and ``omega`` 2 pi f. The states have the order of the equations, all
         derivatives last. Otherwise the name of a model that ships, the path of a model's file or of a
         specification, TOML text of either, or a table with the keys of ``[model]``; then no keyword is taken.
+    kind
+        ``"map"`` if a line ``x' = ...`` gives the next ``x``, and not its rate.
     name, title, source, section
         Name, by default ``model``; what the model is, in a line; where its equations come from; the instant of
         its sections.
@@ -257,6 +262,7 @@ def model(
     """
     tables = {
         "name": name,
+        "kind": kind,
         "title": title,
         "source": source,
         "section": section,
