@@ -22,6 +22,7 @@ from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.jit import inline
 from magpend_core.engine.observers import PENDING, Observer
 from magpend_core.engine.system import System
+from magpend_core.engine.tangents import WRITTEN_OUT_MAPS
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import exp, log
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
@@ -61,7 +62,7 @@ class LyapunovExponents:
         Mean growth rate in each block of drive periods [1/s].
     divergence : ndarray, (cell,)
         Time average of the trace of the Jacobian over the same periods [1/s], to which the exponents
-        of a full spectrum add up.
+        of a full spectrum add up; of a map the mean of log |det J|, NaN for one with more than three states.
     loss : ndarray, (cell,)
         Largest factor by which an orthonormalisation shortened a vector. Beyond `MOST_LOSS` the later
         exponents are not resolved.
@@ -275,6 +276,7 @@ def lyapunov_exponents(
     order = np.argsort(-means, axis=1, kind="stable")
     blocks = np.take_along_axis(sums[:, :, :n_exponents], order[:, None, :], axis=2)
     measures = np.where(status[:, None] == BOUNDED, all_measures, np.nan)
+    is_known = not system.is_map or n <= WRITTEN_OUT_MAPS
     per_weight = np.ones_like(frequency) if has_returns else frequency
     weighted = measures[:, :n_exponents] / measures[:, n_exponents + 1, None] * per_weight[:, None]
     return LyapunovExponents(
@@ -282,7 +284,7 @@ def lyapunov_exponents(
         stderr=blocks.std(axis=1, ddof=1) / np.sqrt(settings.n_blocks),
         weighted=np.take_along_axis(weighted, order, axis=1),
         blocks=blocks,
-        divergence=(sums[:, :, n_exponents] * shares).mean(axis=1),
+        divergence=np.where(is_known, (sums[:, :, n_exponents] * shares).mean(axis=1), np.nan),
         loss=measures[:, n_exponents + 2],
         status=status.astype(np.int8),
         is_whole=n_exponents == n,

@@ -11,7 +11,8 @@ from magpend_core.defaults import ATOL, MOST_STEPS_BETWEEN, RTOL
 from magpend_core.engine import sampling as engine
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.driven import with_recorded_drive
-from magpend_core.engine.entry import N_LANES, check_tolerances, slack_of
+from magpend_core.engine.entry import N_LANES, check_tolerances, integrate, slack_of
+from magpend_core.engine.observers import LIFT, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.validation import check_array, check_count, check_states
 
@@ -162,7 +163,7 @@ def sample(
     Parameters
     ----------
     system
-        What is integrated.
+        What is integrated; of a map the times are counts of iterations, and drives and tolerances without effect.
     parameters
         Packed parameters of each trajectory, shape (trajectory, n_parameters) [SI].
     initial_states
@@ -206,6 +207,8 @@ def sample(
     if which.shape != (len(initial),) or (len(which) and not 0 <= which.min() <= which.max() < len(grids)):
         raise ValueError(f"piece must give one of {len(grids)} pieces for each of {len(initial)} trajectories.")
     columns = range(system.n_states) if columns is None else columns
+    if system.is_map:
+        return _iterated(system, packed, initial, [grids[i] for i in which], list(columns), n_lanes)
     longest = max((len(t) for t in grids), default=0)
     table = _drive_table(system, grids, drives)
     samples = engine.Samples(
@@ -229,6 +232,35 @@ def sample(
         lanes = check_count("n_lanes", n_lanes, 1)
         engine.sampler_of(system)(samples, lanes, rtol, atol, attempts)
     return Samples(samples.out, samples.status, samples.n_steps)
+
+
+def _iterated(
+    system: System, packed: np.ndarray, initial: np.ndarray, grids: list[np.ndarray], columns: list[int], n_lanes: int
+) -> Samples:
+    """Return the states of trajectories of a map after given numbers of iterations, a row of `grids` for each."""
+    if any((grid % 1.0 != 0.0).any() for grid in grids):
+        raise ValueError(f"times: {system.name} is a map, which has states after whole numbers of iterations alone.")
+    ends = np.array([max(grid[-1], 1.0) for grid in grids])
+    cells = integrate(
+        system,
+        LIFT,
+        MapSettings(),
+        parameters=packed[:, None],
+        frequency_hz=np.ones((len(grids), 1)),
+        initial_states=initial,
+        n_keep=int(ends.max(initial=1.0)),
+        n_measures=1,
+        measures=ends[:, None, None],
+        rtol=RTOL,
+        atol=ATOL,
+        max_steps_per_period=1,
+        n_lanes=n_lanes,
+    )
+    states = np.concatenate([initial[:, None], cells.section[:, 0]], axis=1)[:, :, columns]
+    out = np.full((len(grids), max(map(len, grids), default=0), len(columns)), np.nan)
+    for own, grid, row in zip(states, grids, out, strict=True):
+        row[: len(grid)] = own[grid.astype(np.int64)]
+    return Samples(out, cells.status[:, 0], cells.n_steps[:, 0])
 
 
 def spacing_of(grid: np.ndarray) -> float:

@@ -215,7 +215,7 @@ def sections(
         Of all cells, or one set for each: ``load_model(...).load(...)``.
     frequency_hz
         Drive frequency of each cell, shape (n,), or one number for all [Hz]; None with a section by
-        crossing.
+        crossing, and of a map, whose sections are its iterations.
     initial_states
         Shape (n, n_states), in the order of the model's `state_names` and in SI units, at the instant t = 0
         of the drive.
@@ -246,6 +246,10 @@ def sections(
         raise ValueError(f"parameters: must be of one model, and are of {len(models)}: {', '.join(models)}.")
     system = several[0].model.system
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
+    if system.is_map:
+        if frequency_hz is not None:
+            raise ValueError(f"frequency_hz = {frequency_hz}: {several[0].model.name} is a map; give None.")
+        frequency_hz = 1.0
     if frequency_hz is None:
         if options.get("section") is None:
             raise ValueError("frequency_hz = None: give the drive's frequency, or a section by crossing.")

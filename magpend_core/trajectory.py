@@ -38,7 +38,7 @@ def trajectory(
     initial_state
         The model's states in their order at time 0, in their units; shape (n_states,).
     times
-        Rising times [s], the first at least 0; shape (n,).
+        Rising times [s], the first at least 0; shape (n,). Of a map counts of iterations, at a frequency of 1.
     rtol, atol
         Relative and absolute tolerance of the error control; `rtol` at least 1e-13.
     max_steps_per_period
@@ -61,6 +61,8 @@ def trajectory(
     system = parameters.model.system
     frequency = float(check_frequency(frequency_hz, ndim=0))
     state = check_states(initial_state, 1, system.n_states, "initial_state")
+    if system.is_map and frequency != 1.0:
+        raise ValueError(f"frequency_hz = {frequency:g}: {system.name} is a map, whose iterations are counted; give 1.")
     grid = check_array("times", times, 1)
     if len(grid) and (grid[0] < 0.0 or np.any(np.diff(grid) <= 0.0)):
         raise ValueError("times must start at 0 or later and rise from entry to entry.")

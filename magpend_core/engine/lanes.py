@@ -427,6 +427,21 @@ def attempt(
             update_extremes(w, base)
 
 
+def iterate(
+    w: Any, events: Any, n_watching: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float
+) -> None:
+    """Iterate a map once in all groups of SIMD lanes: `attempt` of a system that is a map."""
+    for group in range(n_groups):
+        base = group * ROWS.size
+        run_stages(w, base)
+        for i in range(N):
+            row = base + i * WIDTH
+            store(w, row + ROWS.state, load(w, row + ROWS.slopes + N * WIDTH))
+        store(w, base + ROWS.steps, load(w, base + ROWS.steps) + 1.0)
+        store(w, base + ROWS.event, REACHED + 0.0 * load(w, base + ROWS.step))
+        events[group] = 1
+
+
 def load_cell(
     w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
@@ -928,8 +943,10 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         own = (*tangent_templates.INLINE, *tangent_templates.CALLED)
         templates = {key: getattr(tangent_templates, key) for key in own} | templates
         templates["run_stages"] = tangent_templates.run_stages_and_vectors
-    elif system.n_states <= UNROLLED_STATES + short:
+    elif system.n_states <= UNROLLED_STATES + short and not system.is_map:
         templates["run_stages"] = unrolled_stages(system)
+    if system.is_map:
+        templates["attempt"] = iterate
     if system.tableau.has_two_errors:
         templates["squared_error"] = squared_error_of_two
     dissolving = {*event_templates.INLINE, *mode_templates.INLINE, *tangent_templates.INLINE, *_INLINE}

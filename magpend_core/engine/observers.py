@@ -283,3 +283,17 @@ def _keeps_every(i_period: int, memory: Any, settings: MapSettings) -> bool:
 
 MAP = Observer("map", _keep_all, _map_memory, n_kept=_n_mapped, keeps_next=_keeps_every)
 """Observer that records every section; each cell ends after the number of periods in its ``measures[0]``."""
+
+
+def _keep_lifted(
+    section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: MapSettings
+) -> int:
+    """Record the section point of every period with angles that run on; end after ``measures[0]`` periods."""
+    for k in range(N):
+        record[i_period - 1, k] = section[k] + TWO_PI * turns[k]
+    memory[0] = float(i_period)
+    return BOUNDED if i_period >= measures[0] else PENDING
+
+
+LIFT = Observer("lift", _keep_lifted, _map_memory, n_kept=_n_mapped, keeps_next=_keeps_every)
+"""Observer like `MAP`, with the full turns of the angles since the start added to them."""

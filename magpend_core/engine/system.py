@@ -158,6 +158,9 @@ class System:
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.
+    is_map : bool
+        Whether this is a map: ``rhs`` then returns the next states in place of rates, and `jacobian` their derivatives.
+        A drive period is one iteration, without steps, tolerances and method; nothing depends on time.
     method : str
         Key of `tableau.METHODS`: ``"dopri5"`` of order 5, or ``"dop853"`` of order 8, which needs a half or a quarter
         of the time for smooth equations at tolerances below 1e-6, but gains nothing if layers limit the steps. Only
@@ -228,6 +231,7 @@ class System:
     section: tuple[int, int] | None = None
     quantity_names: tuple[str, ...] = ()
     quantities: Callable[..., Any] | None = None
+    is_map: bool = False
     method: str = "dopri5"
     tangents_of: System | None = field(default=None, compare=False, repr=False)
     recorded_for: System | None = field(default=None, compare=False, repr=False)
@@ -302,7 +306,9 @@ class System:
             data += (self.sticks,)  # type: ignore[assignment]
         if any(size != 1.0 for size in self.sizes):
             data += (self.sizes,)  # type: ignore[assignment]
-        if self.method != "dopri5":
+        if self.is_map:
+            data += ("map",)  # type: ignore[assignment]
+        elif self.method != "dopri5":
             data += (self.method,)  # type: ignore[assignment]
         if self.n_known is not None or self.jacobian_entries is not None:
             data += (self.n_known, self.jacobian_entries)  # type: ignore[assignment]
@@ -310,9 +316,11 @@ class System:
 
     @property
     def tableau(self) -> Tableau:
-        """Runge-Kutta coefficients of the system's `method`."""
-        from magpend_core.engine.tableau import METHODS
+        """Runge-Kutta coefficients of the system's `method`; of a map `ITERATION`."""
+        from magpend_core.engine.tableau import ITERATION, METHODS
 
+        if self.is_map:
+            return ITERATION
         if self.method not in METHODS:
             known = ", ".join(METHODS)
             raise ValueError(f"method = {self.method!r}: {self.name} can be integrated by {known}.")

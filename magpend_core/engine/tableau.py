@@ -190,3 +190,6 @@ METHODS = {
     "dop853": Tableau(np.array(_NODES_8), _filled(_STAGES_8, 12), _ERRORS_8[0], _ERRORS_8[1], 8),
 }
 """Methods by name, as given by their authors."""
+
+ITERATION = Tableau(np.zeros(2), np.zeros((2, 1)), np.zeros(2), np.zeros(2), 1)
+"""What stands for a method in a system that is a map: its one stage after the first evaluates the map at the state."""

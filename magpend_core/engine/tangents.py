@@ -9,7 +9,7 @@ rows of a vector stay in the first-level cache. The states do not depend on the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,9 @@ from magpend_core.engine.jacobians import rows_of_entries
 from magpend_core.engine.jit import inline
 from magpend_core.engine.simd import WIDTH, load, multiply_add, store
 from magpend_core.engine.system import System
+
+WRITTEN_OUT_MAPS = 3
+"""Most states of a map whose determinant is written out."""
 
 DIVERGENCE = "divergence"
 """Name of the state that integrates the trace of the Jacobian."""
@@ -34,9 +37,28 @@ def order_of(row: dict[int, int]) -> list[int]:
     return [1, 0, *columns[2:]] if columns[:2] == [0, 1] else columns
 
 
-def trace_of(rows: list[dict[int, int]], name: str) -> str:
-    """Return source code for the trace of the Jacobian whose tuple of entries is called `name`."""
-    return " + ".join(f"{name}[{row[i]}]" for i, row in enumerate(rows) if i in row)
+def divergence_of(system: System, name: str) -> str:
+    """Return source code for the value of the state `DIVERGENCE`, from the tuple `name` of the Jacobian's entries.
+
+    It is the trace, the rate at which a flow changes volumes; of a map with at most `WRITTEN_OUT_MAPS` states the
+    logarithm of the factor by which an iteration changes them, and 0 of a map with more.
+    """
+    rows = rows_of_entries(system)
+    if not system.is_map:
+        return " + ".join(f"{name}[{row[i]}]" for i, row in enumerate(rows) if i in row) or "0.0 * y[0]"
+    if len(rows) > WRITTEN_OUT_MAPS:
+        return "0.0 * y[0]"
+    return f"log(maximum(absolute({_determinant(rows, name, range(len(rows)))}), 1e-100))"
+
+
+def _determinant(rows: list[dict[int, int]], name: str, columns: Sequence[int]) -> str:
+    """Return source code for the determinant of the last rows of a whole matrix in some of its columns."""
+    first = rows[-len(columns)]
+    if len(columns) == 1:
+        return f"{name}[{first[columns[0]]}]"
+    minors = [_determinant(rows, name, [c for c in columns if c != j]) for j in columns]
+    terms = [f"{name}[{first[j]}] * ({minor})" for j, minor in zip(columns, minors, strict=True)]
+    return " ".join(f"{'-' if k % 2 else '+' if k else ''} {term}" for k, term in enumerate(terms)).strip()
 
 
 def n_entries(system: System) -> int:
@@ -80,7 +102,7 @@ def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callabl
     """
     parts = [f"entries[{k}]" for k in order]
     if has_trace:
-        parts.append(trace_of(rows_of_entries(base), "entries") or "0.0 * y[0]")
+        parts.append(divergence_of(base, "entries"))
     lines = ["def tangent_entries(y, u, c):", "entries = _jacobian(y, u, c)", f"return ({', '.join(parts)},)"]
     scope: dict[str, Any] = {"__name__": base.rhs.__module__, "_jacobian": base.jacobian}
     exec("\n    ".join(lines), scope)

@@ -17,8 +17,10 @@ from typing import Any
 
 from magpend_core.engine.jacobians import rows_of_entries
 from magpend_core.engine.jit import inline
+from magpend_core.engine.simd import absolute, maximum
 from magpend_core.engine.system import System
-from magpend_core.engine.tangents import DIVERGENCE, order_of, trace_of
+from magpend_core.engine.tangents import DIVERGENCE, divergence_of, order_of
+from magpend_core.engine.vecmath import log
 from magpend_core.sizes import WRITTEN_OUT, too_many_states
 
 
@@ -64,7 +66,7 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False, writ
         Number of tangent vectors, 1 to ``system.n_states``.
     divergence
         Whether one more state, the last, integrates the trace of the Jacobian: the logarithm of the
-        factor by which the flow changes volumes.
+        factor by which the flow changes volumes. Of a map it is that of the last iteration.
     written_out
         Whether the products are written out; by default up to `sizes.WRITTEN_OUT` states.
 
@@ -113,9 +115,11 @@ def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dic
     """
     n = system.n_states
     bindings = {"_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers}
+    if system.is_map:
+        bindings |= {"absolute": absolute, "log": log, "maximum": maximum}
     parts = [f"dy[{i}]" for i in range(n)] + _products(system, n_vectors)
     if divergence:
-        parts.append(trace_of(rows_of_entries(system), "jacobian") or "0.0 * y[0]")
+        parts.append(divergence_of(system, "jacobian"))
     rhs = _compile(
         f"def rhs(y, u, c):\n"
         f"    base = ({_first(n)},)\n"

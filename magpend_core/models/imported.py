@@ -99,6 +99,8 @@ def _description(path: str, model: Model) -> dict[str, Any]:
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
     table["autonomous"] = model.autonomous
+    if model.is_map:
+        table["is_map"] = True
     for name in ("states", "parameters", "quantities"):
         table[name] = {one.name: _plain(one) for one in getattr(model, name)}
     table["presets"] = {
@@ -190,12 +192,18 @@ def described_model(table: Mapping[str, Any]) -> Model:
         raise ParameterError(problems)
     texts = {name: table[name] for name in _TEXTS if name in table and name != "digest"}
     return DescribedModel(
-        **texts, **given, system_path="", sources=(), autonomous=table.get("autonomous") is True, text=dict(table)
+        **texts,
+        **given,
+        system_path="",
+        sources=(),
+        autonomous=table.get("autonomous") is True,
+        is_map=table.get("is_map") is True,
+        text=dict(table),
     )
 
 
 def _outer_problems(table: Mapping[str, Any]) -> list[str]:
-    known = (KEY, *_TEXTS, *_TABLES, "autonomous", "mirror")
+    known = (KEY, *_TEXTS, *_TABLES, "autonomous", "is_map", "mirror")
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]
     problems += [

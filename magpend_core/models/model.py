@@ -191,7 +191,9 @@ class Model:
     relations : callable
         Sentences on values that are in bounds each, but not together.
     autonomous : bool
-        Whether nothing depends on time but through the states.
+        Whether it is a flow, and nothing depends on time but through the states.
+    is_map : bool
+        Whether the equations give the next state; a drive period then stands for one iteration.
     text : mapping, optional
         The table that the model was read from, if it was text; plain data, see `reference`.
     """
@@ -212,6 +214,7 @@ class Model:
     angle_dim: str = "angle"
     relations: Callable[[Mapping[str, float]], list[str]] = field(default=_no_relations)
     autonomous: bool = False
+    is_map: bool = False
     text: Mapping[str, Any] | None = None
 
     def __repr__(self) -> str:
@@ -239,6 +242,13 @@ class Model:
     def crossing(self) -> Crossing | None:
         """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
         return None
+
+    @property
+    def clock_hz(self) -> float | None:
+        """Return what the engine takes as the drive frequency [Hz] of a model without a drive: of a map 1, with a
+        section by crossing one over the longest time between crossings; None where the frequency is given.
+        """
+        return 1.0 if self.is_map else None
 
     @property
     def disturbance(self) -> Disturbance | None:

@@ -44,6 +44,11 @@ class SectionedModel(Model):
         return self.through
 
     @property
+    def clock_hz(self) -> float | None:
+        """Return one over the longest time between crossings [Hz]."""
+        return self.through.frequency_hz
+
+    @property
     def flow(self) -> Model:
         """Return the model without its Poincare section."""
         return self.whole

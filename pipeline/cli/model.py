@@ -84,8 +84,9 @@ def _lines(model: Model, found: Description) -> list[str]:
     if found.equations:
         lines += ["", "equations"]
         lines += [f"  {name} = {text}" for name, text in found.definitions.items()]
-        lines += [f"  d{name}/dt = {text}" for name, text in found.equations.items()]
-    lines += ["", "found", *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"])]
+        lines += [f"  {name}' = {t}" if model.is_map else f"  d{name}/dt = {t}" for name, t in found.equations.items()]
+    if not model.is_map:  # no step of a map goes across anything
+        lines += ["", "found", *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"])]
     if model.remarks:
         lines += ["", "warnings", *(f"  {line}" for line in model.remarks)]
     if found.problems:
@@ -111,6 +112,7 @@ def _as_dict(model: Model, found: Description) -> dict[str, Any]:
     return {
         **described(model),
         "autonomous": model.autonomous,
+        "is_map": model.is_map,
         "section": model.section,
         "digest": model.digest,
         "definitions": found.definitions,

@@ -75,6 +75,7 @@ def all_of(model: Model) -> list[str]:
     from pipeline.products.product import padded
 
     seen = "no drive: the equations do not depend on time" if model.autonomous else ""
+    seen = "a map: the equations give the next states" if model.is_map else seen
     seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
     lines = [f"{model.name}: {model.title}", seen, "", "states"]
     lines += padded([(s.name, s.unit, s.meaning) for s in model.states])

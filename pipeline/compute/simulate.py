@@ -206,6 +206,8 @@ def simulate(
     from magpend_core.models.parameters import ParameterError
 
     chosen = load_model(model)
+    if chosen.is_map:
+        raise SpecError(f"{chosen.name} is a map, without motion between its iterations: run it with magpend run.")
     if chosen.autonomous and drive is None:
         frequency_hz = CLOCK_HZ if frequency_hz is None else frequency_hz
         n_periods = FLOW_PERIODS if n_periods is None else n_periods

@@ -171,7 +171,7 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
     """Return the drive frequency at a parameter point [Hz]; NaN if it is unknown.
 
-    For a flow with sections at crossings it is one over the longest time between crossings, as in the engine.
+    For a map, and for a flow with sections at crossings, it is `Model.clock_hz`, as in the engine.
 
     Parameters
     ----------
@@ -180,8 +180,8 @@ def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
     values
         Coordinates of the point by name.
     """
-    if model is not None and model.crossing is not None:
-        return model.crossing.frequency_hz
+    if model is not None and model.clock_hz is not None:
+        return model.clock_hz
     return float(values.get(FREQUENCY_DIM, math.nan))
 
 
@@ -227,9 +227,11 @@ def letter(attractor: int) -> str:
 
 
 def period_of(model: Model | None) -> str:
-    """Return the word for the time between two section points: drive period, return or strobe period."""
+    """Return the word for the time between two section points: drive period, return, iteration or strobe period."""
     if model is None:
         return "drive period"
+    if model.is_map:
+        return "iteration"
     if model.crossing is not None:
         return "return"
     return "strobe period" if model.autonomous else "drive period"
@@ -240,8 +242,20 @@ def periods_of(model: Model | None) -> str:
     return f"{period_of(model)}s"
 
 
+def time_unit(model: Model | None) -> str:
+    """Return the unit of the time in which exponents count: s, or iteration of a map."""
+    return "iteration" if model is not None and model.is_map else "s"
+
+
+def samples_per_period(model: Model, n: int) -> int:
+    """Return the number of instants at which a period is sampled: `n`, but 1 of a map, which has its iterates alone."""
+    return 1 if model.is_map else n
+
+
 def section_name(model: Model | None) -> str:
-    """Return the name of a model's section: stroboscopic or Poincar\u00e9."""
+    """Return the name of a model's section: stroboscopic, Poincar\u00e9, or the iterates of a map."""
+    if model is not None and model.is_map:
+        return "iterates"
     return "stroboscopic section" if model is None or model.crossing is None else "Poincar\u00e9 section"
 
 

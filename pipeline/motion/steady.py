@@ -52,6 +52,9 @@ MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 9 us + 21.5 us T/s (measured between 0.1 and 3 Hz on AVX-512, good to 20 %).
 """
 
+MICROSECONDS_PER_ITERATION = 0.1
+"""Rule of thumb for one iteration of a map on one core."""
+
 RTOL_OF_RULE = 1e-8
 ROOT = 6
 """The time is proportional to (1/rtol)^(1/6)."""
@@ -61,6 +64,10 @@ NEEDS = {
     "noisy": "with noise; add a table [noise] to its specification",
 }
 """What a run at constant parameters lacks for the analyses of each other kind of motion."""
+
+
+NOT_OF_MAPS = ("response",)
+"""Analyses of the motion between sections, which a map has not."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,8 @@ class Steady:
 
     def unsuited(self, analysis: Analysis) -> str:
         """Return the sentences that refuse an analysis that is for another kind of motion; empty if it suits."""
+        if self.model.is_map and analysis.name in NOT_OF_MAPS:
+            return f"{analysis.name} follows the motion over a period; {self.model.name} is a map, of iterates alone."
         if analysis.motion == self.kind:
             return ""
         if not self.obstacle:
@@ -111,6 +120,8 @@ class Steady:
 
     def seconds_per_period(self, frequency_hz: np.ndarray) -> np.ndarray:
         """Estimate the computing time per drive period of one trajectory on one core [s], by a rule of thumb."""
+        if self.model.is_map:
+            return np.full(np.shape(frequency_hz), MICROSECONDS_PER_ITERATION * 1e-6)
         microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND / np.asarray(frequency_hz)
         return np.asarray(microseconds * 1e-6 * (RTOL_OF_RULE / self.integration.rtol) ** (1 / ROOT))
 

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.chaos.lyapunov import GOOD, Motion, period_seconds, pooled_mean, summarise
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
-from pipeline.layout.vocabulary import model_of, period_of, periods_of, split_dims
+from pipeline.layout.vocabulary import model_of, period_of, periods_of, split_dims, time_unit
 from pipeline.plots import labels, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.lyapunov import UNITS, left_out
@@ -92,7 +92,8 @@ def plot_convergence(
     handles = _draw_running(top, final, data)
     for kind, colour in _COLOURS.items():
         _draw_cells(bottom, data, "in_block", kind, colour)
-    unit = "s" if per == "s" else "period"
+    model = model_of(ds)
+    unit = "period" if per == "period" and not model.is_map else time_unit(model)
     style.label_axes(top, y=f"$\\lambda_{exponent}$, mean so far [1/{unit}]")
     style.label_axes(bottom, str(data["period"].attrs["long_name"]), f"in the block [1/{unit}]")
     top.set_xlim(0.0, 1.01 * float(data["period"][-1]))
@@ -111,6 +112,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
         raise ValueError(f"exponent is {exponent}, and the cube has 1 to {part.sizes['exponent']}")
     place = style.join([labels.caption(part, with_start=False), left_out(part)])
     model = model_of(part)
+    per = "period" if model.is_map else per
     scale = period_seconds(part) if per == "period" else 1.0
     chosen = xr.Dataset(
         {

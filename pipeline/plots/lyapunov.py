@@ -49,6 +49,7 @@ def left_out(part: xr.Dataset) -> str:
 
 def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
     """Return the Lyapunov exponents and their errors per second or per period, with flags and classes of motion."""
+    per = "period" if model_of(part).is_map else per
     scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
     chosen = part if spectrum else part.isel(exponent=slice(1))
     dims = chosen["lyapunov"].dims

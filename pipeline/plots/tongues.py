@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import shown_unit
+from pipeline.layout.vocabulary import model_of, period_of
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import fixed_of, swept_parameters
 from pipeline.plots.branches import take_room
@@ -82,7 +83,7 @@ def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
         data = data.transpose(swept[1], swept[0])
     keep = {*data["rotation"].dims, *swept}
     data = data.drop_vars([c for c in data.coords if c not in keep])
-    data["rotation"].attrs = {"units": "1", "long_name": "turns per drive period"}
+    data["rotation"].attrs = {"units": "1", "long_name": f"turns per {period_of(model_of(part))}"}
     return data.assign_attrs(title="rotation numbers")
 
 
@@ -101,7 +102,7 @@ def _draw_staircase(fig: style.DataFigure, ax: Axes, data: xr.Dataset, axis: xr.
     x = np.broadcast_to(axis.values.astype(np.float64)[:, None], rotation.shape)
     for which, colour, name in ((~locked, "0.55", "not locked"), (locked, style.BLUE, "locked: closed orbits")):
         ax.plot(x[which], rotation[which], ".", color=colour, markersize=2.5, label=name, gid=name.split(":")[0])
-    style.label_axes(ax, labels.parameter_label(axis), "rotation number [turns per drive period]")
+    style.label_axes(ax, labels.parameter_label(axis), f"rotation number [{data['rotation'].attrs['long_name']}]")
     style.legend_above(fig, [style.dot("locked: closed orbits", style.BLUE), style.dot("not locked", "0.55")])
     for fraction, (low, high) in _steps(x[locked], rotation[locked], axis).items():
         ax.annotate(
@@ -147,7 +148,7 @@ def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]
     if entries:
         style.legend_above(fig, entries)
     bar = fig.colorbar(ScalarMappable(norm), ax=ax, pad=0.015, aspect=32, ticks=MaxNLocator(7))
-    style.style_bar(bar, "rotation number\n[turns per drive period]")
+    style.style_bar(bar, f"rotation number\n[{data['rotation'].attrs['long_name']}]")
 
 
 def draw_rotation(run: OpenRun, options: FigureOptions) -> style.DataFigure:

@@ -5,6 +5,7 @@ section point.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
@@ -91,7 +92,17 @@ LYAPUNOV_VARIABLES = (
 
 
 def _variables(options: LyapunovOptions, model: Any) -> tuple[Variable, ...]:
-    return LYAPUNOV_VARIABLES
+    if not model.is_map:
+        return LYAPUNOV_VARIABLES
+    words = {
+        "lyapunov": "Lyapunov exponents per iteration, in falling order",
+        "lyapunov_blocks": "mean growth rate in each block of iterations",
+        "divergence": "mean logarithm of the change of volumes in an iteration",
+    }
+    return tuple(
+        replace(v, units="1", long_name=words.get(v.name, v.long_name), attrs={}) if v.units == "1/s" else v
+        for v in LYAPUNOV_VARIABLES
+    )
 
 
 def _sizes(options: LyapunovOptions, model: Any) -> dict[str, int]:

@@ -104,7 +104,9 @@ def _settled(options: RotationOptions, model: Any) -> RotationOptions:
         )
     if len(set(of)) < len(of):
         raise ValueError(f"of: {of[0]} is given twice; name two different states.")
-    return options.model_copy(update={"of": of})
+    # a map has no path between its points, whose turns could be counted
+    of_section = options.section or (model.is_map and len(of) > 1)
+    return options.model_copy(update={"of": of, "section": of_section})
 
 
 def _variables(options: RotationOptions, model: Any) -> tuple[Variable, ...]:

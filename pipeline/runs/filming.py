@@ -138,6 +138,7 @@ def _of_run(
 ) -> tuple[list[instants.Moving], list[str]]:
     from pipeline.compute.simulate import start_of
 
+    _refuse_map(run.model)
     if cells:
         return of_cells(run, cells), []
     if start is None:
@@ -156,6 +157,7 @@ def _alone(start: Start) -> instants.Moving:
     from pipeline.specification.tables import FREQUENCY
 
     model = load_model(start.model)
+    _refuse_map(model)
     frequency = start.frequency_hz
     if frequency is None:
         frequency = CLOCK_HZ if model.autonomous else DEFAULT_HZ
@@ -163,6 +165,11 @@ def _alone(start: Start) -> instants.Moving:
     parameters = model.load(start.preset, **start.overrides)
     check_states(model, np.array([state]), [{**parameters, FREQUENCY: frequency}])
     return of_start(parameters, frequency, state, start.transient)
+
+
+def _refuse_map(model: Model) -> None:
+    if model.is_map:
+        raise SpecError(f"{model.name} is a map, without motion between its iterations to animate; draw its section.")
 
 
 MOST_MOTIONS = 8

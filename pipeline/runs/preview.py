@@ -43,7 +43,9 @@ def first_figure(run: RunDirectory) -> str:
         return "basins"
     if plan.sizes.get("period_index", 0) >= MANY_SECTIONS:
         return "section"
-    return "bifurcation" if any(not is_start_dim(d) for d in plan.dims) else "gallery"
+    if any(not is_start_dim(d) for d in plan.dims):
+        return "bifurcation"
+    return "section" if run.model.is_map else "gallery"
 
 
 def figure_command(run: RunDirectory) -> str:

@@ -11,7 +11,7 @@ import tomllib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -108,8 +108,10 @@ def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Mode
             return None
     if not isinstance(reference, Mapping) or not isinstance(reference.get("states"), Mapping):
         return None
-    rate, quantities = ("0*t" if forced else "0"), reference.get("quantities", {})
+    is_map, quantities = reference.get("kind") == "map", reference.get("quantities", {})
+    rate = "0*t" if forced and not is_map else "0"
     table = {
+        "kind": "map" if is_map else "flow",
         "name": "stand-in",
         "states": reference["states"],
         "parameters": reference.get("parameters", {}),
@@ -185,6 +187,7 @@ def model(
     /,
     *,
     name: str | None = None,
+    kind: Literal["flow", "map"] | None = None,
     title: str | None = None,
     source: str | None = None,
     section: str | None = None,
@@ -208,10 +211,12 @@ def model(
         A function ``f(t, y, p)`` as for `scipy.integrate.solve_ivp`, which returns the rates of `states`: it is
         called once with symbols, and its equations are then text like any others. Or lines ``x' = v`` (rates),
         ``drive = A*cos(omega*t)`` (parts with a name) and ``d = 0.2`` (parameters); ``x'' = ...`` makes the
-        states ``x`` and ``x_dot``. Or a dict of right sides by state. In expressions ``t`` is the time [s] and
-        ``f`` the frequency of the drive [Hz]. The states have the order of the equations, all derivatives last.
-        Otherwise the name of a model that ships, the path of a model's file or of a specification, TOML text of
-        either, or a table with the keys of ``[model]``; then no keyword is taken.
+        states ``x`` and ``x_dot``. Or a dict of right sides by state. In expressions ``t`` is the time [s], ``f``
+        the frequency of the drive [Hz], and ``omega`` 2 pi f. The states have the order of the equations, all
+        derivatives last. Otherwise the name of a model that ships, the path of a model's file or of a
+        specification, TOML text of either, or a table with the keys of ``[model]``; then no keyword is taken.
+    kind
+        ``"map"`` if a line ``x' = ...`` gives the next ``x``, and not its rate.
     name, title, source, section
         Name, by default ``model``; what the model is, in a line; where its equations come from; the instant of
         its sections.
@@ -221,7 +226,7 @@ def model(
         For a function: the names of the states, in the order of ``y``, and the parameters, in the order of ``p``.
     drive
         Of a function that depends on ``t``: the parameter that is the angular frequency, the frequency or the period of
-        its drive. Specifications give the rate of the drive; in the text the parameter is an expression of ``f``.
+        its drive. Specifications give its value as ``frequency_hz``; in the text it is an expression of ``f``.
     impacts, drawing, mirror, presets, classifier
         Tables with the keys of ``[model]``.
     values
@@ -257,6 +262,7 @@ def model(
     """
     tables = {
         "name": name,
+        "kind": kind,
         "title": title,
         "source": source,
         "section": section,

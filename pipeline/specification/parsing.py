@@ -14,6 +14,7 @@ from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import Preset, is_file
+from magpend_core.models.text.reading import KINDS as MODEL_KINDS
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification import drift as moving
@@ -95,7 +96,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
         raise SpecError(odd)
     if data.get("kind") == IDENTIFICATION:
         raise SpecError(f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.')
-    if "kind" not in data and "equations" in data:
+    if data.get("kind") in (None, *MODEL_KINDS) and "equations" in data:
         raise SpecError(A_MODEL)
     problems = [unknown_key(key, key, KEYS) for key in data if key not in KEYS]
     data, wrong = _only_tables(data, problems)
@@ -111,6 +112,10 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
         model = stand_in(data.get("model"), folder, forced="section" not in data)
     if model is None:
         raise SpecError(problems)
+    if model.is_map:
+        problems += _map_problems(model, data)
+        data = {key: table for key, table in data.items() if key not in _NOT_OF_MAPS}
+        tables, drift = {**tables, **dict.fromkeys(_NOT_OF_MAPS)}, {}
     section = section_of(tables["section"], model, data, problems)
     ramps = moving.checked_ramps(drift, model, axes, problems)
     noise = noise_of(tables["noise"], model, data, problems)
@@ -123,7 +128,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     problems += size_problems(axes, starts)
     problems += _method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(data.get("parameters", {}))
-    has_periods = "drive" in data or "section" in data or model.autonomous
+    has_periods = "drive" in data or "section" in data or model.autonomous or model.is_map
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
     own = parameter_problems(known, seen, tuple(data.get("axes", {})), axes, complete)
     problems += [p for p in own if not follows(p, data, noise)]
@@ -309,6 +314,32 @@ def _drift_problems(
     if problems or not imports:
         return problems
     return moving.system_problems(model, ramps, values, axes, table.hertz)
+
+
+_NOT_OF_MAPS = {
+    "section": "whose sections are its iterations",
+    "drive": "which has no drive",
+    "drift": "and parameters move in time",
+    "noise": "and noise acts on the rates of a flow",
+}
+"""Tables of a specification that a map cannot have, with the reason."""
+
+
+def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
+    """Return the problems of tables and keys that a map, which has no time and no steps, cannot have."""
+    what = f"{model.name} is a map"
+    problems = [f"{name}: {what}, {why}; drop the table." for name, why in _NOT_OF_MAPS.items() if name in data]
+    rates = [f"parameters.{word}" for word in RATES if word in data.get("parameters", {})]
+    rates += [f"axes.{FREQUENCY}"] if FREQUENCY in data.get("axes", {}) else []
+    problems += [f"{key}: {what}, which has no drive; drop the key." for key in rates]
+    given = data.get("integration", {})
+    # a stored specification has all keys, with their defaults
+    fields = Integration.model_fields
+    steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if given.get(k, d := fields[k].default) != d]
+    problems += [f"integration.{key}: {what}, whose iterations have no steps; drop the key." for key in steps]
+    if "extremes" in data.get("products", {}):
+        problems.append(f"products.extremes: {what}, without motion between its iterations; drop the product.")
+    return problems
 
 
 def _method_problems(integration: Integration | None, products: Mapping[str, Options], is_recorded: bool) -> list[str]:

@@ -262,10 +262,10 @@ class Spec:
     def frequency_hz(self) -> float | None:
         """Drive frequency [Hz], for a recorded drive its mean frequency; None if the frequency is swept.
 
-        With a section by crossing it is one over the longest time between crossings, as in the engine.
+        For a map, and with a section by crossing, it is `Model.clock_hz`, as in the engine.
         """
-        if self.section is not None:
-            return self.section.crossing.frequency_hz
+        if self.model.clock_hz is not None:
+            return self.model.clock_hz
         return self.parameters.hertz if self.recorded is None else self.recorded.frequency_hz
 
     @property

@@ -59,6 +59,8 @@ def angle_remark(name: str) -> str:
 
 def _dynamics(definition: Definition) -> list[tuple[str, Tree]]:
     """Return the expressions that move the state; with each the state that an impact sets to it, else an empty text."""
+    if definition.is_map:  # the next state turns with the state
+        return list(definition.equations.items())
     found = [("", tree) for tree in (*definition.equations.values(), *(i.of for i in definition.impacts))]
     return found + [(name, tree) for i in definition.impacts for name, tree in i.set.items()]
 

@@ -41,6 +41,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         forcing=None if forcing is None else functions["forcing"],  # type: ignore[arg-type]
         forcing_is_time=forcing is not None and forcing.op == "time",
         rhs=functions["rhs"],
+        is_map=definition.is_map,
         jacobian=functions["jacobian"],
         jacobian_entries=source.jacobian_entries,
         is_angle=tuple(s.on_circle for s in states),

@@ -69,6 +69,8 @@ class Definition:
         The first of the presets has the values of the table of parameters.
     table : dict
         The text as plain data.
+    is_map : bool
+        Whether the equations give the next state, and not the rate of the state.
     """
 
     name: str
@@ -87,6 +89,7 @@ class Definition:
     presets: tuple[Preset, ...]
     classifier: ClassifierText | None
     table: Mapping[str, Any] = field(repr=False)
+    is_map: bool = False
 
     def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
         """Return all names that expressions use, directly or through definitions, each after the names that
@@ -113,8 +116,8 @@ class Definition:
 
     @property
     def autonomous(self) -> bool:
-        """Whether neither the equations nor the impacts depend on time or frequency."""
-        return not {"t", "f", "phase"} & set(self.used(self.dynamics))
+        """Whether it is a flow, of which neither equations nor impacts depend on time or frequency."""
+        return not self.is_map and not {"t", "f", "phase"} & set(self.used(self.dynamics))
 
     def remarks(self) -> list[str]:
         """Return a sentence for each parameter and each definition that no expression uses."""
@@ -154,6 +157,7 @@ class Definition:
                 ]
                 for i in self.impacts
             ],
+            **({"kind": "map"} if self.is_map else {}),
         }
         return json.dumps(plain, sort_keys=True)
 

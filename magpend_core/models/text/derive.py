@@ -108,6 +108,8 @@ def derive(definition: Definition) -> Derived:
         If the equations are too large.
     """
     builder = Builder(definition)
+    if definition.is_map:
+        return _of_map(builder)
     graph = builder.graph
     scales = tuple(s.scale for s in definition.states)
     presets = [builder.leaf_values(p.values) for p in definition.presets]
@@ -145,6 +147,17 @@ def derive(definition: Definition) -> Derived:
         sticks,
         (*(f"{form} beside a jump in time" for form in late), *(["square"] * len(sides.left))),
     )
+
+
+def _of_map(builder: Builder) -> Derived:
+    """Derive the Jacobian of a map. Corners and jumps stay as they are: no step of a map goes across them."""
+    graph, own = builder.graph, builder.definition
+    images = tuple(builder.node(tree) for tree in own.equations.values())
+    columns = [derivatives(graph, images, {graph.leaf("state", i): graph.one}) for i in range(len(images))]
+    jacobian = tuple(columns[j][i] for i in range(len(images)) for j in range(len(images)))
+    quantities = tuple(builder.node(tree) for tree in own.quantities.values())
+    sliding = sliding_of(graph, images, ())
+    return Derived(graph, images, jacobian, quantities, None, (), (), (), (), sliding, (), (), ())
 
 
 def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int, float]]) -> bool:

@@ -87,7 +87,8 @@ def equations_of(definition: Definition) -> list[str]:
         if name in definition.define
     ]
     for name, tree in definition.equations.items():
-        rate = rf"\frac{{\mathrm{{d}}{symbol_of(name, symbols)}}}{{\mathrm{{d}}t}}"
+        symbol = symbol_of(name, symbols)
+        rate = rf"{{{symbol}}}'" if definition.is_map else rf"\frac{{\mathrm{{d}}{symbol}}}{{\mathrm{{d}}t}}"
         lines.append(f"{rate} &= {latex_of(tree, symbols)}")
     return lines
 

@@ -100,6 +100,13 @@ def read_lines(
     found = Lines()
     entries = list(_entries(equations, found))
     orders = _orders(entries, found)
+    if tables.get("kind") == "map":
+        found.problems += [
+            f"{e.place}: {e.name}{chr(39) * e.order}: an equation of a map has one prime, {e.name}' = ... for the next "
+            f"{e.name}; make the {e.name} before a state of its own."
+            for e in entries
+            if e.order > 1
+        ]
     names = {name: [name + suffix for suffix in SUFFIXES[:order]] for name, order in orders.items()}
     rates: dict[str, Any] = {}
     for k in range(max(orders.values(), default=0)):  # first all positions, then all their rates

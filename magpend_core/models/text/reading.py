@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from magpend_core.models.model import Quantity, State
+from magpend_core.models.model import Mirror, Quantity, State
 from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
 from magpend_core.models.text.definition import Definition, Impact
 from magpend_core.models.text.grammar import Tree, names
@@ -29,8 +29,11 @@ ESCAPE = 1e9
 MAX_FUNCTION = 20_000
 """Characters of the source of a Python function from which the equations were read."""
 BOUNDS = {"finite": FINITE, "positive": POSITIVE, "non-negative": NON_NEGATIVE, "fraction": FRACTION}
+KINDS = ("flow", "map")
+"""Values of the key ``kind``: equations for the rates of the states, the default, or for the next states."""
 KEYS = (
     "name",
+    "kind",
     "title",
     "source",
     "section",
@@ -121,10 +124,13 @@ class _Reading(ViewsReader):
         mirror = self._mirror(table.get("mirror"), state_names)
         classifier = self._classifier(table.get("classifier"), define)
         presets = self._presets(table.get("presets", {}), parameters, values, head["source"])
+        trees = {"define": define, "equations": equations, "quantities": quantities}
+        is_map = self._is_map(table.get("kind", "flow"), trees, impacts, mirror)
         if self.problems:
             return None
         return Definition(
             **head,
+            is_map=is_map,
             states=states,
             parameters=parameters,
             define=define,
@@ -143,6 +149,24 @@ class _Reading(ViewsReader):
         plain = name.replace("-", "").replace("_", "")
         if given and not (plain.isascii() and plain.isalnum() and len(name) <= 60 and name[0].isalpha()):
             self.report(self.at("name"), f"{shown(name)} must be a letter, then letters, digits, - and _, 60 at most.")
+
+    def _is_map(
+        self, kind: Any, tables: Mapping[str, Mapping[str, Tree]], impacts: tuple[Impact, ...], mirror: Mirror | None
+    ) -> bool:
+        """Return whether the key ``kind`` says that the model is a map; report what a map cannot have."""
+        if kind not in KINDS:
+            self.report(self.at("kind"), f"{shown(kind)} must be one of {', '.join(KINDS)}.")
+        if kind != "map":
+            return False
+        for key, trees in tables.items():
+            for name, tree in trees.items():
+                for timed in [n for n, _ in names(tree) if n in ("t", "f", "phase")][:1]:
+                    self.report(self.at(key, name), f"needs {timed!r}; a map has no time: count iterations by a state.")
+        if impacts:
+            self.report(self.at("impacts"), 'a map has none between its iterations; write "where" in its equations.')
+        if mirror is not None and mirror.half_period:
+            self.report(self.at("mirror.half_period"), "a map has no drive; leave it out.")
+        return True
 
     def _new_name(self, name: str, place: str, kind: str) -> bool:
         if name in OF_RUNS:

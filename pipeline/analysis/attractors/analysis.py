@@ -29,7 +29,7 @@ from pipeline.analysis.tabular import (
     with_interval,
     words_of,
 )
-from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims, time_unit
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions
 from pipeline.products.product import Table
 
@@ -65,6 +65,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
     dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     attracting = np.unique(ds["attractor"].values[ds["stability"].values == ATTRACTS])
+    unit = time_unit(model_of(ds))
     n, others = attracting.size, int(ds.attrs[N_IDS]) - attracting.size
     lines = [f"{counted(n, 'attractor')} at {counted(n_points, 'parameter point')}"]
     if others:
@@ -75,7 +76,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
     else:
         for _, where in points_of(ds, dims):
             shown, more = _largest([row for row in rows if all(row[k] == v for k, v in where.items())])
-            lines += [*point_table(ds, where, shown, lambda row: _attractor_words(row, n_points)), *more]
+            lines += [*point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, unit)), *more]
     return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
 
 
@@ -162,12 +163,12 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
     out.
     """
-    lines = []
+    lines, what = [], "the map" if model_of(ds).is_map else "the flow"
     if any(row["evidence"] == "volume" for row in rows):
         if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
-            lines.append("the flow preserves volume on some sets: none of them attracts")
+            lines.append(f"{what} preserves volume on some sets: none of them attracts")
         else:
-            lines.append("the flow preserves volume: a conservative system has no attractors")
+            lines.append(f"{what} preserves volume: a conservative system has no attractors")
     above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
     longest = int(ds.attrs.get("identify_max_orbit_period", 0))
     unsettled = [row for row in rows if row["stability"] == "not_settled"]
@@ -195,7 +196,7 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _attractor_words(row: Row, n_points: int) -> Words:
+def _attractor_words(row: Row, n_points: int, unit: str) -> Words:
     turns = [f"{round(v, 3) + 0.0:.3f}" for k, v in row.items() if k.startswith("rotation_")]
     decided = [f"{n} {plain(k.removeprefix('by_'))}" for k, n in row.items() if k.startswith("by_") and n]
     flow = "eigenvalue_real" in row  # returns of a flow differ in length
@@ -210,7 +211,7 @@ def _attractor_words(row: Row, n_points: int) -> Words:
         "rotation": " ".join(turns) or None,
         "|multiplier|": number(row["multiplier_modulus"], ".4g" if flow else ".4f"),
         "eigenvalue": _eigenvalue(row) if flow else None,
-        "exponent per s": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
+        f"exponent per {unit}": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
         "cells": str(row["n_cells"]),
         "share": with_interval(row, FRACTION, ".4f") if "fraction" in row else None,
         "mirror": _known(row["mirror_partner"]) if "mirror_partner" in row else None,

@@ -30,7 +30,7 @@ from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGEN
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
-from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, samples_per_period
 
 ENERGY = "energy"
 """Name of the model's quantity whose range is computed for each attractor."""
@@ -186,7 +186,8 @@ def follow_orbits(orbits: Sequence[tuple[Features, Parameters, float]], geometry
 
 def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry) -> None:
     flows = [of_flow(parameters) for _, parameters, _ in orbits]
-    times = [np.arange(period * SAMPLES + 1) / (SAMPLES * frequency) for _, _, frequency in orbits]
+    per = samples_per_period(flows[0].model, SAMPLES)
+    times = [np.arange(period * per + 1) / (per * frequency) for _, _, frequency in orbits]
     paths = sample(
         flows[0].model.system,
         np.array([flow.pack() for flow in flows]),
@@ -212,7 +213,7 @@ def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, g
         mirror = parameters.model.mirror
         if mirror is not None:
             first = SAMPLES // 2 if mirror.half_period else 0
-            found.image = paths.states[row, first : period * SAMPLES : SAMPLES] * np.array(mirror.signs)
+            found.image = paths.states[row, first : period * per : per] * np.array(mirror.signs)
 
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:

@@ -39,7 +39,7 @@ def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
     """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
     from pipeline.specification.problems import SpecError
 
-    if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
+    if axis_name(parameter) == FREQUENCY_DIM and run.model.clock_hz is not None:
         swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
         raise SpecError(f"{run.model.name} has no drive frequency to follow; give --parameter: {known}.")
@@ -200,7 +200,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
                 "normal_form_error": float(one["normal_form_error"]),
                 "unstable_below": below,
                 "unstable_above": above,
-                "period_s": float(one["bifurcation_period_s"]),
+                **({} if model_of(ds).is_map else {"period_s": float(one["bifurcation_period_s"])}),
                 **fixed_of(ds, branch),
                 "branch": branch,
                 "to_branch": int(one["to_branch"]),

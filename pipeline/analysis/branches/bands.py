@@ -235,8 +235,8 @@ def _draws(run: OpenRun, options: BandOptions) -> xr.Dataset:
 
 def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along:
     varying = [str(n) for n in located.data_vars if located[n].attrs.get("long_name", "") == f"value of {n}"]
-    frequency = base.model.crossing.frequency_hz if base.model.crossing is not None else np.nan
-    if base.model.crossing is None and axis_name(options.parameter) != FREQUENCY and FREQUENCY in located:
+    frequency = np.nan if base.model.clock_hz is None else base.model.clock_hz
+    if base.model.clock_hz is None and axis_name(options.parameter) != FREQUENCY and FREQUENCY in located:
         rates = np.unique(located[FREQUENCY].values)
         varying += [FREQUENCY] if len(rates) > 1 else []
         frequency = float(rates[0]) if len(rates) else np.nan

@@ -210,7 +210,7 @@ def _per_branch(
         "first_end": _column(first, "int8", "why it begins", **code_flags(ENDS)),
         "last_end": _column(last, "int8", "why it ends", **code_flags(ENDS)),
     }
-    if model is None or model.crossing is None:
+    if model is None or model.clock_hz is None:
         about = "drive frequency, NaN if it varies"
         columns[FREQUENCY] = _column(frequencies, "float64", about, units="Hz")
     found: dict[str, Any] = {name: ("branch", *column) for name, column in columns.items()}
@@ -301,8 +301,8 @@ def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
 
 def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
     family = branch.family
-    if not family.period:
-        return _rest_sides(branch, base, classifier)
+    if not family.period or base.model.is_map:
+        return _point_sides(branch, base, classifier)
     own = base.replace(**dict(zip(base.names, map(float, family.parameters), strict=True)))
     name, flow = family.free[0], of_flow(own).model.system
     angles = np.flatnonzero(family.system.is_angle)
@@ -327,13 +327,15 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
     return np.array(codes, np.int8)
 
 
-def _rest_sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
+def _point_sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
+    """Return the classes of motion of equilibria, and of orbits of a map, from their points alone."""
     name, n_angles = branch.family.free[0], sum(branch.family.system.is_angle)
     own = base.replace(**dict(zip(base.names, map(float, branch.family.parameters), strict=True)))
     codes = []
     for point in branch.points:
         values = own.replace(**{name: float(branch.family.values(point.u)[0])})
-        states = np.repeat(branch.family.state(point.u)[None], 2, axis=0)
+        own_points = point.value.images if branch.family.period else branch.family.state(point.u)[None]
+        states = np.repeat(own_points, 2, axis=0)
         codes.append(classifier.classify(states, np.zeros(n_angles, np.int64), _SEEN_WHOLE, _values(values)))
     return np.array(codes, np.int8)
 

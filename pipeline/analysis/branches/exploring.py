@@ -209,7 +209,8 @@ def _half_orbit(branch: Branch, which: int) -> Start:
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies."""
     worse_above = (at.n_unstable_after > at.n_unstable_before) == at.rises_before
-    inner = child.points[end + 3 if end == 0 else end - 3]
+    reach = min(4, len(child.points))  # a branch that leaves the interval soon is short
+    inner = child.points[reach - 1 if end == 0 else -reach]
     return "supercritical" if (inner.u[-1] > at.point.u[-1]) == worse_above else "subcritical"
 
 

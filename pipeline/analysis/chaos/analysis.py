@@ -42,7 +42,7 @@ from pipeline.analysis.tabular import (
     with_interval,
 )
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, split_dims
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, model_of, period_of, split_dims, time_unit
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.product import Table
 
@@ -98,8 +98,9 @@ def chaos_table(ds: xr.Dataset) -> Table:
     if n_points > FEW_POINTS:
         lines += _summary(ds, rows, dims)
     else:
+        unit = time_unit(model_of(ds))
         for _, where in points_of(ds, dims):
-            lines += point_table(ds, where, rows, _words)
+            lines += point_table(ds, where, rows, lambda row: _words(row, unit))
     lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
     return Table(rows, lines)
 
@@ -128,7 +129,7 @@ def _spectrum(one: xr.Dataset) -> Row:
     return row
 
 
-def _words(row: Row) -> Words:
+def _words(row: Row, unit: str) -> Words:
     return {
         "id": str(row["attractor_id"]),
         "kind": plain(row["kind"]),
@@ -137,7 +138,7 @@ def _words(row: Row) -> Words:
         "period": str(row["orbit_period"] or "-"),
         "cells": str(row["n_cells"]),
         "share": f"{row['share']:.3f}",
-        "exponents per s": _exponents(row),
+        f"exponents per {unit}": _exponents(row),
         "|multipliers|": _multipliers(row),
         "Kaplan-Yorke": with_error(row["kaplan_yorke"], row["kaplan_yorke_stderr"]),
         "correlation": with_error(row["correlation"], row["correlation_stderr"]),
@@ -194,8 +195,9 @@ def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[
     period = with_error(row["lyapunov_1_per_period"], row["lyapunov_1_stderr_per_period"])
     place = ", ".join(f"{d} {row[d]:g}{unit_of(ds, d)}" for d in dims)
     who = f"attractor {row['attractor_id']}, {_nature_words(row)}"
-    each = f", {period} per drive period" if period != "-" else ""
-    return [f"  largest exponent: {rate} per s{each}, {who}, at {place}"]
+    unit = time_unit(model_of(ds))
+    each = f", {period} per {period_of(model_of(ds))}" if period != "-" and unit == "s" else ""
+    return [f"  largest exponent: {rate} per {unit}{each}, {who}, at {place}"]
 
 
 # ---- correlation dimension ---------------------------------------------------------------------

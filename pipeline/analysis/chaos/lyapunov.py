@@ -16,7 +16,7 @@ import xarray as xr
 
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import hertz_of
-from pipeline.layout.vocabulary import PERIODIC
+from pipeline.layout.vocabulary import PERIODIC, model_of
 from pipeline.products.lyapunov import LyapunovFlag
 
 Floats = npt.NDArray[np.float64]
@@ -107,7 +107,11 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
 
 
 def period_seconds(ds: xr.Dataset) -> xr.DataArray:
-    """Return the time between successive section points [s]: the drive period, or each cell's mean return time."""
+    """Return the time between successive section points [s]: the drive period, each cell's mean return time, or 1 of
+    a map.
+    """
+    if "model" in ds.attrs and model_of(ds).is_map:
+        return xr.DataArray(1.0)
     if "return_time" in ds:
         return ds["return_time"].mean("period_index")
     frequency = hertz_of(ds)

@@ -70,6 +70,7 @@ from pipeline.layout.vocabulary import (
     letter,
     model_of,
     periods_of,
+    samples_per_period,
     section_attributes,
     split_dims,
     told_by,
@@ -360,8 +361,9 @@ def _head(ds: xr.Dataset) -> str:
     scales = zip(ds["state"].values, ds["state_scale"].values, strict=True)
     units = ", ".join(f"{name} {scale:g}" for name, scale in scales)
     periods = periods_of(model_of(ds))
+    n_phases = samples_per_period(model_of(ds), int(ds.attrs["resilience_phases"]))
     return (
-        f"shocks of {ds.attrs['resilience_states']} at {ds.attrs['resilience_phases']} phases, distances of all "
+        f"shocks of {ds.attrs['resilience_states']} at {n_phases} phase{'s' * (n_phases > 1)}, distances of all "
         f"states; sizes: {norm} of the jumps over their scales ({units}); times in {periods}"
     )
 

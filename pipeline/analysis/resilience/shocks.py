@@ -31,7 +31,7 @@ from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.together import run_together
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
-from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, samples_per_period
 from pipeline.products.reporting import report
 
 Norm = Literal["euclidean", "largest"]
@@ -415,7 +415,7 @@ def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases
         points = points[:MOST_POINTS]
         return Bases(points, np.zeros(len(points)), np.ones(len(points), bool))
     n = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else MOST_POINTS
-    return _sampled(parameters, points[:n], 1.0 / frequency, n_phases)
+    return _sampled(parameters, points[:n], 1.0 / frequency, samples_per_period(parameters.model, n_phases))
 
 
 def _sampled(parameters: Parameters, points: np.ndarray, period: float, n_phases: int) -> Bases:

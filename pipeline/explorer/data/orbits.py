@@ -20,7 +20,17 @@ from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BRANCH,
+    EVIDENCE,
+    KINDS,
+    PENDING,
+    STABILITIES,
+    UNSTABLE,
+    grid_dim,
+    samples_per_period,
+)
 from pipeline.plots.palette import motion_codes, motions_of
 from pipeline.store.run import RunDirectory
 
@@ -101,7 +111,7 @@ def orbit_series(
     atol: float = 1e-9,
 ) -> dict[str, np.ndarray]:
     """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
-    n = max(1, min(n_periods * SAMPLES, 65_536))
+    n = max(1, min(n_periods * samples_per_period(parameters.model, SAMPLES), 65_536))
     times = seconds * np.arange(n + 1) / n
     return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)
 
@@ -250,12 +260,11 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
     exponents, source = _exponents(cell, multipliers, seconds)
     names = motions_of(run.cube())
     code = int(motion_codes(cell.data))
-    autonomous = run.model.crossing is not None
     return {
         "cell": cell.number,
         "at": {a.name: cell.index.get(a.name, 0) for a in run.axes},
         "parameters": cell.parameters.as_dict(),
-        "frequency": None if autonomous else cell.clock_hz,
+        "frequency": cell.clock_hz if run.model.clock_hz is None else None,
         "status": cell.status.name.lower().replace("_", " "),
         "status_meaning": cell.status.sentence,
         "motion": names.words[code] if names.told and code > 0 else None,

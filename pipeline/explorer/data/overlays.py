@@ -33,6 +33,7 @@ from pipeline.layout.vocabulary import (
     letter,
     model_of,
     periods_of,
+    time_unit,
 )
 from pipeline.plots import palette
 from pipeline.plots.branches import NAMES, pieces
@@ -83,7 +84,7 @@ def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Itera
         yield {
             "name": f"lyapunov{k + 1}",
             "title": f"Lyapunov exponent {k + 1}, mean over the starts",
-            "unit": "1/s",
+            "unit": f"1/{time_unit(run.model)}",
             "group": "exponents",
             "colour": rgb(EXPONENT_COLOURS[k % len(EXPONENT_COLOURS)]),
             **{
@@ -112,7 +113,7 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
             yield {
                 "name": f"exponent {letter(number)}",
                 "title": f"largest exponent of {name}",
-                "unit": "1/s",
+                "unit": f"1/{time_unit(run.model)}",
                 "group": "exponents",
                 "colour": colour,
                 "attractor": number,

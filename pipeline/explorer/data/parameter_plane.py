@@ -139,7 +139,7 @@ def _attrs(
     return {
         **unknown,
         "parameters": parameters.as_dict(),
-        "frequency": clock_hz if run.model.crossing is None else None,
+        "frequency": clock_hz if run.model.clock_hz is None else None,
         "status": "periodic",
         "status_meaning": f"an orbit on a curve of bifurcations: {kind}",
         "kind": f"{kind}, period {period}",

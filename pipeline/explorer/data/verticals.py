@@ -154,9 +154,7 @@ def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, f
     changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
     own = run.parameters
     packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)
-    crossing, fixed = run.model.crossing, run.spec.frequency_hz
-    if crossing is not None:
-        return packed, crossing.frequency_hz
+    fixed = run.spec.frequency_hz
     return packed, values[FREQUENCY_DIM] if FREQUENCY_DIM in values else float(fixed or 1.0)
 
 

@@ -15,7 +15,16 @@ from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import Axis, ExploredRun
 from pipeline.explorer.data.orbits import fixed_points
 from pipeline.explorer.data.verticals import plain, verticals
-from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim, period_of, section_name
+from pipeline.layout.vocabulary import (
+    DIVERGED,
+    FAILED,
+    FREQUENCY_DIM,
+    PENDING,
+    grid_dim,
+    period_of,
+    section_name,
+    time_unit,
+)
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError
@@ -97,7 +106,8 @@ def _model(run: ExploredRun) -> dict[str, Any]:
         "title": model.title,
         "section": _section(model),
         "period": period_of(model),
-        "forced": not model.autonomous,
+        "time": time_unit(model),
+        "forced": not (model.autonomous or model.is_map),
         "states": [_named(s, s.on_circle, s.scale, s.rate or None) for s in model.states],
         "quantities": [_named(q, False, 1.0, None) for q in model.quantities],
         "parameters": [_parameter(run, p) for p in model.parameters],

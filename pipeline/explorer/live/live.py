@@ -242,9 +242,8 @@ class LiveRun:
         return Place(parameters, hertz, index)
 
     def _frequency(self, given: float | None) -> float:
-        crossing = self.model.crossing
-        if crossing is not None:
-            return crossing.frequency_hz
+        if self.model.clock_hz is not None:
+            return self.model.clock_hz
         axis = self.spec.axes.get(FREQUENCY)
         own = self.spec.frequency_hz
         if given is None:
@@ -339,7 +338,7 @@ class LiveRun:
         block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
         inputs = cells.inputs(block)
         values = dict(zip(self.spec.values.names, map(float, inputs.parameters[0, 0]), strict=True))
-        frequency = None if self.model.crossing is not None else float(inputs.frequency_hz[0, 0])
+        frequency = None if self.model.clock_hz is not None else float(inputs.frequency_hz[0, 0])
         return self.place(values, frequency), inputs.initial_states[0]
 
 
@@ -400,7 +399,8 @@ class Warming:
         live = self._live
         place, start = live.first_start()
         rtol, atol = live.integration.rtol, live.integration.atol
-        orbit_series(place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol)
+        seconds = 1.0 if live.model.is_map else 0.01 / place.frequency
+        orbit_series(place.parameters, place.frequency, start, 1, seconds, rtol=rtol, atol=atol)
 
     def _maps(self) -> None:
         place, start = self._live.first_start()

@@ -146,7 +146,7 @@ class Follower:
     def _place_at(self, place: Place, name: str, value: float) -> Place:
         if name == FREQUENCY:
             return self._live.place(place.parameters, value)
-        frequency = None if self._live.model.crossing is not None else place.frequency
+        frequency = None if self._live.model.clock_hz is not None else place.frequency
         return self._live.place({**place.parameters, name: value}, frequency)
 
     def _family(self, held: Held, name: str, target: float) -> Family:
@@ -290,7 +290,7 @@ def described(
     attrs: dict[str, Any] = {
         "cell": None,
         "parameters": {k: v for k, v in place.parameters.items()},
-        "frequency": None if is_flow else place.frequency,
+        "frequency": place.frequency if model.clock_hz is None else None,
         "status": Status.PERIODIC.name.lower(),
         "period": family.period,
         "seconds": seconds,

@@ -98,6 +98,10 @@ def _flutter(t, y, p):
     return np.concatenate([rate, np.linalg.solve(mass, -damping @ rate - stiffness @ v - spring)])
 
 
+def _henon(t, y, p):
+    return [1.0 - p["a"] * y[0] ** 2 + y[1], p["b"] * y[0]]
+
+
 FLUTTER = {
     **{"U": 16.0, "kh": 3529.4, "kh3": 0.0, "ch": 14.5756, "ka": 54.1162, "ka2": 751.6, "ka3": 5006.7, "ka4": 0.0},
     **{"ka5": 0.0, "ca": 0.5628, "Ia": 0.1724, "xa": 0.24, "mw": 5.3, "mT": 16.9, "b": 0.15, "a": -0.5, "rho": 1.204},
@@ -115,6 +119,7 @@ EQUATIONS = {
     "forced-van-der-pol": (_forced_van_der_pol, {"mu": 1.0, "A": 0.4}),
     "rossler": (_rossler, {"a": 0.2, "b": 0.2, "c": 5.7}),
     "flutter": (_flutter, FLUTTER),
+    "henon": (_henon, {"a": 1.4, "b": 0.3}),
     "lorenz": (_lorenz, {"sigma": 10.0, "rho": 28.0, "beta": 8.0 / 3.0}),
 }
 """Right-hand sides written down once more, at 1 rad/s, and the published parameters."""

@@ -274,7 +274,8 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
         return None
     flow_of, rate = of_flow(point.parameters), LEG / seconds
     for n in STRETCHES:
-        times = np.linspace(0.0, n * seconds, n * SAMPLES)
+        whole = point.parameters.model.is_map
+        times = np.arange(n * seconds + 1.0) if whole else np.linspace(0.0, n * seconds, n * SAMPLES)
         paths = [
             trajectory(flow_of, rate, states[i], times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL)
             for i in [0, *(kept + 1)]

@@ -35,7 +35,7 @@ export function stabilityOf({ attrs, stable }) {
 function rows(orbit, view) {
   const { attrs } = orbit, found = [];
   const stability = stabilityOf(orbit), attracts = !attrs.stability || attrs.stability === "attracts";
-  const unit = view.model.forced ? (attrs.period === 1 ? "drive period" : "drive periods") : (attrs.period === 1 ? "return" : "returns");
+  const unit = `${view.model.period}${attrs.period === 1 ? "" : "s"}`;
   if (attrs.period) found.push(["Period", `${attrs.period} ${unit}`]);
   else if (attrs.period === null) found.push(["Period", "none found"]);
   if (attrs.kind) found.push(["Kind", attrs.kind]);
@@ -47,7 +47,7 @@ function rows(orbit, view) {
   if (told) found.push(["Share of the starts", told]);
   if (attrs.exponents?.length) {
     const from = attrs.exponents_from ? ` (from the ${attrs.exponents_from})` : "";
-    found.push(["Lyapunov exponents [1/s]", attrs.exponents.map((value) => number(value, 3)).join(", ") + from]);
+    found.push([`Lyapunov exponents [1/${view.model.time}]`, attrs.exponents.map((value) => number(value, 3)).join(", ") + from]);
   }
   return found;
 }

@@ -1,0 +1,169 @@
+"""Runs of maps: bifurcations against closed forms, and tables and figures that count iterations."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+import magpend
+from pipeline.runs.derive import derive
+from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
+from tests.pipeline.factories import finished
+
+pytestmark = pytest.mark.slow
+
+HENON = """
+kind = "sweep"
+model = "henon"
+axes.a = { values = [-0.1, 0.1, 0.31, 0.5, 0.95] }
+initial_conditions = { kind = "list", points = [[0.1, 0.1], [0.0, 0.0]] }
+integration = { n_transient = 400, n_keep = 40 }
+products.lyapunov = { n_periods = 64, n_blocks = 4 }
+"""
+DELAYED = """
+kind = "sweep"
+axes.a = { values = [1.7, 1.8, 1.9] }
+initial_conditions = { kind = "list", points = [[0.3, 0.3]] }
+integration = { n_transient = 600, n_keep = 40 }
+
+[model]
+name = "delayed"
+kind = "map"
+states = { x = {}, y = {} }
+parameters = { a = 2.0 }
+equations = { x = "a*x*(1 - y)", y = "x" }
+"""
+BALL = """
+kind = "sweep"
+axes.gamma = { values = [3.5, 3.7] }
+initial_conditions = { kind = "grid", phi = { start = -3.0, stop = 3.0, num = 12 }, v = { values = [6.0, 6.4] } }
+integration = { n_transient = 1500, n_keep = 40 }
+
+[model]
+name = "ball"
+kind = "map"
+states = { phi = { unit = "rad", on_circle = true }, v = {} }
+parameters = { alpha = 0.5, gamma = 3.5 }
+define = { next = "phi + v" }
+equations = { phi = "next", v = "alpha*v - gamma*cos(next)" }
+"""
+"""Bouncing ball: Holmes, J. Sound Vib. 84 (1982) 173-189, the high-bounce map."""
+
+LOGISTIC = magpend.model("x' = r*x*(1 - x)", kind="map", r=3.2)
+
+
+def located(run, low, high, parameter, **options):
+    """Return the located bifurcations as rows: parameter value, type, period and critical multiplier."""
+    ds = derive(run, "branches", {"parameter": parameter, "low": low, "high": high, **options})
+    rows = zip(
+        ds["value"].values,
+        [str(kind) for kind in np.array(ds["kind"].attrs["flag_meanings"].split())[ds["kind"].values]],
+        ds["orbit_period"].values[ds["of_branch"].values],
+        ds["critical_real"].values + 1j * ds["critical_imag"].values,
+        strict=True,
+    )
+    return sorted((float(v), k, int(p), complex(m)) for v, k, p, m in rows)
+
+
+@pytest.fixture(scope="module")
+def henon(tmp_path_factory):
+    return finished(tmp_path_factory.mktemp("henon"), HENON)
+
+
+def test_henon__fold_and_doublings(henon):
+    """With b = .3: fold at -(1 - b)**2/4; doublings at 3 (1 - b)**2/4, and at (1 - b)**2 + (1 + b)**2/4 of period 2."""
+    found = [row for row in located(henon, -0.2, 0.95, "a") if row[2] < 4]
+    wanted = [(-0.1225, "fold", 1), (0.3675, "period_doubling", 1), (0.9125, "period_doubling", 2)]
+    assert [row[1:3] for row in found] == [row[1:] for row in wanted]
+    assert [row[0] for row in found] == pytest.approx([row[0] for row in wanted], abs=1e-10)
+
+
+def test_delayed_logistic__neimark_sacker(tmp_path):
+    """At a = 2, with multipliers exp(+-i pi/3)."""
+    ((value, kind, period, multiplier),) = located(finished(tmp_path, DELAYED), 1.7, 2.1, "a")
+    assert (kind, period) == ("neimark_sacker", 1)
+    assert value == pytest.approx(2.0, abs=1e-10)
+    assert abs(np.angle(multiplier)) == pytest.approx(np.pi / 3.0, abs=1e-9)
+
+
+def test_bouncing_ball__fold_and_doubling(tmp_path):
+    """Of one bounce per turn of the table: cos phi = -2 pi (1 - alpha)/gamma; fold where that is -1, doubling where
+    gamma**2 = (2 pi (1 - alpha))**2 + 4 (1 + alpha)**2.
+    """
+    run = finished(tmp_path, BALL)
+    folds = [row[0] for row in located(run, 3.0, 4.5, "gamma", max_period=1) if row[1] == "fold"]
+    doublings = [row[0] for row in located(run, 3.0, 4.5, "gamma", max_period=1) if row[1] == "period_doubling"]
+    assert folds == pytest.approx([np.pi], abs=1e-10)
+    assert doublings[:1] == pytest.approx([np.hypot(np.pi, 3.0)], abs=1e-10)
+
+
+def test_logistic__cascade(tmp_path):
+    """Doublings at 3 and 1 + sqrt(6); their limit, by Aitken's rule from the last three, is 3.569945672."""
+    spec = (
+        Spec("sweep", LOGISTIC)
+        .with_axis("r", values=[2.9, 3.2, 3.5, 3.55, 3.566, 3.5693, 3.56976])
+        .with_start_list([[0.3]])
+        .with_integration(n_transient=6000, n_keep=300, max_orbit_period=64)
+    )
+    rows = located(magpend.run(spec, tmp_path / "run", workers=0), 2.9, 3.5699, "r", max_period=64)
+    doublings = [value for value, kind, _, _ in rows if kind == "period_doubling"]
+    assert [row[2] for row in rows if row[1] == "period_doubling"] == [2**k for k in range(len(doublings))]
+    assert doublings[:2] == pytest.approx([3.0, 1.0 + np.sqrt(6.0)], abs=1e-10)
+    assert len(doublings) >= 6
+    a, b, c = doublings[-3:]
+    assert c - (c - b) ** 2 / ((c - b) - (b - a)) == pytest.approx(3.569945672, abs=1e-6)
+
+
+def texts(panels):
+    return " ".join(text.get_text() for text in np.atleast_1d(panels)[0].figure.findobj(Text))
+
+
+def test_words__count_iterations(henon, command, tmp_path):
+    """Neither table nor figure of a map names seconds, hertz or a drive."""
+    run = magpend.Run.open(henon)
+    cube = run.cube()
+    assert "frequency" not in cube.coords
+    assert cube["lyapunov"].attrs["units"] == "1"
+    assert "iteration" in cube["lyapunov"].attrs["long_name"]
+    said = [command(tmp_path, "analyse", name, henon)[0] for name in ("attractors", "chaos", "branches")]
+    said += [texts(getattr(run.plot, name)()) for name in ("lyapunov", "bifurcation", "branches")]
+    said += [texts(run.plot.convergence(at={"a": 0.5}))]
+    said += [" ".join(map(str, json.loads(command(tmp_path, "analyse", "branches", henon, "--json")[0])[0]))]
+    for text in said:
+        assert not {"Hz", "drive", "second", "seconds", "period_s", "[1/s]"} & set(text.split())
+    assert "exponents per iteration" in said[1]
+    assert "[1/iteration]" in said[3]
+    assert "[1/iteration]" in said[6]
+
+
+def test_refusals__one_sentence_each(henon, tmp_path, command):
+    for words in (("simulate", "--model", "henon"), ("animate", henon), ("plot", "gallery", henon, "--at", "a=0.5")):
+        with pytest.raises(AssertionError, match="henon is a map"):
+            command(tmp_path, *words)
+    with pytest.raises(SpecError, match="response follows the motion over a period"):
+        derive(henon, "response", {})
+    tables = {
+        "section": {"of": "x"},
+        "noise": {"strengths": {"x": 0.1}},
+        "drift": {"b": {"from": 0.2, "to": 0.3, "start_periods": 4, "duration_periods": 3}},
+        "parameters": {"frequency_hz": 2.0},
+        "integration": {"rtol": 1e-6, "max_steps_per_period": 7},
+        "products": {"extremes": {"quantities": ["x"]}},
+    }
+    spec = {"kind": "sweep", "model": "henon", "initial_conditions": {"kind": "list", "points": [[0.1, 0.1]]}, **tables}
+    with pytest.raises(SpecError) as raised:
+        Spec.parse(spec)
+    keys = {problem.partition(":")[0] for problem in raised.value.problems}
+    assert keys == {
+        "section",
+        "noise",
+        "drift",
+        "parameters.frequency_hz",
+        "integration.rtol",
+        "integration.max_steps_per_period",
+        "products.extremes",
+    }
