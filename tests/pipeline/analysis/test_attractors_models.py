@@ -58,6 +58,14 @@ def test_attractors__of_a_run_without_a_swept_parameter_have_exponents(tmp_path)
     assert found["lyapunov_max"].item() == pytest.approx(0.1034, abs=0.01)
 
 
+def test_attractors__of_two_sections_that_do_not_close_yet(tmp_path):
+    """A damped oscillator of which each cell keeps two points; the tail decided on an empty half."""
+    spec = magpend.Spec("sweep", "x'' = cos(omega*t) - 0.2*x' - 2*x").with_parameters(omega=1.0)
+    spec = spec.with_start_random(n=4, x=(-3.0, 3.0), x_dot=(-3.0, 3.0)).with_integration(n_transient=10, n_keep=2)
+    found = magpend.run(spec, tmp_path / "linear", workers=0).attractors()
+    assert found["orbit_period"].values.tolist() == [1]
+
+
 @pytest.mark.slow
 def test_identify__chaos_without_angles(chaotic, strange):
     """Grouping sets took the largest difference of no rotations."""

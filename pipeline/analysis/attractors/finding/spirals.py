@@ -164,8 +164,9 @@ def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry) -> np
     for p in np.unique(found.period[found.period > 0]).tolist():
         rows = np.flatnonzero(found.period == p)
         lag = geometry.distance(section[rows, p:], section[rows, :-p])
-        early, late = lag[:, : half - p // 2].max(axis=1), lag[:, half - p // 2 :].max(axis=1)
-        closes[rows] |= late <= CLOSES_IN * early
+        middle = half - p // 2
+        if 0 < middle < lag.shape[1]:
+            closes[rows] |= lag[:, middle:].max(axis=1) <= CLOSES_IN * lag[:, :middle].max(axis=1)
     return np.asarray(closes)
 
 
