@@ -87,6 +87,7 @@ ANALYSES = {
     "manifolds": f"{SWEPT} --length 0.5 --chord 0.1",
     "tangency": f"{SWEPT} --parameter amplitude --from 0.3 --to 0.31 --length 0.5",
     "tongues": f"sweep {LINE} --second damping --second-from 0.2 --second-to 0.3 --denominator 1",
+    "events": "walk --period 1",
     "response": "walk --period 1",
     "backbone": "walk --undamped damping=0 --undamped amplitude=0",
     "curves": "walk --period 1 --second amplitude --second-from 0.25 --second-to 0.35",
@@ -114,6 +115,7 @@ FIGURES_OF = {
     "lyapunov": f"sweep {LINE}",
     "convergence": f"sweep {POINT}",
     "multipliers": "walk --period 1",
+    "genealogy": "walk --period 1",
     "drift": "ramp",
     "section": f"sweep {POINT}",
 }

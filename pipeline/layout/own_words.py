@@ -14,10 +14,15 @@ from pipeline.specification.tables import FREQUENCY, RATES
 RATE = "drive_rate"
 """Attribute with the word, if it is not ``frequency_hz``."""
 
-_FLIPPED = ("jump_rises", "rises_before", "rises_after")
+_FLIPPED = ("jump_rises", "rises_before", "rises_after", "rises")
 """Variables that tell whether the frequency rises: the period falls."""
 
-_ERRORS = {"bracket": "value", "special_first_error": "special_first", "special_second_error": "special_second"}
+_ERRORS = {
+    "bracket": "value",
+    "value_error": "value",
+    "special_first_error": "special_first",
+    "special_second_error": "special_second",
+}
 """Variables with the width of an interval of frequencies, and those with the frequency."""
 
 

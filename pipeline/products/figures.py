@@ -7,6 +7,7 @@ from typing import Literal
 from pipeline.products.backbone import BackboneOptions
 from pipeline.products.branches import BranchOptions, CurveOptions, TongueOptions
 from pipeline.products.chaos import DimensionOptions
+from pipeline.products.events import EventOptions
 from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, Options, StateOptions, option
@@ -107,6 +108,10 @@ class CurveFigureOptions(CurveOptions, FigureOptions):
 
     over: str = option("", "Run over both parameters whose map of regimes is drawn below.")
     show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
+
+
+class GenealogyOptions(EventOptions, FigureOptions):
+    """Options of a figure of the events of attractors."""
 
 
 class ResponseFigureOptions(ResponseOptions, FigureOptions):
@@ -293,6 +298,13 @@ CURVES = Figure(
     "Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.",
     CurveFigureOptions,
     "pipeline.plots.regimes:draw_curves",
+)
+
+GENEALOGY = Figure(
+    "genealogy",
+    "Draw the range of each attractor over the swept parameter as a bar, with the events at its ends.",
+    GenealogyOptions,
+    "pipeline.plots.genealogy:draw",
 )
 
 ROTATION = Figure(

@@ -67,6 +67,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "Chaos and spectra": {"chaos": ("chaos", ""), "dimension": ("chaos", ""), "spectrum": ("spectrum", "")},
         "Orbits and branches, stable or not": {
             "branches": ("branches", ""),
+            "events": ("events", "a sweep or continuation along one parameter"),
             "response": ("response", ""),
             "backbone": ("backbone", ""),
             "bands": ("branches", "a posterior of magpend identify"),
@@ -110,6 +111,7 @@ _FIGURES = {
         "branches": "",
         "multipliers": "",
         "curves": "",
+        "genealogy": _ONE,
         "response": "",
         "backbone": "",
         "rotation": f"{_ROTATION}, and {_ONE}, or {_TWO}",

@@ -47,10 +47,10 @@ def lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
     asked = [
         (i, branch.family, guess) for i, s in enumerate(starts) for branch in branches for guess in _near(s, branch)
     ]
-    there = run_together([_at_value(family, guess) for _, family, guess in asked])
+    there = run_together([at_value(family, guess) for _, family, guess in asked])
     candidates = [(i, point) for (i, _, _), point in zip(asked, there, strict=True) if point is not None]
     near = sorted({i for i, _ in candidates})
-    polished = run_together([_at_value(starts[i].family, starts[i].unknowns) for i in near])
+    polished = run_together([at_value(starts[i].family, starts[i].unknowns) for i in near])
     own = dict(zip(near, polished, strict=True))
     known = {i for i, point in candidates if _is_same(starts[i], own[i], point)}
     return [i in known for i in range(len(starts))]
@@ -60,13 +60,13 @@ def _is_same(start: Start, polished: Point | None, point: Point) -> bool:
     """Return whether an orbit, as given or refined to the residual of a branch, is one of a branch's orbits."""
     given = start.unknowns
     here = given if polished is None else polished.u
-    reach = SAME_ON_BRANCH + _error(point) + (0.0 if polished is None else _error(polished))
+    reach = SAME_ON_BRANCH + error_of(point) + (0.0 if polished is None else error_of(polished))
     if polished is not None and np.abs(polished.u - given).max() > GUESS:  # it left for another orbit
         here = given
     return min(float(np.abs(start.family.mismatch(here, x)).max()) for x in point.value.images) <= reach
 
 
-def _error(point: Point) -> float:
+def error_of(point: Point) -> float:
     """Bound the distance of a point from the exact orbit by its residual: near a bifurcation it is the residual's
     root.
     """
@@ -75,7 +75,8 @@ def _error(point: Point) -> float:
     return residual / max(least, np.sqrt(residual)) if residual > 0.0 else 0.0
 
 
-def _at_value(family: Family, guess: np.ndarray) -> Steps[Point | None]:
+def at_value(family: Family, guess: np.ndarray) -> Steps[Point | None]:
+    """Refine a guess of an orbit by Newton's method at its value of the parameter; None on failure."""
     normal = np.zeros(len(guess))
     normal[-1] = 1.0
     found = yield from correct(problem_of(family), guess, normal, Settings())

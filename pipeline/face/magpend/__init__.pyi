@@ -94,6 +94,7 @@ branches = Run.branches
 bands = Run.bands
 curves = Run.curves
 orbits = Run.orbits
+events = Run.events
 response = Run.response
 backbone = Run.backbone
 tongues = Run.tongues

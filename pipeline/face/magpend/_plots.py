@@ -38,6 +38,7 @@ class Plots:
     branches = OnePanel(options.BranchFigureOptions)
     multipliers = OnePanel(options.MultiplierOptions)
     curves = OnePanel(options.CurveFigureOptions)
+    genealogy = OnePanel(options.GenealogyOptions)
     rotation = OnePanel(FigureOptions)
     response = SeveralPanels(options.ResponseFigureOptions)
     backbone = OnePanel(options.BackboneFigureOptions)

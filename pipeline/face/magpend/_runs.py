@@ -12,6 +12,7 @@ from pipeline.products.backbone import BackboneOptions
 from pipeline.products.basins import BasinOptions
 from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions, TongueOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
+from pipeline.products.events import EventOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Options
@@ -76,6 +77,7 @@ class Run(RunDirectory):
     curves = AnalysisMethod(CurveOptions)
     orbits = AnalysisMethod(OrbitOptions)
     tongues = AnalysisMethod(TongueOptions)
+    events = AnalysisMethod(EventOptions)
     response = AnalysisMethod(ResponseOptions)
     backbone = AnalysisMethod(BackboneOptions)
     manifolds = AnalysisMethod(ManifoldOptions)

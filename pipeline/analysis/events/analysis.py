@@ -1,0 +1,394 @@
+"""Join attractors and branches to events."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Parameters
+from pipeline.analysis.attractors.matching import geometry_of
+from pipeline.analysis.branches.analysis import settle_branches, swept_axis
+from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
+from pipeline.analysis.events.cascades import CASCADE, Born, cascade_of, torus_of
+from pipeline.analysis.events.lines import Fate, Line, Orbit, at, follow, lines_of, places_of
+from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import isel, points_of_rows, rows_at
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.selection import choose, start_dims
+from pipeline.analysis.tabular import plain
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    EQUILIBRIUM,
+    FREQUENCY_DIM,
+    PERIODIC_ORBIT,
+    axis_name,
+    frequency_of,
+    letter,
+    parameter_name,
+    parameters_of,
+)
+from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.products.branches import BranchOptions
+from pipeline.products.events import EventOptions
+
+UNDECIDED, RANGE_END, LIVES_ON = "not_decided", "range_end", "lives_on"
+
+NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, CASCADE)
+"""Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""
+
+LOCATED = 1e-9
+"""Least error of a located bifurcation, as a share of the interval: integrations have the tolerance 1e-12."""
+
+_AT_EVEN_TIMES = "a limit cycle seen at even times has no branch; see it at crossings: [section] of a new run"
+
+
+def settle_events(run: OpenRun, options: EventOptions) -> EventOptions:
+    """Fill in the parameter interval; raise SpecError unless the run sweeps the parameter."""
+    from pipeline.specification.problems import SpecError
+
+    settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
+    axis = swept_axis(run, settled.parameter)
+    if axis is None:
+        raise SpecError(f"events lie along a swept parameter, and the run does not sweep {settled.parameter}.")
+    return settled
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Neighbouring parameter values at which an attractor has one kind and period."""
+
+    attractor: int
+    kind: int
+    period: int
+    places: tuple[int, int]  # numbers of its first and last value, in rising order
+    rows: tuple[int, int]  # its rows there
+
+
+@dataclass(frozen=True)
+class Event:
+    """An end of a stretch, or a change between two stretches of one attractor."""
+
+    stretch: Stretch
+    rises: bool
+    fate: Fate
+    what: str = UNDECIDED
+    error: float = np.nan
+    to: Mapping[int, int] = field(default_factory=dict)  # numbers of cells by the id on which they go on
+    n_cells: int = 0
+    after: Stretch | None = None  # the attractor beyond a change
+    born: Born | None = None  # evidence of a cascade
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Attractors along one axis, the located branches, and what both need."""
+
+    attractors: xr.Dataset
+    located: xr.Dataset
+    axis: str
+    base: Parameters
+    order: np.ndarray  # positions on the axis by rising value
+    lines: Sequence[Line]
+    names: Mapping[tuple[int, int], int] = field(default_factory=dict)  # ids of joined attractors, by place and id
+
+    @property
+    def along(self) -> np.ndarray:
+        """Values of the axis in rising order."""
+        return np.asarray(self.attractors[self.axis].values[self.order], np.float64)
+
+    @property
+    def scale(self) -> float:
+        """Length of the axis."""
+        return float(np.ptp(self.along))
+
+
+def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
+    """Name the events at the ends of all attractors of a run along a parameter."""
+    found, axis = run.derive("attractors"), axis_name(options.parameter)
+    located = run.derive("branches", **options.part(BranchOptions))
+    part = choose(found, options.at, (axis, *start_dims(found)), f"events lie along {parameter_name(axis)}")
+    inside = (part[axis].values >= options.low) & (part[axis].values <= options.high)
+    part = isel(part, {axis: np.flatnonzero(inside)})
+    base, geometry = parameters_of(run.cube()), geometry_of(found)
+    others = base.as_dict() | {parameter_name(str(k)): float(v) for k, v in part.coords.items() if not v.ndim}
+    others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
+    order = np.argsort(part[axis].values, kind="stable")
+    scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
+    stretches = _stretches(scene)
+    run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
+    stretches, fates, names = _joined(stretches, _fates(scene, stretches))
+    stretches.sort(key=lambda one: (one.attractor, one.places))
+    scene = replace(scene, names=names)
+    named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
+    named = [_aperiodic(scene, one, named) for one in named]
+    return _dataset(scene, stretches, _merged(named))
+
+
+def _scalars(part: xr.Dataset) -> list[tuple[str, float]]:
+    return [(str(k), v) for k, v in part.coords.items() if not v.ndim and np.issubdtype(v.dtype, np.number)]
+
+
+def _stretches(scene: Scene) -> list[Stretch]:
+    """Return the stretches of all attractors, by id and rising value."""
+    ds, rows = scene.attractors, rows_at(scene.attractors)
+    own = {name: ds[name].values for name in ("attractor", "kind", "orbit_period", "stability")}
+    found: dict[int, list[Stretch]] = {}
+    for place, index in enumerate(scene.order.tolist()):
+        for row in rows[(index,)]:
+            if own["stability"][row] != ATTRACTS:
+                continue
+            number, kind, period = (int(own[name][row]) for name in ("attractor", "kind", "orbit_period"))
+            of_id = found.setdefault(number, [])
+            one = Stretch(number, kind, period, (place, place), (row, row))
+            if of_id and of_id[-1].places[1] == place - 1 and (of_id[-1].kind, of_id[-1].period) == (kind, period):
+                last = of_id.pop()
+                one = replace(last, places=(last.places[0], place), rows=(last.rows[0], row))
+            of_id.append(one)
+    return [one for number in sorted(found) for one in found[number]]
+
+
+Fates = dict[tuple[Stretch, bool], tuple[Fate, Fate]]
+"""Fates of the orbits at the first (False) and the last value of stretches, as the parameter falls and rises."""
+
+
+def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
+    """Follow the orbits at both ends of each stretch along their branches."""
+    ds, points = scene.attractors, points_of_rows(scene.attractors)
+    fates: Fates = {}
+    asked, orbits = [], []
+    for one in stretches:
+        for rises in (False, True):
+            row, place = one.rows[rises], one.places[rises]
+            why = ""
+            if not one.period and one.kind != EQUILIBRIUM:
+                why = _AT_EVEN_TIMES if one.kind == PERIODIC_ORBIT else "no orbit to follow"
+            elif not ds["is_polished"].values[row]:
+                why = "Newton's method found no orbit there"
+            if why:
+                fates[one, rises] = (Fate(np.nan, why=why),) * 2
+                continue
+            frequency, packed = parameters_at(ds.isel({scene.axis: int(scene.order[place])}), scene.base)
+            family = family_of(scene.base.model.system, one.period, frequency, packed, scene.axis, scene.scale)
+            asked.append((one, rises))
+            orbits.append(Orbit(family, points[row][0], value_of(family, frequency, packed)))
+    for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
+        if found is None:
+            fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
+        else:
+            fates[key] = follow(scene.located, found, -1), follow(scene.located, found, 1)
+    return fates
+
+
+def _joined(stretches: Sequence[Stretch], fates: Fates) -> tuple[list[Stretch], Fates, dict[tuple[int, int], int]]:
+    """Join stretches that lie on one stable piece of a branch: they are one attractor, also where no cell ends on it
+    in between, or where it has two ids, as ids of equilibria rest on distance.
+
+    Return also the id of the joined stretch by the place and the id of each one.
+    """
+    joined: list[Stretch] = []
+    names: dict[tuple[int, int], int] = {}
+    kept: Fates = {}
+    open_ends: dict[tuple[int, ...], int] = {}  # by piece, the stretch that reaches furthest
+    for one in sorted(stretches, key=lambda one: one.places):
+        left, right = (_piece(*fates[one, rises]) for rises in (False, True))
+        k = open_ends.get((*left, one.period), -1) if left else -1
+        if k >= 0 and joined[k].places[1] < one.places[0]:
+            before = joined[k]
+            whole = replace(before, places=(before.places[0], one.places[1]), rows=(before.rows[0], one.rows[1]))
+            kept[whole, False], kept[whole, True] = kept[before, False], fates[one, True]
+            joined[k] = whole
+        else:
+            kept[one, False], kept[one, True] = fates[one, False], fates[one, True]
+            joined.append(one)
+            k = len(joined) - 1
+        if right:
+            open_ends[(*right, one.period)] = k
+        names |= {(place, one.attractor): joined[k].attractor for place in range(one.places[0], one.places[1] + 1)}
+    return joined, kept, names
+
+
+def _piece(down: Fate, up: Fate) -> tuple[int, ...]:
+    """Return what tells a stable piece of a branch: the branch and the nodes at which it ends; empty if unknown."""
+    return (up.branch, *sorted((down.node, up.node))) if up.branch >= 0 else ()
+
+
+def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
+    """Name the end of a stretch by the fate of its orbit."""
+    place = one.places[rises]
+    beyond = place + (1 if rises else -1)
+    if not 0 <= beyond < len(scene.along):
+        return Event(one, rises, replace(fate, value=float(scene.along[place])), RANGE_END)
+    to, n_cells = _cells(scene, one.attractor, rises, place, beyond)
+    event = Event(one, rises, fate, to=to, n_cells=n_cells)
+    if fate.is_bound:
+        return replace(event, what=LIVES_ON)
+    if fate.bifurcation < 0:
+        return event
+    ds, k = scene.located, fate.bifurcation
+    sides = ds["n_unstable_before"].values[k], ds["n_unstable_after"].values[k]
+    if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
+        why = f"{fate.why} at {at(ds, fate.value)}, whose numbers of unstable multipliers contradict it"
+        return replace(event, fate=replace(fate, value=np.nan, bifurcation=-1, why=why))
+    error = max(float(ds["bracket"].values[k]), LOCATED * scene.scale)
+    return replace(event, what=KINDS[int(ds["kind"].values[k])], error=error)
+
+
+def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:
+    """Count the cells of an attractor by the id on which cells of the same start end at the next value.
+
+    In a continuation only branches in this direction of the parameter count.
+    """
+    ds = scene.attractors
+    ids = outcomes(ds).transpose(scene.axis, ...).values[scene.order]
+    here = np.isin(ids[place], [i for (p, i), name in scene.names.items() if (p, name) == (place, attractor)])
+    if "direction" in ds.coords and start_dims(ds) == ["branch"]:
+        here &= ds["direction"].values == ("up" if rises else "down")
+    counts = Counter(scene.names.get((beyond, i), i) for i in ids[beyond][here].tolist())
+    return dict(counts.most_common()), int(here.sum())
+
+
+def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, if that proves it."""
+    if one.what != UNDECIDED or one.stretch.period or SETS[one.stretch.kind] not in ("chaotic_set", "torus"):
+        return one
+    place, way = one.stretch.places[one.rises], 1 if one.rises else -1
+    heir = next(iter(one.to), -1)
+    facing = [
+        other
+        for other in named
+        if other.rises != one.rises
+        and other.stretch.attractor == heir
+        and other.stretch.places[other.rises] == place + way
+        and other.fate.bifurcation >= 0
+        and next(iter(other.to), -1) == one.stretch.attractor
+    ]
+    if not facing:
+        return replace(one, fate=replace(one.fate, why=_why_open(one, heir, named)))
+    points = points_of_rows(scene.attractors)[one.stretch.rows[one.rises]]
+    bracket = float(scene.along[place + way]), float(scene.along[place])
+    decide = torus_of if SETS[one.stretch.kind] == "torus" else cascade_of
+    born = decide(scene.located, facing[0].fate, bracket, points, geometry_of(scene.attractors))
+    fate = replace(facing[0].fate, value=born.value, why=born.why)
+    if not born.what:
+        return replace(one, fate=replace(fate, bifurcation=-1))
+    error = max(born.error, LOCATED * scene.scale)
+    return replace(one, fate=fate, what=born.what, error=error, born=born)
+
+
+def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
+    """Say why the end of a chaotic set or a torus is not decided."""
+    beyond = [other.stretch for other in named if other.stretch.attractor == heir]
+    if any(other.kind == one.stretch.kind for other in beyond):
+        return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
+    return "its cells do not go on to an orbit whose end is located and whose cells go on to it"
+
+
+def _merged(named: Sequence[Event]) -> list[Event]:
+    """Make one event of two ends of an attractor at one bifurcation: it changes its period there."""
+    merged: list[Event] = []
+    for one in named:
+        last = merged[-1] if merged else None
+        if (
+            last is not None
+            and (last.rises, one.rises) == (True, False)
+            and last.stretch.attractor == one.stretch.attractor
+            and last.fate.bifurcation == one.fate.bifurcation >= 0
+        ):
+            merged[-1] = replace(last, after=one.stretch)
+        else:
+            merged.append(one)
+    return merged
+
+
+# ---- dataset -----------------------------------------------------------------------------------
+
+
+def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> xr.Dataset:
+    named = sorted(named, key=lambda one: (one.stretch.attractor, one.stretch.places[one.rises]))
+    located, along, n = scene.located, scene.along, len(scene.along)
+    beyond = [one.stretch.places[one.rises] + (1 if one.rises else -1) for one in named]
+    bifurcations = np.array([one.fate.bifurcation for one in named], int)
+    own = [_is_own(located, one.fate) for one in named]
+    degrees = [int(located["criticality"].values[k]) if k >= 0 else 0 for k in bifurcations]
+    unit = {"units": str(located.attrs["parameter_units"])}
+    columns: dict[str, tuple[Sequence[object], str, Mapping[str, object]]] = {
+        "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),
+        "set": ([one.stretch.kind for one in named], "kind of the attractor", code_flags(SETS)),
+        "period": ([one.stretch.period for one in named], "period of the attractor, 0 none", {}),
+        "period_after": ([one.after.period if one.after else -1 for one in named], "period beyond a change", {}),
+        "rises": ([int(one.rises) for one in named], "1 if it ends as the parameter rises", {}),
+        "what": ([NAMES.index(one.what) for one in named], "name of the event", code_flags(NAMES)),
+        "criticality": (degrees, "criticality", code_flags(["unknown", *CRITICALITIES[1:]])),
+        "value": ([_value(one) for one in named], "parameter value of the event", unit),
+        "value_error": ([one.error for one in named], "error of the value", unit),
+        "seen": ([along[one.stretch.places[one.rises]] for one in named], "last value with cells", unit),
+        "beyond": ([along[b] if 0 <= b < n else np.nan for b in beyond], "next value of the run", unit),
+        "bifurcation": (bifurcations.tolist(), "number of the bifurcation, -1 none", {}),
+        "branch": ([one.fate.branch for one in named], "branch of the attractor, -1 none", {}),
+        "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
+        "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
+        "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
+        "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
+        "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
+    }
+    variables: dict[str, object] = {
+        name: ("event", np.array(found), {"units": "1", "long_name": text, **attrs})
+        for name, (found, text, attrs) in columns.items()
+    }
+    to = [list(one.to) for one in named], [list(one.to.values()) for one in named]
+    doublings = [one.born.doublings if one.born else () for one in named]
+    variables["to_attractor"] = (("event", "outcome"), _padded(to[0], -1).astype(int), {"long_name": "ids beyond"})
+    variables["to_cells"] = (("event", "outcome"), _padded(to[1], 0).astype(int), {"long_name": "their cells"})
+    variables["doublings"] = (("event", "doubling"), _padded(doublings, np.nan), unit)
+    kept = {name: located.attrs[name] for name in ("parameter", "parameter_units", "model") if name in located.attrs}
+    return xr.Dataset(variables | _bars(scene, stretches, named), attrs=kept)
+
+
+def _padded(rows: Sequence[Sequence[float]], fill: float) -> np.ndarray:
+    """Stack rows of different lengths to an array."""
+    found = np.full((len(rows), max([1, *map(len, rows)])), fill)
+    for one, row in zip(found, rows, strict=True):
+        one[: len(row)] = row
+    return found
+
+
+def _value(one: Event) -> float:
+    return np.nan if one.what in (UNDECIDED, LIVES_ON) else one.fate.value
+
+
+def _bars(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> dict[str, object]:
+    """Return the range of each stretch, up to its events where they are decided."""
+    ends = {(one.stretch, one.rises): _value(one) for one in named}
+    ends |= {(one.after, not one.rises): _value(one) for one in named if one.after}
+
+    def end(one: Stretch, rises: bool) -> float:
+        found = ends[one, rises]
+        return float(scene.along[one.places[rises]]) if np.isnan(found) else found
+
+    unit = {"units": str(scene.located.attrs["parameter_units"])}
+    columns: dict[str, tuple[Sequence[float], Mapping[str, object]]] = {
+        "attractor": ([one.attractor for one in stretches], {}),
+        "set": ([one.kind for one in stretches], code_flags(SETS)),
+        "period": ([one.period for one in stretches], {}),
+        "low": ([end(one, False) for one in stretches], unit),
+        "high": ([end(one, True) for one in stretches], unit),
+    }
+    return {f"stretch_{name}": ("stretch", np.array(found), attrs) for name, (found, attrs) in columns.items()}
+
+
+def _is_own(ds: xr.Dataset, fate: Fate) -> int:
+    return int(fate.bifurcation >= 0 and int(ds["of_branch"].values[fate.bifurcation]) == fate.branch)
+
+
+def _other_branch(ds: xr.Dataset, fate: Fate) -> int:
+    if fate.bifurcation < 0:
+        return -1
+    both = (int(ds[name].values[fate.bifurcation]) for name in ("of_branch", "to_branch"))
+    return next((one for one in both if one != fate.branch), -1)

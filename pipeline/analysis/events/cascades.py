@@ -1,0 +1,117 @@
+"""Decide whether a chaotic set ends in a cascade of doublings, and whether a torus ends on an orbit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.branches.bifurcations import DOUBLING, KINDS, TORUS
+from pipeline.analysis.events.lines import Fate, at
+from pipeline.analysis.sets import Geometry, mean_distance
+from pipeline.analysis.tabular import words_of
+
+CASCADE = "cascade"
+
+DELTA = 4.669201609
+"""Feigenbaum's constant: the limit of the ratio of successive intervals between doublings of smooth maps."""
+
+RATIOS = (4.0, 5.5)
+"""Range of the last ratio within which doublings count as a cascade."""
+
+NEAR = 0.15
+"""Largest mean distance of a chaotic set from the last doubled orbit, in units of the orbit's size."""
+
+
+@dataclass(frozen=True)
+class Born:
+    """Verdict on the end of a chaotic set or a torus; `what` is empty if it is not decided."""
+
+    what: str
+    why: str
+    value: float = np.nan
+    error: float = np.nan
+    doublings: tuple[float, ...] = ()
+    ratio: float = np.nan
+
+
+def cascade_of(
+    ds: xr.Dataset, fate: Fate, bracket: tuple[float, float], points: np.ndarray, geometry: Geometry
+) -> Born:
+    """Judge whether a chaotic set ends where a cascade of doublings accumulates.
+
+    Parameters
+    ----------
+    ds
+        Located branches.
+    fate
+        End of the orbit to which the cells of the set go on.
+    bracket
+        Values of the run on the orbit's side and on the set's side.
+    points
+        Section points of the set at its last value.
+    geometry
+        Geometry of the states.
+
+    Returns
+    -------
+    Born
+        The limit follows from the last two doublings and Feigenbaum's constant; its error is the change if the
+        measured ratio takes the place of the constant.
+    """
+    chain = _chain(ds, fate.bifurcation)
+    way = np.sign(bracket[1] - bracket[0])
+    found = ds["value"].values[chain]
+    if len(chain) < 3 or (np.diff(found) * way <= 0.0).any():
+        listed = f"at {at(ds, *found)}" if chain else "none"
+        return Born("", f"a cascade needs three doublings of the orbit to which its cells go; located: {listed}")
+    steps = np.diff(found)
+    ratio = float(steps[-2] / steps[-1])
+    limit = float(found[-1] + steps[-1] / (DELTA - 1.0))
+    error = abs(float(steps[-1]) * (1.0 / (DELTA - 1.0) - 1.0 / (ratio - 1.0))) if ratio > 1.0 else np.inf
+    told = f"doublings at {at(ds, *found)}, last ratio {ratio:.4f}, limit at {at(ds, limit)}"
+    if not RATIOS[0] < ratio < RATIOS[1]:
+        return Born("", f"{told}: the ratio is not near {DELTA:.4f}")
+    if (limit - bracket[0]) * way < -error or (limit - bracket[1]) * way > error:
+        return Born("", f"{told}: the limit lies outside of {at(ds, *bracket)}")
+    orbit = ds["bifurcation_section"].values[chain[-1]]
+    orbit = orbit[np.isfinite(orbit).all(axis=-1)]
+    size = float(geometry.distance(orbit[:, None], orbit[None]).max())
+    away = mean_distance(points, orbit, geometry) / size
+    if away > NEAR:
+        return Born("", f"{told}: the set is {away:.2f} of the orbit's size away from the last orbit")
+    why = f"{told}; the set is {away:.3f} of the orbit's size away from the last orbit"
+    return Born(CASCADE, why, limit, error, tuple(map(float, found)), ratio)
+
+
+def _chain(ds: xr.Dataset, k: int) -> list[int]:
+    """Return the doublings that lead to one and on from it, by rising period."""
+    kind, of, to = (ds[name].values for name in ("kind", "of_branch", "to_branch"))
+    doubling = kind == KINDS.index(DOUBLING)
+    if k < 0 or not doubling[k]:
+        return []
+    chain = [k]
+    while (before := np.flatnonzero(doubling & (to == of[chain[0]]))).size:
+        nearest = before[np.abs(ds["value"].values[before] - ds["value"].values[chain[0]]).argmin()]
+        if int(nearest) in chain:
+            break
+        chain.insert(0, int(nearest))
+    loses = np.minimum(ds["n_unstable_before"].values, ds["n_unstable_after"].values) == 0
+    while to[chain[-1]] >= 0 and (after := np.flatnonzero(doubling & loses & (of == to[chain[-1]]))).size:
+        nearest = after[np.abs(ds["value"].values[after] - ds["value"].values[chain[-1]]).argmin()]
+        if int(nearest) in chain:
+            break
+        chain.append(int(nearest))
+    return chain
+
+
+def torus_of(ds: xr.Dataset, fate: Fate, bracket: tuple[float, float], points: np.ndarray, geometry: Geometry) -> Born:
+    """Judge whether a torus ends on an orbit, at a supercritical Neimark-Sacker point; parameters as `cascade_of`."""
+    k, low, high = fate.bifurcation, min(bracket), max(bracket)
+    value, kind = float(ds["value"].values[k]), KINDS[int(ds["kind"].values[k])]
+    degree = words_of(ds["criticality"])[int(ds["criticality"].values[k])]
+    told = f"the orbit to which its cells go ends at {at(ds, value)}: {degree} {kind.replace('_', ' ')}"
+    if kind != TORUS or degree != "supercritical" or not low <= value <= high:
+        return Born("", told)
+    return Born(TORUS, told, value, float(ds["bracket"].values[k]))

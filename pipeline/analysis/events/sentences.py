@@ -1,0 +1,117 @@
+"""Tell events in words, and tabulate them."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
+from pipeline.analysis.events.analysis import LIVES_ON, RANGE_END, UNDECIDED
+from pipeline.analysis.events.cascades import CASCADE
+from pipeline.analysis.outcomes import DIVERGED
+from pipeline.analysis.tabular import MOST_ROWS, Row, counted, plain, values
+from pipeline.layout.vocabulary import letter, parameter_name
+from pipeline.products.product import Table
+
+_NAMES = (
+    *("attractor", "set", "period", "period_after", "rises", "what", "criticality", "value", "value_error", "seen"),
+    *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "evidence"),
+)
+
+
+def events_table(ds: xr.Dataset) -> Table:
+    """Return the table of events: a row for each, with its sentence and evidence.
+
+    ``value`` and ``value_error`` have the unit of the swept parameter; ``seen`` and ``beyond`` are the values of the
+    run between which cells leave the attractor, ``to_attractor`` is the id on which most of them go on.
+    """
+    rows = [_row(ds, k) for k in range(ds.sizes["event"])]
+    own = [row for row in rows if row["what"] not in (RANGE_END, LIVES_ON)]
+    n_open = sum(row["what"] == UNDECIDED for row in own)
+    lines = [f"{counted(len(own), 'event')}, {n_open} not decided"]
+    told = [row for row in rows if row["what"] != RANGE_END]
+    lines += [f"  {row['sentence']}" for row in told[:MOST_ROWS]]
+    if len(told) > MOST_ROWS:
+        lines.append(f"  and {len(told) - MOST_ROWS} more; all are in --csv and --json")
+    bounds = sorted({(row["seen"], row["attractor"]) for row in rows if row["what"] == RANGE_END})
+    for end in dict.fromkeys(x for x, _ in bounds):
+        ids = ", ".join(letter(i) for x, i in bounds if x == end)
+        lines.append(f"the range ends at {parameter_name(str(ds.attrs['parameter']))} = {end:.10g}: {ids}")
+    return Table(rows, lines, "" if rows else "no cell ends on an attractor")
+
+
+def _row(ds: xr.Dataset, k: int) -> Row:
+    one = ds.isel(event=k)
+    row = values(one, *_NAMES)
+    to, cells = one["to_attractor"].values.tolist(), one["to_cells"].values.tolist()
+    row |= {"to_attractor": to[0], "to_cells": cells[0]}
+    doublings = [x for x in one["doublings"].values.tolist() if np.isfinite(x)]
+    going = {i: n for i, n in zip(to, cells, strict=True) if n}
+    return {"label": LABELS.get(row["what"], ""), **row, "sentence": _sentence(ds, row, going, doublings)}
+
+
+def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[float]) -> str:
+    name, unit = parameter_name(str(ds.attrs["parameter"])), str(ds.attrs["parameter_units"])
+    unit = "" if unit == "1" else f" {unit}"
+    own, way = f"period {row['period']}" if row["period"] else plain(row["set"]), "rises" if row["rises"] else "falls"
+    who, seen, beyond = f"{letter(row['attractor'])} ({own})", row["seen"], row["beyond"]
+    cells = f"; {_going_on(row['attractor'], to)}" if to else ""
+    if row["what"] == RANGE_END:
+        return f"{who} reaches the end of the range, {name} = {seen:.10g}{unit}"
+    if row["what"] == LIVES_ON:
+        return f"{who} stays stable as {name} {way} beyond {seen:.10g}{unit}, but no cell finds it{cells}"
+    if row["what"] == UNDECIDED:
+        where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
+        return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
+    at = f"{name} = {_with_error(row['value'], row['value_error'])}{unit}"
+    if row["period_after"] >= 0:
+        changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"
+        return f"{changes} at {at} as it {way}: {_reason(row, doublings)}"
+    late = (row["value"] - beyond) * (1 if row["rises"] else -1) > row["value_error"]
+    unseen = f" (no cell finds it beyond {seen:.10g})" if late else ""
+    return f"{who} ends at {at} as it {way}{unseen}: {_reason(row, doublings)}{cells}"
+
+
+def _reason(row: Row, doublings: list[float]) -> str:
+    """Name the event and say what the attractor meets, in words."""
+    what, own, other = row["what"], bool(row["is_own"]), row["other_branch"]
+    if what == CASCADE:
+        listed = ", ".join(f"{x:.7g}" for x in doublings)
+        return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
+    spelt = {TORUS: "Neimark-Sacker", HOPF: "Hopf"}.get(what, plain(what))
+    head = f"{degree}{spelt} ({LABELS[what]})"
+    sure = row["criticality"] in ("supercritical", "subcritical")
+    off, of = row["criticality"] == "subcritical", "" if other < 0 else f" (branch {other})"
+    kind = "equilibrium" if row["set"] == "equilibrium" else "orbit"
+    if what == FOLD:
+        return f"{head}, it meets the unstable {kind} of branch {row['branch']}"
+    if what in (DOUBLING, HOPF, TORUS, PITCHFORK) and own and not sure:
+        return head
+    if row["set"] == "torus":
+        return f"{head}, the torus shrinks onto the orbit of branch {row['branch']}"
+    told = {
+        (DOUBLING, True): f"{'it meets the unstable' if off else 'onto the'} orbit of period {2 * row['period']}{of}",
+        (DOUBLING, False): f"it shrinks onto the orbit of period {row['period'] // 2}{of}",
+        (HOPF, True): f"it {'meets an unstable' if off else 'sheds a stable'} limit cycle{of}",
+        (HOPF, False): f"it shrinks onto the equilibrium{of}",
+        (TORUS, True): "it meets an unstable torus" if off else "onto a torus",
+        (PITCHFORK, True): f"it {'meets two unstable arms' if off else 'passes its stability to two arms'}{of}",
+        (PITCHFORK, False): f"it meets the other arm on the {kind} between them{of}",
+    }
+    verb = "exchanges stability with" if what == TRANSCRITICAL else "meets"
+    return f"{head}, {told.get((what, own), f'it {verb} the {kind}{of}')}"
+
+
+def _going_on(attractor: int, to: dict[int, int]) -> str:
+    words = {DIVERGED: "diverge", -1: "reach no attractor", attractor: "stay"}
+    parts = [(words.get(i, f"go on to {letter(i)}"), n) for i, n in to.items()]
+    if len(parts) == 1:
+        return f"its cells {parts[0][0]}"
+    return "of its cells " + ", ".join(f"{n} {text}" for text, n in parts)
+
+
+def _with_error(value: float, error: float) -> str:
+    """Format a value with its error, to the digit of the error."""
+    digits = int(np.clip(np.ceil(-np.log10(error)), 0, 12))
+    return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.0e}"

@@ -1,0 +1,163 @@
+"""Events of attractors against closed forms, a harmonic balance of the tests' own, and published values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+
+import magpend
+from pipeline.specification.problems import SpecError
+
+CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
+LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.2)
+HENON = magpend.model("x' = 1 - a*x**2 + y\ny' = b*x", name="henon", kind="map", a=0.2, b=0.3)
+DELAYED = magpend.model("x' = a*x*(1 - y)\ny' = x", name="delayed", kind="map", a=1.9)
+SOFT = magpend.model("x'' = mu*x' - x**2*x' - x", name="soft", mu=0.1)
+HARD = magpend.model(
+    "x' = mu*x - y + x*R - x*R**2\ny' = x + mu*y + y*R - y*R**2\nR = x**2 + y**2", name="hard", mu=-0.1
+)
+DUFFING = magpend.model("x'' = F*cos(omega*t) - c*x' - x - x**3", name="duffing", F=0.1, c=0.1)
+
+SUPER, SUB = "supercritical", "subcritical"
+ROOT = np.sqrt(6.0)
+
+KNOWN = {
+    # pitchfork of 0 at 1 onto +-sqrt(mu - 1), whose multiplier 3 - 2 mu is -1 at 2; the orbit +-x of period 2 with
+    # x**2 = mu + 1 is unstable and shrinks onto 0 at -1
+    "cubic": [
+        ("A", 1, "falls", "period_doubling", SUB, -1.0),
+        ("A", 1, "rises", "pitchfork", SUPER, 1.0),
+        *((i, 1, "falls", "pitchfork", SUPER, 1.0) for i in "BC"),
+        *((i, 1, "rises", "period_doubling", SUPER, 2.0) for i in "BC"),
+    ],
+    "henon": [
+        ("A", 1, "falls", "fold", "unknown", -0.25 * 0.7**2),
+        ("A", 1, "rises", "period_doubling", SUPER, 0.75 * 0.7**2),
+        ("A", 2, "rises", "period_doubling", SUPER, 0.7**2 + 0.25 * 1.3**2),
+    ],
+    # the multipliers of (a - 1)/a have the product a - 1
+    "delayed": [("A", 1, "rises", "neimark_sacker", SUPER, 2.0), ("B", 0, "falls", "neimark_sacker", SUPER, 2.0)],
+    "soft": [("A", 0, "rises", "hopf", SUPER, 0.0), ("B", 1, "falls", "hopf", SUPER, 0.0)],
+    # cycles of the radius R with mu + R - R**2 = 0
+    "hard": [("A", 0, "rises", "hopf", SUB, 0.0), ("B", 1, "falls", "fold", "unknown", -0.25)],
+    # sigma (sigma + b + 3)/(sigma - b - 1)
+    "lorenz": [("A", 0, "rises", "hopf", SUB, 10.0 * (10.0 + 8.0 / 3.0 + 3.0) / (10.0 - 8.0 / 3.0 - 1.0))],
+}
+
+
+def sweep(model, folder, starts, integration=(), section=None, **axis):
+    spec = magpend.Spec("sweep", model)
+    for name, values in axis.items():
+        spec = spec.with_axis(name, values=[float(x) for x in values])
+    if section is not None:
+        spec = spec.with_section(longest=60.0, **section)
+    settings = {"n_transient": 300, "n_keep": 4, **dict(integration)}
+    spec = spec.with_start_random(n=8, seed=0, **starts).with_integration(**settings)
+    return magpend.run(spec, folder / "run", workers=0)
+
+
+LONG = {"n_transient": 2000, "n_keep": 100}
+BOX = {"x": (-1.0, 1.0)}
+RUNS = {
+    "cubic": lambda d: sweep(CUBIC, d, BOX, LONG, mu=np.linspace(-1.31, 2.21, 23)),
+    "henon": lambda d: sweep(HENON, d, {**BOX, "y": (-0.3, 0.3)}, LONG, a=np.linspace(-0.1531, 0.9931, 24)),
+    "delayed": lambda d: sweep(
+        DELAYED, d, {"x": (0.3, 0.6), "y": (0.3, 0.6)}, {"n_transient": 4000, "n_keep": 400}, a=[1.711, 1.961, 2.061]
+    ),
+    "soft": lambda d: sweep(
+        SOFT, d, {"x": (-2, 2), "x_dot": (-2, 2)}, section={"of": "x_dot", "value": 0.0, "direction": "down"},
+        mu=np.linspace(-0.19, 0.41, 7),
+    ),
+    "hard": lambda d: sweep(
+        HARD, d, {"x": (-1.5, 1.5), "y": (-1.5, 1.5)}, section={"of": "y", "value": 0.0, "direction": "up"},
+        mu=np.linspace(-0.41, 0.19, 7),
+    ),
+    "lorenz": lambda d: sweep(
+        magpend.load_model("lorenz"), d, {"x": (7, 9), "y": (7, 9), "z": (20, 26)}, {"n_transient": 200, "n_keep": 60},
+        section={"of": "x", "value": 7.5, "direction": "up"}, rho=[20.0, 22.0, 24.0, 26.0],
+    ),
+}  # fmt: skip
+
+
+def told(table):
+    """The decided events of a table, as in `KNOWN`, and the largest error in units of the stated one."""
+    rows = table[~table["what"].isin(["range_end", "not_decided"])]
+    ways = np.where(rows["rises"] == 1, "rises", "falls")
+    letters = [chr(ord("A") + i) for i in rows["attractor"]]
+    columns = (letters, rows["period"], ways, rows["what"], rows["criticality"])
+    return list(zip(*columns, strict=True)), rows["value"].to_numpy(), rows["value_error"].to_numpy()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RUNS)
+def test_events__closed_forms(name, tmp_path):
+    table = RUNS[name](tmp_path).table("events")
+    events, values, errors = told(table)
+    assert sorted(events) == sorted(one[:5] for one in KNOWN[name])
+    known = {one[:5]: one[5] for one in KNOWN[name]}
+    assert (np.abs(values - [known[one] for one in events]) <= errors).all()
+    assert (errors < 2e-8).all()
+    # the chaotic set of Lorenz's equations ends in a crisis at 24.06, which doublings cannot tell
+    assert (table["what"] == "not_decided").sum() == (name == "lorenz")
+
+
+@pytest.mark.slow
+def test_events__cascade_of_the_logistic_map(tmp_path):
+    run = sweep(
+        LOGISTIC, tmp_path, {"x": (0.1, 0.9)}, {"n_transient": 4000, "n_keep": 200}, r=np.linspace(2.801, 3.575, 101)
+    )
+    table = run.table("events")
+    events, values, errors = told(table)
+    found = dict(zip(events, zip(values, errors, strict=True), strict=True))
+    doublings = [found["A", p, "rises", "period_doubling", SUPER] for p in (1, 2)]
+    assert [x for x, _ in doublings] == pytest.approx([3.0, 1.0 + ROOT], abs=1e-9)
+    ((limit, error),) = (v for k, v in found.items() if k[3] == "cascade")
+    assert abs(limit - 3.569945671870945) < error < 1e-6  # OEIS A098587
+    assert not (table["what"] == "not_decided").any()
+
+
+def fold_of(force, omega, first, n=6):
+    """Frequency of a fold of the hardening oscillator, where the Jacobian of a harmonic balance is singular."""
+    orders = np.arange(1, 2 * n, 2)
+    phases = np.exp(1j * np.outer(np.arange(8 * n) * 2.0 * np.pi / (8 * n), orders))
+
+    def residual(u, w):
+        c = u[:n] + 1j * u[n:]
+        own = (1.0 - (orders * w) ** 2 + 0.1j * orders * w) * c
+        own += 2.0 * (phases.conj().T @ (phases @ c).real ** 3) / (8 * n)
+        own[0] -= force
+        return np.concatenate([own.real, own.imag])
+
+    def slope(u, w, v):
+        # two central differences, whose combination is exact for cubics
+        near, far = ((residual(u + h * v, w) - residual(u - h * v, w)) / (2.0 * h) for h in (0.1, 0.2))
+        return (4.0 * near - far) / 3.0
+
+    def singular(y):
+        u, w, v = y[: 2 * n], y[2 * n], y[2 * n + 1 :]
+        return np.concatenate([residual(u, w), slope(u, w, v), [v @ v - 1.0]])
+
+    u = np.zeros(2 * n)
+    u[0], u[n] = first.real, first.imag
+    u = fsolve(residual, u, args=(omega,))
+    matrix = np.column_stack([slope(u, omega, e) for e in np.eye(2 * n)])
+    y, _, flag, message = fsolve(singular, [*u, omega, *np.linalg.svd(matrix)[2][-1]], xtol=1e-13, full_output=True)
+    assert flag == 1, message
+    return float(y[2 * n])
+
+
+@pytest.mark.slow
+def test_events__both_folds_of_duffing_in_one_bracket(tmp_path):
+    starts = {"x": (-3, 3), "x_dot": (-3, 3)}
+    run = sweep(DUFFING, tmp_path, starts, F=[0.05, 0.1], omega=[1.0, 1.1, 1.3, 1.4])
+    table = run.table("events", parameter="omega", at={"F": 0.1})
+    events, values, errors = told(table)
+    assert (errors < 1e-9).all()
+    assert events == [("A", 1, "rises", "fold", "unknown"), ("B", 1, "falls", "fold", "unknown")]
+    known = [fold_of(0.1, 1.22, 0.4 - 0.7j), fold_of(0.1, 1.16, -0.4 - 0.1j)]
+    assert known == pytest.approx([1.228735, 1.157952], abs=1e-6)  # docs/response.md
+    assert (np.abs(values - known) <= errors).all()
+    assert "fold (LP), it meets the unstable orbit of branch" in table["sentence"].str.cat()
+    with pytest.raises(SpecError, match="does not sweep"):
+        run.events(parameter="c", low=0.1, high=0.2)
