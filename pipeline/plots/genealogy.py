@@ -68,6 +68,7 @@ def plot_genealogy(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ax.margins(x=0.02)
     style.limits(ax, frame)
     style.label_axes(ax, labels.swept_label(str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"])), "attractor")
+    style.caption(ax, labels.caption(ds, with_start=False))
     style.legend_above(fig, _handles(ds), size=fig.look.tick)
     style.finish(fig)
     return fig

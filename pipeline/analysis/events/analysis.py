@@ -16,7 +16,7 @@ from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import CASCADE, Born, cascade_of, torus_of
-from pipeline.analysis.events.lines import Fate, Line, Orbit, at, follow, lines_of, places_of
+from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, follow, lines_of, places_of
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -45,6 +45,9 @@ NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, CASCADE)
 
 LOCATED = 1e-9
 """Least error of a located bifurcation, as a share of the interval: integrations have the tolerance 1e-12."""
+
+AT_BRANCH_POINT = 1e-7
+"""The same of branch points, where Newton's method is as exact as the root of its residual."""
 
 _AT_EVEN_TIMES = "a limit cycle seen at even times has no branch; see it at crossings: [section] of a new run"
 
@@ -236,7 +239,8 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
         why = f"{fate.why} at {at(ds, fate.value)}, whose numbers of unstable multipliers contradict it"
         return replace(event, fate=replace(fate, value=np.nan, bifurcation=-1, why=why))
-    error = max(float(ds["bracket"].values[k]), LOCATED * scene.scale)
+    least = AT_BRANCH_POINT if int(ds["kind"].values[k]) in CROSSING else LOCATED
+    error = max(float(ds["bracket"].values[k]), least * scene.scale)
     return replace(event, what=KINDS[int(ds["kind"].values[k])], error=error)
 
 
@@ -269,12 +273,9 @@ def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
         and other.fate.bifurcation >= 0
         and next(iter(other.to), -1) == one.stretch.attractor
     ]
-    if not facing:
+    if not facing or len(one.to) > 1:
         return replace(one, fate=replace(one.fate, why=_why_open(one, heir, named)))
-    points = points_of_rows(scene.attractors)[one.stretch.rows[one.rises]]
-    bracket = float(scene.along[place + way]), float(scene.along[place])
-    decide = torus_of if SETS[one.stretch.kind] == "torus" else cascade_of
-    born = decide(scene.located, facing[0].fate, bracket, points, geometry_of(scene.attractors))
+    born = _born(scene, one.stretch, place, way, facing[0].fate)
     fate = replace(facing[0].fate, value=born.value, why=born.why)
     if not born.what:
         return replace(one, fate=replace(fate, bifurcation=-1))
@@ -282,11 +283,28 @@ def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
     return replace(one, fate=fate, what=born.what, error=error, born=born)
 
 
+def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> Born:
+    """Judge the end of a chaotic set or a torus, given the fate of the orbit beyond."""
+    along, geometry, all_points = scene.along, geometry_of(scene.attractors), points_of_rows(scene.attractors)
+    points = all_points[stretch.rows[way > 0]]
+    if SETS[stretch.kind] == "chaotic_set":
+        bracket = float(along[place + way]), float(along[place])
+        return cascade_of(scene.located, fate, bracket, points, geometry)
+    if stretch.places[0] == stretch.places[1]:
+        return Born("", "one value of the run shows the torus; two are needed to see it shrink")
+    rows = rows_at(scene.attractors)[(int(scene.order[place - way]),)]
+    inner = next(row for row in rows if scene.attractors["attractor"].values[row] == stretch.attractor)
+    values = float(along[place + way]), float(along[place]), float(along[place - way])
+    return torus_of(scene.located, fate, values, (points, all_points[inner]), geometry)
+
+
 def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
     """Say why the end of a chaotic set or a torus is not decided."""
     beyond = [other.stretch for other in named if other.stretch.attractor == heir]
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
+    if len(one.to) > 1:
+        return "its cells do not all go on to the same attractor"
     return "its cells do not go on to an orbit whose end is located and whose cells go on to it"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +21,20 @@ DELTA = 4.669201609
 RATIOS = (4.0, 5.5)
 """Range of the last ratio within which doublings count as a cascade."""
 
+MERGING = 0.187
+"""Distance from the limit at which the bands of chaos have merged to those of a doubling, as a share of that
+doubling's distance: (3.592572 - 3.569946)/(3.569946 - 3.449490) for the logistic map, where four bands merge to two.
+
+The bands merge at the same rate as orbits double. So nearer to the limit a chaotic set has the cascade's bands, and no
+crisis lies between.
+"""
+
 NEAR = 0.15
 """Largest mean distance of a chaotic set from the last doubled orbit, in units of the orbit's size."""
+
+
+SQUARE_ROOT = 0.25
+"""Largest deviation from 1 of the ratio of a torus's squared sizes to that of its distances from the point."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,10 @@ def cascade_of(
         return Born("", f"{told}: the limit lies outside of {at(ds, *bracket)}")
     orbit = ds["bifurcation_section"].values[chain[-1]]
     orbit = orbit[np.isfinite(orbit).all(axis=-1)]
+    ratios = steps[:-1] / steps[1:]
+    regular = next(k for k in range(len(ratios)) if ((ratios[k:] > RATIOS[0]) & (ratios[k:] < RATIOS[1])).all())
+    if abs(bracket[1] - limit) > MERGING * abs(limit - found[regular]):
+        return Born("", f"{told}: the set is seen so far from the limit that crises may lie between")
     size = float(geometry.distance(orbit[:, None], orbit[None]).max())
     away = mean_distance(points, orbit, geometry) / size
     if away > NEAR:
@@ -106,12 +123,31 @@ def _chain(ds: xr.Dataset, k: int) -> list[int]:
     return chain
 
 
-def torus_of(ds: xr.Dataset, fate: Fate, bracket: tuple[float, float], points: np.ndarray, geometry: Geometry) -> Born:
-    """Judge whether a torus ends on an orbit, at a supercritical Neimark-Sacker point; parameters as `cascade_of`."""
-    k, low, high = fate.bifurcation, min(bracket), max(bracket)
+def torus_of(
+    ds: xr.Dataset, fate: Fate, bracket: tuple[float, float, float], tori: Sequence[np.ndarray], geometry: Geometry
+) -> Born:
+    """Judge whether a torus ends on an orbit, at a supercritical Neimark-Sacker point.
+
+    Parameters
+    ----------
+    ds, fate, geometry
+        As in `cascade_of`.
+    bracket
+        Values of the run: on the orbit's side, and the two nearest on the side of the torus.
+    tori
+        Section points of the torus at these two values.
+    """
+    k, (beyond, seen, inner) = fate.bifurcation, bracket
     value, kind = float(ds["value"].values[k]), KINDS[int(ds["kind"].values[k])]
     degree = words_of(ds["criticality"])[int(ds["criticality"].values[k])]
     told = f"the orbit to which its cells go ends at {at(ds, value)}: {degree} {kind.replace('_', ' ')}"
-    if kind != TORUS or degree != "supercritical" or not low <= value <= high:
+    if kind != TORUS or degree != "supercritical" or not min(beyond, seen) <= value <= max(beyond, seen):
+        return Born("", told)
+    orbit = ds["bifurcation_section"].values[k]
+    orbit = orbit[np.isfinite(orbit).all(axis=-1)]
+    near, far = (mean_distance(points, orbit, geometry) for points in tori)
+    share = near**2 / far**2 / ((seen - value) / (inner - value))
+    told += f"; the torus shrinks as the root of the distance to {share:.2f}"
+    if abs(share - 1.0) > SQUARE_ROOT:
         return Born("", told)
     return Born(TORUS, told, value, float(ds["bracket"].values[k]))
