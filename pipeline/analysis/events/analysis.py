@@ -12,11 +12,11 @@ import xarray as xr
 from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
-from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.bifurcations import BRANCHING, KINDS
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import CASCADE, Born, cascade_of, torus_of
-from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, follow, lines_of, places_of
+from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -239,9 +239,10 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
         why = f"{fate.why} at {at(ds, fate.value)}, whose numbers of unstable multipliers contradict it"
         return replace(event, fate=replace(fate, value=np.nan, bifurcation=-1, why=why))
-    least = AT_BRANCH_POINT if int(ds["kind"].values[k]) in CROSSING else LOCATED
-    error = max(float(ds["bracket"].values[k]), least * scene.scale)
-    return replace(event, what=KINDS[int(ds["kind"].values[k])], error=error)
+    crosses = int(ds["kind"].values[k]) in CROSSING
+    error = max(float(ds["bracket"].values[k]), (AT_BRANCH_POINT if crosses else LOCATED) * scene.scale)
+    what = crossing_at(ds, scene.lines, k) if crosses else KINDS[int(ds["kind"].values[k])]
+    return replace(event, what=what, error=error)
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:
@@ -334,7 +335,12 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
     beyond = [one.stretch.places[one.rises] + (1 if one.rises else -1) for one in named]
     bifurcations = np.array([one.fate.bifurcation for one in named], int)
     own = [_is_own(located, one.fate) for one in named]
-    degrees = [int(located["criticality"].values[k]) if k >= 0 else 0 for k in bifurcations]
+    degrees = [
+        int(located["criticality"].values[one.fate.bifurcation])
+        if one.fate.bifurcation >= 0 and one.what != BRANCHING
+        else 0
+        for one in named
+    ]
     unit = {"units": str(located.attrs["parameter_units"])}
     columns: dict[str, tuple[Sequence[object], str, Mapping[str, object]]] = {
         "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),

@@ -11,6 +11,7 @@ import xarray as xr
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, KINDS, PITCHFORK, SAME_PLACE, TRANSCRITICAL
+from pipeline.analysis.branches.exploring import BESIDE
 from pipeline.analysis.branches.known import GUESS, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
@@ -204,6 +205,22 @@ def _at_end(ds: xr.Dataset, line: Line, node: int, seen: str) -> Fate:
         why = f"{seen}, is stable, and springs from the bifurcation"
         return Fate(float(ds["value"].values[k]), line.branch, node, k, why)
     return Fate(np.nan, line.branch, node, why=f"{seen}, is stable, and {where}")
+
+
+def crossing_at(ds: xr.Dataset, lines: Sequence[Line], k: int) -> str:
+    """Return the kind of a branch point if its two branches prove it: at a pitchfork exactly one of them turns, at a
+    transcritical point neither does.
+    """
+    turning = []
+    for branch in (int(ds[name].values[k]) for name in ("of_branch", "to_branch")):
+        for line in lines:
+            for node in np.flatnonzero(line.bifurcation == k).tolist() if line.branch == branch else ():
+                before, after = max(node - BESIDE, 0), min(node + BESIDE, len(line.value) - 1)
+                if before < node < after:
+                    turning.append(bool(np.prod(line.value[[before, after]] - line.value[node]) > 0.0))
+    kind = KINDS[int(ds["kind"].values[k])]
+    proved = {PITCHFORK: [False, True], TRANSCRITICAL: [False, False]}.get(kind)
+    return kind if sorted(turning) == proved else BRANCHING
 
 
 def _sprung_from(ds: xr.Dataset, line: Line, node: int, end: str) -> int:

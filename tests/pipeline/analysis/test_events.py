@@ -7,6 +7,10 @@ import pytest
 from scipy.optimize import fsolve
 
 import magpend
+from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.events.cascades import cascade_of
+from pipeline.analysis.events.lines import Fate, crossing_at, lines_of
+from pipeline.analysis.sets import Geometry
 from pipeline.specification.problems import SpecError
 
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
@@ -116,7 +120,26 @@ def test_events__cascade_of_the_logistic_map(tmp_path):
     ((limit, error),) = (v for k, v in found.items() if k[3] == "cascade")
     assert abs(limit - 3.569945671870945) < error < 1e-6  # OEIS A098587
     assert not (table["what"] == "not_decided").any()
-    print(len(events))
+    assert len(events) == 7
+    # the same cascade says nothing of a set that is seen beyond the merging of its bands, as crises may lie between
+    located = run.branches()
+    first = int(np.flatnonzero(np.abs(located["value"] - 3.0) < 1e-6)[0])
+    points = located["bifurcation_section"].values[first, :1]
+    born = cascade_of(located, Fate(3.0, 0, 0, first), (3.5, 3.8), points, Geometry((False,), (1.0,)))
+    assert born.what == ""
+    assert "crises" in born.why
+
+
+@pytest.mark.slow
+def test_crossing_at__needs_both_branches(tmp_path):
+    """A pitchfork that is said to be transcritical, or whose other branch is unknown, is a branch point."""
+    located = sweep(CUBIC, tmp_path, BOX, LONG, mu=[0.81, 1.21]).branches()
+    lines = lines_of(located, {"mu": 1.0}, Geometry((False,), (1.0,)))
+    ((k,),) = np.nonzero(located["kind"].values == KINDS.index("pitchfork"))
+    assert crossing_at(located, lines, int(k)) == "pitchfork"
+    assert crossing_at(located, lines[:1], int(k)) == "branch_point"
+    located["kind"].values[k] = KINDS.index("transcritical")
+    assert crossing_at(located, lines, int(k)) == "branch_point"
 
 
 def fold_of(force, omega, first, n=6):
