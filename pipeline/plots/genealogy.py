@@ -52,7 +52,14 @@ def plot_genealogy(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     -------
     DataFigure
         Its `data` are the events without their texts.
+
+    Raises
+    ------
+    ValueError
+        If there is no attractor.
     """
+    if not ds.sizes["stretch"]:
+        raise ValueError("there is no attractor to draw: no cell of the run ends on one")
     texts = [name for name, variable in ds.variables.items() if variable.dtype.kind in "OUT"]
     ids = sorted(set(ds["stretch_attractor"].values.tolist()))
     rows = {number: len(ids) - 1 - k for k, number in enumerate(ids)}

@@ -23,6 +23,7 @@ EVENTS = Analysis(
     EventOptions,
     compute=f"{_ROOM}:events",
     table="pipeline.analysis.events.sentences:events_table",
+    needs=f"{_ROOM}:needs_one_axis",
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",

@@ -20,7 +20,7 @@ from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, cros
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import choose, start_dims
+from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.tabular import plain
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
@@ -60,7 +60,20 @@ def settle_events(run: OpenRun, options: EventOptions) -> EventOptions:
     axis = swept_axis(run, settled.parameter)
     if axis is None:
         raise SpecError(f"events lie along a swept parameter, and the run does not sweep {settled.parameter}.")
+    assert settled.low is not None
+    assert settled.high is not None
+    if int(((axis.values >= settled.low) & (axis.values <= settled.high)).sum()) < 2:
+        raise SpecError(
+            f"--from {settled.low} --to {settled.high}: the run has fewer than two values of {settled.parameter} there."
+        )
     return settled
+
+
+def needs_one_axis(run: OpenRun, options: EventOptions) -> None:
+    """Raise ValueError unless `at` leaves one value of each axis beside the parameter's."""
+    cube, axis = run.cube(), axis_name(options.parameter)
+    if axis in cube.dims:
+        select_points(cube.isel({axis: slice(0, 1)}), options.at, purpose=f"events lie along {parameter_name(axis)}")
 
 
 @dataclass(frozen=True)
@@ -227,7 +240,8 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     place = one.places[rises]
     beyond = place + (1 if rises else -1)
     if not 0 <= beyond < len(scene.along):
-        return Event(one, rises, replace(fate, value=float(scene.along[place])), RANGE_END)
+        _, n_cells = _cells(scene, one.attractor, rises, place, place)
+        return Event(one, rises, replace(fate, value=float(scene.along[place])), RANGE_END, n_cells=n_cells)
     to, n_cells = _cells(scene, one.attractor, rises, place, beyond)
     event = Event(one, rises, fate, to=to, n_cells=n_cells)
     if fate.is_bound:
