@@ -52,6 +52,7 @@ NOT_MADE = {
     "identification-residuals.png": "residuals of the identification that ships, which takes an hour",
     "measured.png": "a sweep of 101 frequencies on the virtual rig, beside a run of as many",
     "report.png": "a browser's picture of a part of a report",
+    "response-pendulum.png": "the response of the pendulum, half a minute, by the commands beside it",
     "rig-calibrated.png": "a diagram of the calibrated model of docs/rig.md beside the rig's",
 }
 """Pictures in the docs that this program does not make, with what they show."""

@@ -14,7 +14,7 @@ from tests.programs import ROOT, program
 
 tutorials = program("docs/run_tutorials.py")
 slurm = program("tests/pipeline/runs/slurm.py")
-FRESH = ("van-der-pol", "python-start", "response", "maps", "henon")
+FRESH = ("van-der-pol", "python-start", "response", "beside-other-tools", "maps", "henon")
 """Pages whose pictures are compared as well."""
 PAGES = {**tutorials.PAGES, **{name: tutorials.pages()[name] for name in FRESH}, "AGENTS": ROOT / "AGENTS.md"}
 
@@ -131,6 +131,13 @@ def test_follow__a_page_that_does_not_hold(tmp_path, change, said):
     assert follow(tmp_path) == {"words.png": tmp_path / "words.txt"}
     with pytest.raises(tutorials.TutorialError, match=re.escape(said)):
         follow(tmp_path, **change)
+
+
+def test_index__begins_with_the_example_of_a_followed_page():
+    index, page = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("index", "response"))
+    first = index.partition("```python\n")[2].partition("```")[0]
+    assert first.count("\n") <= 10
+    assert f"<!-- run -->\n```python\n{first}```" in page
 
 
 def test_navigation__every_page_is_in_it():

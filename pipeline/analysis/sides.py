@@ -14,7 +14,8 @@ import xarray as xr
 
 from magpend_core.models.model import Classifier, Parameters
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
+from pipeline.layout.own_words import hertz_of
+from pipeline.layout.vocabulary import BOUNDED, INFERRED, PERIODIC, model_of, parameters_of
 
 UNKNOWN = 0
 """Code of every classifier's first label: the motion is unknown."""
@@ -80,7 +81,7 @@ def flags_of(classifier: Classifier) -> dict[str, Any]:
 
 
 def _frequency(ds: xr.Dataset) -> xr.DataArray:
-    found = ds.coords.get(FREQUENCY_DIM)
+    found = hertz_of(ds)
     return xr.DataArray(float(ds.attrs.get("frequency_hz", np.inf))) if found is None else found
 
 

@@ -121,7 +121,9 @@ def _start(
     """Read the initial state, the model and its parameters from the options; None if a run's own motions are
     animated.
     """
+    from pipeline.compute.simulate import with_rate
     from pipeline.runs.filming import Start
+    from pipeline.specification.models import find_model
     from pipeline.specification.problems import SpecError
 
     states = read_states(words)
@@ -131,7 +133,8 @@ def _start(
     if not alone and not states and not transient:
         return None
     overrides = read_pairs("--set", settings or [], "q=1.5")
-    frequency = overrides.pop("frequency_hz", overrides.pop("frequency", frequency_hz))
+    known = find_model(model or DEFAULT, at="--model")
+    frequency, overrides = with_rate(overrides.pop("frequency", frequency_hz), overrides, known)
     return Start(states, transient, model or DEFAULT, frequency, preset, overrides)
 
 

@@ -200,13 +200,11 @@ def show(
     json: str | None = None,
 ) -> None:
     """Compute an analysis, or read it if it is stored, and print its table."""
-    from pipeline.products.product import function_of
-    from pipeline.products.registry import ANALYSES
-    from pipeline.runs.derive import derive
+    from pipeline.runs.derive import derive, shown_table
     from pipeline.specification.problems import SpecError
 
     ds = derive(directory, name, options, echo=console.note, workers=workers, scheduler=where)
-    table = function_of(ANALYSES[name].table)(ds)
+    table = shown_table(name, ds)
     if table.nothing:
         raise SpecError(f"{directory}: {table.nothing}")
     tell(table, csv, json)

@@ -82,7 +82,7 @@ def simulate(
     if not no_figure:
         check_figure_path(target)
     overrides = read_pairs("--set", settings or [], "q=1.5")
-    frequency = overrides.pop("frequency_hz", overrides.pop("frequency", frequency_hz))
+    frequency, overrides = simulation.with_rate(overrides.pop("frequency", frequency_hz), overrides, chosen)
     if frequency is None and drive is None and not chosen.autonomous:
         frequency = DEFAULT_HZ
     ds = simulation.simulate(

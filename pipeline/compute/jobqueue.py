@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
 import shutil
 import sys
 import tempfile
@@ -110,8 +111,8 @@ def _keys(folder: Path) -> Any:
     for name, content in made.get_tls_config_for_role("worker").items():
         if content is not None and "\n" in content:
             files[name] = folder / name
-            with os.fdopen(os.open(files[name], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-                file.write(content)
+            with os.fdopen(os.open(files[name], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(content.encode())
     roles = {
         f"tls_{role}_{name}": str(files[name]) for role in ("scheduler", "worker", "client") for name in ("cert", "key")
     }
@@ -147,7 +148,7 @@ def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callab
             # one job at least, as no task is submitted before the first worker was looked at
             jobs.adapt(minimum_jobs=cluster.min_jobs, maximum_jobs=cluster.max_jobs, target_duration=_TARGET)
             echo(
-                f"scheduler at {jobs.scheduler_address} in this process ({os.uname().nodename}); workers "
+                f"scheduler at {jobs.scheduler_address} in this process ({platform.node()}); workers "
                 f"come in {cluster.kind} jobs named {JOB_NAME}, up to {cluster.max_jobs} of {cluster.cores} "
                 f"cores; what they say is in {folder}"
             )

@@ -23,7 +23,7 @@ from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.specification.files import check_new_file
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.specification.recorded_drive import RecordedDrive, load_drive, model_problems
-from pipeline.specification.tables import FREQUENCY, Integration
+from pipeline.specification.tables import FREQUENCY, RATES, Integration
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -180,7 +180,8 @@ def simulate(
     model
         A model, or what `magpend_core.load_model` takes for one.
     preset, overrides
-        Name or file of a preset and parameters by name, see `magpend_core.models.model.Model.load`.
+        Name or file of a preset and parameters by name, see `magpend_core.models.model.Model.load`. Among these,
+        ``omega`` or ``period`` gives the drive's rate instead of `frequency_hz`.
     n_transient
         Drive periods before the series begins.
     n_periods, samples_per_period
@@ -212,10 +213,11 @@ def simulate(
         n_periods = FLOW_PERIODS if n_periods is None else n_periods
     series = Series(n_transient, n_periods, samples_per_period, rtol, atol)
     problems = _problems(series) + _state_problems(chosen, initial_state)
+    frequency_hz, overrides = with_rate(frequency_hz, overrides or {}, chosen)
     recording = _recording(drive, frequency_hz, chosen, series, problems)
     try:
         found = chosen.preset(preset)
-        parameters = chosen.load(found, **(overrides or {}))
+        parameters = chosen.load(found, **overrides)
     except ParameterError as error:
         problems += error.problems
     if problems:
@@ -227,11 +229,21 @@ def simulate(
         ds = _at_frequency(parameters, frequency_hz, state, series)
     else:
         ds = _under_recording(parameters, recording, state, series)
-    origin = {**found.provenance, **dict.fromkeys(overrides or {}, "given")}
+    origin = {**found.provenance, **dict.fromkeys(overrides, "given")}
     sources = "\n".join(f"{name}: {origin.get(name, '')}" for name in parameters)
     return ds.assign_attrs(
         preset=found.name, sources=sources, initial_state=state, n_transient=n_transient, rtol=rtol, atol=atol
     )
+
+
+def with_rate(
+    frequency_hz: float | None, overrides: Mapping[str, float], model: Model
+) -> tuple[float | None, dict[str, float]]:
+    """Take the drive's rate, in any of its words, out of parameters by name; return it in Hz, and the others."""
+    words = [word for word in RATES if word in overrides and word not in model.parameter_names]
+    for word in words:
+        frequency_hz = RATES[word].hertz(overrides[word])
+    return frequency_hz, {name: value for name, value in overrides.items() if name not in words}
 
 
 def _recording(

@@ -20,6 +20,7 @@ TEMPORARY = ".tmp"
 # absent on Windows
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+_FOLDER = getattr(os, "O_DIRECTORY", 0)
 
 _REMEDIES = {
     errno.ENOSPC: "make room on its disk",
@@ -147,8 +148,10 @@ def temporary_beside(path: Path) -> Path:
 
 
 def sync_folder(path: Path) -> None:
-    """Flush a folder's entries to disk, so that they survive a crash."""
-    handle = os.open(path, os.O_RDONLY)
+    """Flush a folder's entries to disk, so that they survive a crash; do nothing where folders cannot be opened."""
+    if not _FOLDER:
+        return
+    handle = os.open(path, os.O_RDONLY | _FOLDER)
     try:
         os.fsync(handle)
     finally:

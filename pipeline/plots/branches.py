@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
@@ -22,9 +23,7 @@ from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions, MultiplierOptions
 
-KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point", "hopf", "pitchfork", "transcritical")
 MARKERS = dict(zip(KINDS, "^soDpvX", strict=True))
-SHORT = dict(zip(KINDS, ("F", "PD", "NS", "BP", "H", "PF", "TC"), strict=True))
 NAMES = {
     "fold": "fold",
     "period_doubling": "period doubling",
@@ -212,7 +211,7 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
             scaley=scale,
         )
         if stable:
-            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{SHORT[kind]}{period or ''}"))
+            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{LABELS[kind]}{period or ''}"))
     return sorted(names, key=lambda n: (n.period, n.x, n.low))
 
 
@@ -302,7 +301,7 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
                 markerfacecolor="white",
                 markeredgecolor="black",
                 markeredgewidth=0.7,
-                label=f"{SHORT[kind]} {NAMES[kind]}",
+                label=f"{LABELS[kind]} {NAMES[kind]}",
             )
             for kind in KINDS
             if kind in present
@@ -338,22 +337,6 @@ DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)
 
 _ON_MAP = dict(zip(KINDS[:3], DASHES[:3], strict=True))
 _STYLE_NAMES = dict(zip(KINDS[:3], ("solid:", "dashed:", "dotted:"), strict=True))
-
-POINT_NAMES = {
-    "cusp": "CP",
-    "generalised_doubling": "GPD",
-    "chenciner": "CH",
-    "r1": "R1",
-    "r2": "R2",
-    "r3": "R3",
-    "r4": "R4",
-    "fold_flip": "LPPD",
-    "fold_neimark_sacker": "LPNS",
-    "doubling_neimark_sacker": "PDNS",
-    "double_neimark_sacker": "NSNS",
-}
-"""Short names of points of codimension two, as MatContM writes them."""
-
 
 ROOM = (0.045, 0.045)
 """Room that a short name takes, in units of the axes."""
@@ -398,7 +381,7 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
 def line_note(ds: xr.Dataset) -> str:
     """Return a text on which line style stands for which kind of bifurcation."""
     present = {KINDS[int(kind)] for kind in ds["kind"].values}
-    return ", ".join(f"{_STYLE_NAMES[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
+    return ", ".join(f"{_STYLE_NAMES[kind]} {LABELS[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
@@ -415,7 +398,7 @@ def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, 
         if not (named and take_room(ax, at, taken)):
             continue
         ax.annotate(
-            POINT_NAMES[names[int(ds["special_kind"][k])]],
+            LABELS[names[int(ds["special_kind"][k])]],
             at,
             (3.0, 3.0),
             textcoords="offset points",
@@ -521,7 +504,7 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
         turning = kind == "neimark_sacker"
         for value in {mu, mu.conjugate()} if turning else {mu}:
             ax.plot(value.real, value.imag, marker=MARKERS[kind], markersize=5.5, markeredgewidth=1.0, **look)
-        text = f"{SHORT[kind]} {float(ds['value'][here[i]]):.4f}"
+        text = f"{LABELS[kind]} {float(ds['value'][here[i]]):.4f}"
         text += f", {np.degrees(np.angle(mu)):.0f}°" if turning else ""
         handles.append(Line2D([], [], marker=MARKERS[kind], markersize=5.0, label=text, **look))
     return handles

@@ -27,6 +27,9 @@ _DEGREE_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 45, 90, 180, 360)
 _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 
+OMEGA = r"$\omega$"
+RATE_AXES = ("frequency", "omega", "drive_period")
+"""Dims of the drive's rate, which maps show on the horizontal axis."""
 MATH_SPACE = r"\ "
 
 
@@ -171,12 +174,16 @@ def parameter_label(coordinate: xr.DataArray) -> str:
     name = str(coordinate.attrs.get("long_name", coordinate.name))
     if coordinate.name == "frequency":
         name = "drive frequency"
+    if coordinate.name == "omega":
+        name = f"{name} {OMEGA}".removeprefix("omega ")
     return with_unit(name, shown_unit(coordinate.attrs, "Hz" if coordinate.name == "frequency" else ""))
 
 
 def swept_label(name: str, units: str) -> str:
     """Return the axis label of the parameter along which branches are continued."""
-    return "drive frequency [Hz]" if name in ("frequency", "frequency_hz") else with_unit(name, units)
+    if name in ("frequency", "frequency_hz"):
+        return "drive frequency [Hz]"
+    return with_unit({"omega": OMEGA, "drive_period": "drive period"}.get(name, name), units)
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
@@ -213,6 +220,7 @@ def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
         # under a recorded drive the mean one
         mean = "mean " if str(coordinate.attrs.get("long_name", "")).startswith("mean") else ""
         return _assignment(f"{mean}$f$", value, "Hz")
+    name = {"omega": OMEGA, "drive_period": "drive period"}.get(name, name)
     return _assignment(name, value, unit)
 
 

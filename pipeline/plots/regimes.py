@@ -15,6 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, t
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
 from pipeline.analysis.run import OpenRun
@@ -23,7 +24,7 @@ from pipeline.analysis.sets import rows_by_number
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, letter, parameter_name
 from pipeline.plots import labels, palette, style
-from pipeline.plots.branches import DASHES, KINDS, NAMES, draw_over, line_note, mark_points
+from pipeline.plots.branches import DASHES, NAMES, draw_over, line_note, mark_points
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.branches import CurveOptions
 from pipeline.products.figures import CurveFigureOptions, RegimeOptions
@@ -210,9 +211,8 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
         raise ValueError(
             f"a map of regimes has two swept parameters, and {left_of}; sweep two, and choose values of any others"
         )
-    return (
-        ("frequency", next(d for d in chosen if d != "frequency")) if "frequency" in chosen else (chosen[0], chosen[1])
-    )
+    (x, y) = chosen
+    return (y, x) if y in labels.RATE_AXES else (x, y)
 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
@@ -384,7 +384,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
             color=_CURVE_COLOURS[kind],
             linestyle=DASHES[periods.index(period) % len(DASHES)],
             linewidth=1.2,
-            label=f"{NAMES[kind]}, period {period}",
+            label=f"{LABELS[kind]} {NAMES[kind]}, period {period}",
         )
         seen.setdefault((period, kind), line)
     style.label_axes(

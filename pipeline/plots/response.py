@@ -13,10 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.plots import labels, style
-from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT, STABLE, UNSTABLE, stretches, with_located
+from pipeline.plots.branches import MARKERS, NAMES, STABLE, UNSTABLE, stretches, with_located
 from pipeline.plots.figure import frame_of
 from pipeline.plots.labels import Measure
 from pipeline.products.figures import ResponseFigureOptions
@@ -192,7 +193,7 @@ def _handles(ds: xr.Dataset, levels: Mapping[Any, str], has_points: bool) -> lis
         lines += [{"color": c, "label": ", ".join(f"{n} = {v:g}" for n, v in level)} for level, c in levels.items()]
     kinds = [KINDS[k] for k in sorted({int(k) for k in ds["kind"].values})]
     mark = {"linestyle": "none", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": "black"}
-    lines += [{**mark, "marker": MARKERS[k], "label": f"{SHORT[k]} {NAMES[k]}"} for k in kinds]
+    lines += [{**mark, "marker": MARKERS[k], "label": f"{LABELS[k]} {NAMES[k]}"} for k in kinds]
     if has_points:
         lines.append({**_POINTS, "label": "measured"})
     return [Line2D([], [], **{k: v for k, v in look.items() if k != "zorder"}) for look in lines]

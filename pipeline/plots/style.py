@@ -26,6 +26,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoMinorLocator, MaxNLocator
 
+from pipeline.layout.own_words import arguments_in_own_words
 from pipeline.plots.looks import (
     BLUE,
     DPI,
@@ -68,6 +69,7 @@ def drawn(plot: Callable[P, T]) -> Callable[P, T]:
     @wraps(plot)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
         given = parameters.bind(*args, **kwargs)
+        given.arguments.update(arguments_in_own_words(given.arguments))
         frame: Frame = given.arguments.get("frame", WIDE)
         with look(frame.style, frame.dpi, frame.width, is_guest()) as found:
             if "frame" in parameters.parameters:

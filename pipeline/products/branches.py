@@ -10,7 +10,7 @@ _ROOM = "pipeline.analysis.branches.analysis"
 class BranchOptions(Options):
     """Options for continuing branches of periodic orbits."""
 
-    parameter: str = option("", "Continuation parameter: a parameter, or frequency_hz; by default the swept one.")
+    parameter: str = option("", "Parameter to follow, or frequency_hz, omega or period; by default the swept one.")
     low: float | None = option(None, "Least value; by default the run's.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default the run's.", unit="SI", flag="--to")
     max_period: int = option(
@@ -30,7 +30,7 @@ class BranchOptions(Options):
 class CurveOptions(BranchOptions):
     """Options for continuing bifurcations as curves in a plane of two parameters."""
 
-    second: str = option(..., "Second parameter: its name, such as q, or frequency_hz.")
+    second: str = option(..., "Second parameter: its name, such as q, or frequency_hz, omega or period.")
     second_low: float = option(..., "Least value of the second parameter.", unit="SI", flag="--second-from")
     second_high: float = option(..., "Largest value of the second parameter.", unit="SI", flag="--second-to")
     curve_period: int = option(

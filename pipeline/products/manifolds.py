@@ -20,7 +20,9 @@ class ManifoldOptions(OrbitOptions):
 class TangencyOptions(OrbitOptions):
     """Options for locating first homoclinic tangencies."""
 
-    parameter: str = option(..., "Parameter along which the manifolds begin to touch: its name, or frequency_hz.")
+    parameter: str = option(
+        ..., "Parameter along which the manifolds begin to touch (frequency_hz, omega and period, too)."
+    )
     low: float = option(..., "Least value of the parameter.", unit="SI", flag="--from")
     high: float = option(..., "Largest value of the parameter.", unit="SI", flag="--to")
     max_period: int = option(1, "Longest orbit period.", unit="drive periods or returns", ge=1, flag="--period")

@@ -341,9 +341,13 @@ def _words(name: str, value: Any) -> str:
     return _word(value) if name in _SPEAKS_FOR_ITSELF else f"{name}_{_word(value)}"
 
 
+_UNNAMEABLE = r'[/\\:<>"|?*]'
+"""Characters that no file name has on Windows; on Linux only the first."""
+
+
 def _word(value: Any) -> str:
     # all digits, since other values give other figures
-    return f"{value:.15g}" if isinstance(value, float) else str(value).replace("/", "-")
+    return f"{value:.15g}" if isinstance(value, float) else re.sub(_UNNAMEABLE, "-", str(value))
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import parameter_name, split_dims
-from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.report.estimates import Estimate, Results, absent
+from pipeline.runs.derive import shown_table
 from pipeline.specification.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def analysed(results: Results, name: str, options: Options) -> xr.Dataset:
 def rows_of(results: Results, name: str, options: Options) -> list[Row]:
     """Return the rows of an analysis' table that match ``where``."""
     ds = analysed(results, name, options)
-    rows = list(function_of(ANALYSES[str(options["analysis"])].table)(ds).rows)
+    rows = list(shown_table(str(options["analysis"]), ds).rows)
     where = options.get("where", {})
     if rows and (unknown := [key for key in where if key not in rows[0]]):
         raise SpecError(unknown_name(f"column of {options['analysis']}", unknown[0], rows[0]))

@@ -18,16 +18,16 @@ import numpy as np
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.layout.conventions import shown_unit
-from pipeline.layout.vocabulary import is_grid_dim, letter, parameter_name, split_dims
-from pipeline.products.product import function_of
+from pipeline.layout.own_words import dims_in_own_words, in_own_words
+from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
-from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.derive import AnalysedRun, shown_table
 from pipeline.runs.drawing import figure
 from pipeline.runs.status import state
 from pipeline.runs.versions import current
 from pipeline.specification.problems import SpecError, unknown_name
-from pipeline.specification.tables import FREQUENCY
+from pipeline.specification.tables import RATES
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in, read_product_attrs
@@ -92,7 +92,7 @@ class Shown:
 
     def __init__(self, run: AnalysedRun, computed: tuple[str, ...]) -> None:
         self.run, self.computed = run, computed
-        self.cube = run.cube()
+        self.cube = in_own_words(run.cube())
         self.axes, self.starts = split_dims(self.cube["status"])
 
     @property
@@ -154,8 +154,9 @@ def _parameters(shown: Shown) -> Iterator[Block]:
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
     rows = []
-    if run.spec.frequency_hz and parameter_name(FREQUENCY) not in swept and run.model.clock_hz is None:
-        rows.append(("drive's frequency", f"{run.spec.frequency_hz:g}", "Hz", "of the forcing", "the specification"))
+    rate, hertz = RATES[run.spec.rate], run.spec.frequency_hz
+    if hertz and rate.column not in swept and run.model.clock_hz is None:
+        rows.append((rate.meaning, f"{rate.given(hertz):g}", rate.unit, "of the forcing", "the specification"))
     for p in run.model.parameters:
         source = chosen.provenance.get(p.name, f"preset {chosen.name}")
         value = f"{run.parameters[p.name]:g}"
@@ -181,7 +182,9 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
     continuation = shown.run.spec.continuation
-    path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
+    path = shown.axes[0]
+    if continuation is not None:
+        (path,) = dims_in_own_words([axis_name(continuation.path)], shown.run.spec.rate)
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
 
 
@@ -200,8 +203,9 @@ def _attractors(shown: Shown) -> Iterator[Block]:
         yield Note(str(error))
         return
     command = command_of("analyse attractors", options, shown.directory)
-    table, told = function_of(ANALYSES["attractors"].table)(found), sentence(found)
-    rows = list(table.rows)
+    found = in_own_words(found)
+    table, told = shown_table("attractors", found), sentence(found)
+    rows: list[dict[str, Any]] = [dict(row) for row in table.rows]
     most, n_others = leading(rows, "attractor_id", "n_cells")
     yield Grid(*_attractor_grid(found, most, shown.axes), _counted(rows, told), command, n_others)
     for remark in table.lines[table.lines.index(told) + 1 :]:
@@ -301,10 +305,11 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     except SpecError as error:
         yield Note(str(error))
         return
+    found = in_own_words(found)
     path = str(found.attrs.get("path", ""))
     unit = shown_unit(found[path].attrs) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
-    rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
+    rows = [_with_letters(row, axis) for row in shown_table(name, found).rows]
     # the settled options, so that a page made from the stored result is the same
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)

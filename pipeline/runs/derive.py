@@ -28,8 +28,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.conventions import conventional
+from pipeline.layout.own_words import in_own_words, rate_attribute
 from pipeline.layout.vocabulary import overrides_attribute
-from pipeline.products.product import Analysis, Options, function_of
+from pipeline.products.product import Analysis, Options, Table, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
@@ -147,7 +148,8 @@ def derive(
     if name == "attractors" and not is_chosen:
         wanted = attractor_options(run)
     wanted = prepared(run, analysis, wanted)
-    key, told = key_of(current(run, name), analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
+    key = key_of(current(run, name), analysis, wanted)
+    told = {**overrides_attribute(run.spec.parameters.overrides), **rate_attribute(run.spec.rate)}
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
         ds = open_product(place)
@@ -170,6 +172,12 @@ def derive(
     if is_chosen:
         _keep(run, wanted)
     return result
+
+
+def shown_table(name: str, ds: xr.Dataset) -> Table:
+    """Return the table of an analysis' result, in the words of the run's specification."""
+    found: Table = function_of(ANALYSES[name].table)(in_own_words(ds))
+    return found
 
 
 def analyses_in(text: str) -> list[str]:

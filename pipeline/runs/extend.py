@@ -18,6 +18,7 @@ from pipeline.layout.cells import CellMap
 from pipeline.layout.evaluation import check_starts, with_sizes
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
+from pipeline.layout.own_words import dims_in_own_words
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.writing import sync_folder
 from pipeline.runs.preview import time_line
@@ -179,7 +180,7 @@ def describe_extension(extension: Extension, *, workers: int | None = None) -> I
     spec, plan = extension.spec, extension.plan
     if spec.title:
         yield spec.title
-    dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
+    dims = ", ".join(f"{d} {n}" for d, n in zip(dims_in_own_words(plan.dims, spec.rate), plan.shape, strict=True))
     yield f"{spec.kind}: {plan.n_cells} cells ({dims or 'one cell'}) in {plan.n_tasks} tasks"
     yield from extension.lines()
     yield f"cube: {size(plan.n_bytes)} before compression"

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.layout.vocabulary import axis_name, grid_dim, is_grid_dim, parameter_name
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, grid_dim, is_grid_dim, parameter_name
 from pipeline.products.product import Options
 from pipeline.specification.problems import SpecError, unknown_name
-from pipeline.specification.tables import FREQUENCY
+from pipeline.specification.tables import FREQUENCY, RATES, Rate, word_named
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from pipeline.store.run import RunDirectory
+
+Some = TypeVar("Some", bound=Options)
 
 DEGREES = "_deg"
 
@@ -22,10 +24,10 @@ DEGREES = "_deg"
 def named(run: RunDirectory, options: Options) -> Options:
     """Translate the names of axes, parameters and states in some options to those of the run.
 
-    ``at`` accepts ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
-    ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second`` accept both names of
-    the frequency. An empty ``parameter`` stands for the swept one, an empty ``state`` for the first state
-    that varies between sections.
+    ``at`` accepts ``frequency``, ``frequency_hz``, ``omega`` or ``period`` of the drive, a parameter, and for a grid
+    of initial states its axis ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second``
+    accept these names, too; bounds are then in their unit. An empty ``parameter`` stands for the swept one, an empty
+    ``state`` for the first state that varies between sections.
 
     Raises
     ------
@@ -48,13 +50,50 @@ def named(run: RunDirectory, options: Options) -> Options:
         if given.get("parameter") == "":
             given["parameter"] = _swept(run, [given.get("second", ""), *given.get("at", {})])
         for role in {"parameter", "second"} & fields.keys():
-            changes[role] = parameter_name(given[role])
+            word = _rate(run, given[role], options)
+            changes[role] = FREQUENCY if word else parameter_name(given[role])
+            changes |= _bounds(role, given, RATES[word], RATES[word].hertz) if word else {}
             problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
         if "state" in fields:
             changes["state"] = given["state"] or model.section_states[0]
             problems += _unknown("state", given["state"], changes["state"], model.state_names)
     if problems:
         raise SpecError(problems)
+    return options.model_copy(update=changes)
+
+
+_BOUNDS = {"parameter": ("low", "high", "before", "after"), "second": ("second_low", "second_high")}
+"""Options with values of a parameter, by the option that names it."""
+
+
+def _rate(run: RunDirectory, name: str, options: Options) -> str:
+    """Return the word for the drive's rate that an option's name is; that of the run if no name was given."""
+    if name == FREQUENCY and getattr(options, "parameter", name) == "":
+        return run.spec.rate
+    return "" if name in run.model.parameter_names else word_named(name)
+
+
+def _bounds(role: str, given: Mapping[str, Any], rate: Rate, convert: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return the given bounds of a role, converted from or to a rate; those of a period in the opposite order."""
+    found = {key: convert(given[key]) for key in _BOUNDS[role] if given.get(key) is not None}
+    low, high = _BOUNDS[role][:2]
+    if rate.inverse and (low in found or high in found):
+        found[low], found[high] = found.get(high), found.get(low)
+    return found
+
+
+def in_own_words(run: RunDirectory, options: Some) -> Some:
+    """Return options from `named` with the drive's rate, where it occurs, in the word of the run."""
+    word, fields = run.spec.rate, type(options).model_fields
+    rate, changes = RATES[word], dict[str, Any]()
+    if at := getattr(options, "at", None):
+        changes["at"] = {
+            word if name == FREQUENCY_DIM else name: rate.given(value) if name == FREQUENCY_DIM else value
+            for name, value in at.items()
+        }
+    for role in _BOUNDS.keys() & fields.keys():
+        if getattr(options, role) == FREQUENCY:
+            changes |= {role: word, **_bounds(role, dict(options), rate, rate.given)}
     return options.model_copy(update=changes)
 
 
@@ -109,4 +148,6 @@ def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> t
             turned = axis in cube.coords and str(cube[axis].attrs.get("units", "")).startswith("rad")
             in_degrees = is_grid_dim(axis) and turned and (degrees or name != plain)
             return axis, math.radians(value) if in_degrees else value
+    if (word := word_named(name)) and FREQUENCY_DIM in dims:
+        return FREQUENCY_DIM, RATES[word].hertz(value)
     raise SpecError(unknown_name("axis", name, [d for d in dims if d in cube.coords] or dims))

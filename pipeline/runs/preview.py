@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.evaluation import size_remarks
+from pipeline.layout.own_words import dims_in_own_words
 from pipeline.layout.plan import Plan, check_space, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
@@ -184,7 +185,8 @@ class Preview:
         if self.spec.title:
             yield self.spec.title
         yield from (f"warning: {remark}" for remark in (*self.spec.model.flow.remarks, *unit_remarks(self.spec.model)))
-        dims = ", ".join(f"{d} {n}" for d, n in self.dims.items())
+        names = dims_in_own_words(self.dims, self.spec.rate)
+        dims = ", ".join(f"{d} {n}" for d, n in zip(names, self.dims.values(), strict=True))
         yield f"{self.spec.kind}: {self.n_cells} cells ({dims or 'one cell'})"
         block = " x ".join(map(str, self.plan.block)) or "1"
         yield from start_remarks(self.spec.initial_conditions)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magpend_core.status import Status
+from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
 from pipeline.runs.preview import figure_command
@@ -140,7 +141,7 @@ class Outcome:
 
 def outcomes_of(run: RunDirectory) -> list[Outcome]:
     """Count the cells of a run that have each status, and find their parameter ranges."""
-    status = run.cube()["status"].load()
+    status = in_own_words(run.cube())["status"].load()
     codes = np.flatnonzero(np.bincount(status.values.ravel().astype(np.int64)))
     return [_outcome(status, Status(int(code))) for code in codes]
 
@@ -196,7 +197,7 @@ def _zoom(lost: list[Outcome], run: RunDirectory) -> str:
     """Return a ``magpend zoom`` command for the ranges in which cells diverged or failed; an empty text if there are
     none.
     """
-    whole = dict(zip(run.plan.dims, run.plan.shape, strict=True))
+    whole = dict(zip(dims_in_own_words(run.plan.dims, run.spec.rate), run.plan.shape, strict=True))
     spans: dict[str, tuple[float, float]] = {}
     for dim in (d for d, n in whole.items() if n > 1):
         ranges = [r for o in lost for r in o.where if r[0] == dim]

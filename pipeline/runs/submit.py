@@ -211,7 +211,9 @@ def _refuse_second(submission: Submission) -> None:
 
 def _ask(command: Sequence[str], text: str | None = None) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(list(command), input=text, capture_output=True, text=True, timeout=_ANSWER_S, check=False)
+        return subprocess.run(
+            list(command), input=text, capture_output=True, encoding="utf-8", timeout=_ANSWER_S, check=False
+        )
     except subprocess.TimeoutExpired:
         raise SubmitError(f"{command[0]}: no answer within {_ANSWER_S:.0f} s; try again.") from None
 

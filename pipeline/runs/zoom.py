@@ -9,13 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from magpend_core.models.imported import KEY
 from pipeline.specification.files import check_new_file, find_spec, merged, nested, specification_toml, write_new
 from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
-from pipeline.specification.tables import FREQUENCY, Range
+from pipeline.specification.tables import FREQUENCY, RATES, Range
 from pipeline.store.local import refuse_place
 
 MARK = "(zoom)"
@@ -141,7 +143,7 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
     if not keys:
         return ["zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."]
     names = [_state(spec, key) or key for key in keys]
-    known = (FREQUENCY, *state_keys(spec.model), *spec.model.parameter_names)
+    known = (*RATES, *state_keys(spec.model), *spec.model.parameter_names)
     unknown = [f"zoom: {unknown_name('axis', key, known)}" for key in keys if key not in known]
     if unknown:
         return unknown
@@ -184,7 +186,7 @@ def _old(spec: Spec, key: str) -> tuple[Any, float]:
     """Return the old value or range of a state or parameter, and the factor to the unit of the new value."""
     state = _state(spec, key)
     if state is None:
-        return spec.axes.get(key), 1.0
+        return spec.axes.get(FREQUENCY if is_rate(spec, key) else key), 1.0
     for name in (state, degrees_key(state)):
         value = getattr(spec.initial_conditions, name, None)
         if value is not None:
@@ -201,13 +203,18 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
     value, factor = _old(spec, key)
     if isinstance(value, Range):
-        array = value.array()
+        array = np.sort(RATES[key].given(value.array())) if is_rate(spec, key) else value.array()
         return float(array[0]) * factor, float(array[-1]) * factor
     return (value[0] * factor, value[1] * factor) if isinstance(value, tuple) else None
 
 
 def _slack(extent: tuple[float, float]) -> float:
     return _ROUNDING * max(abs(extent[0]), abs(extent[1]))
+
+
+def is_rate(spec: Spec, key: str) -> bool:
+    """Return whether a key is a word for the drive's rate, and no parameter of the model."""
+    return key in RATES and key not in spec.model.parameter_names
 
 
 def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
@@ -218,13 +225,12 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
         data["initial_conditions"].pop(degrees_key(state), None)
         data["initial_conditions"][key] = value
         return
-    parameters = data["parameters"]
-    parameters.pop(key, None) if key == FREQUENCY else parameters["overrides"].pop(key, None)
-    if isinstance(value, dict):
-        data["axes"][key] = value
-        return
-    data["axes"].pop(key, None)
-    (parameters if key == FREQUENCY else parameters["overrides"])[key] = value
+    table = data["parameters"] if is_rate(spec, key) else data["parameters"]["overrides"]
+    for name in RATES if is_rate(spec, key) else (key,):
+        table.pop(name, None)
+        if name != key or not isinstance(value, dict):
+            data["axes"].pop(name, None)
+    (data["axes"] if isinstance(value, dict) else table)[key] = value
 
 
 # ---- TOML --------------------------------------------------------------------------------------
@@ -296,7 +302,7 @@ def widened(spec: Spec, widening: Widening) -> Spec:
 
 
 def _problems(spec: Spec, widening: Widening) -> list[str]:
-    known = (FREQUENCY, *spec.model.parameter_names, *state_keys(spec.model))
+    known = (*RATES, *spec.model.parameter_names, *state_keys(spec.model))
     problems = [f"extend: {unknown_name('axis', name, known)}" for name in widening.axes if name not in known]
     states = [name for name in widening.axes if state_of_key(name, spec.model)]
     kind = spec.initial_conditions.kind

@@ -206,7 +206,7 @@ def model(
     Parameters
     ----------
     equations
-        Lines ``x' = v`` (rates), ``drive = A*cos(2*pi*f*t)`` (parts with a name) and ``d = 0.2`` (parameters);
+        Lines ``x' = v`` (rates), ``drive = A*cos(omega*t)`` (parts with a name) and ``d = 0.2`` (parameters);
         ``x'' = ...`` makes the states ``x`` and ``x_dot``. Or a dict of right sides by state. In expressions
         ``t`` is the time [s] and ``f`` the frequency of the drive [Hz]. The states have the order of the
         equations, all derivatives last. Otherwise the name of a model that ships, the path of a model's file
@@ -243,7 +243,7 @@ def model(
 
     Examples
     --------
-    >>> duffing = model("x'' = -d*x' + x - x**3 + A*cos(2*pi*f*t)", d=0.2, A=0.3)
+    >>> duffing = model("x'' = -d*x' + x - x**3 + A*cos(omega*t)", d=0.2, A=0.3)
     >>> duffing.state_names
     ('x', 'x_dot')
     """

@@ -11,7 +11,7 @@ import numpy as np
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import ParameterError, unknown_name_problem
 from pipeline.specification.starts import GridStarts, Starts
-from pipeline.specification.tables import FREQUENCY, ParametersTable, Range
+from pipeline.specification.tables import FREQUENCY, RATES, ParametersTable, Range, word_of
 
 MAX_CELLS = 10**15
 MOST_RELATED = 12
@@ -45,16 +45,17 @@ def parameter_problems(
 def _frequency_problems(
     table: ParametersTable, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
 ) -> list[str]:
-    problems = []
-    if FREQUENCY in declared and table.frequency_hz is not None:
-        problems.append("axes.frequency_hz: is also in parameters; keep one of the two.")
     if FREQUENCY in axes:
-        least = float(axes[FREQUENCY].array()[0])
+        axis = axes[FREQUENCY]
+        least = float(axis.given()[0])
         if least <= 0:
-            problems.append(f"axes.frequency_hz: its least value {least!r} must be greater than 0 Hz.")
-    if FREQUENCY not in declared and table.frequency_hz is None and complete:
-        return ["parameters.frequency_hz: missing; set it there, or sweep it as axes.frequency_hz."]
-    return problems
+            unit = RATES[word_of(axis)].unit
+            return [f"axes.frequency_hz: its least value {least!r} must be greater than 0 {unit}."]
+    if FREQUENCY not in declared and table.hertz is None and complete:
+        return [
+            "parameters.frequency_hz: missing; set it there (or omega, or period), or sweep it as axes.frequency_hz."
+        ]
+    return []
 
 
 def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -25,7 +26,17 @@ from pipeline.specification.problems import SpecError, checked, shown, unknown_c
 from pipeline.specification.recorded_drive import HOW, DriveTable, recorded, run_problems
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, Starts, refine_problems, starts_model
-from pipeline.specification.tables import FREQUENCY, Continuation, Execution, Integration, ParametersTable, Range, Table
+from pipeline.specification.tables import (
+    FREQUENCY,
+    RANGES,
+    RATES,
+    Continuation,
+    Execution,
+    Integration,
+    ParametersTable,
+    Range,
+    Table,
+)
 
 KINDS = ("sweep", "continuation")
 
@@ -39,6 +50,7 @@ TABLES: dict[str, type[Table]] = {
     "section": SectionTable,
     "noise": NoiseTable,
 }
+_AS_GIVEN = re.compile(rf"\b(axes|parameters)\.{FREQUENCY}\b")
 _OPTIONAL = ("drive", "section", "noise")
 _NO_TABLES = ("kind", "title", "model", "measured")
 KEYS = (
@@ -92,8 +104,9 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     data = data if folder is None else _with_texts(data, folder, problems)
     kind, title = _kind(data, problems), _title(data, problems)
     model = add_model(data.get("model", DEFAULT), folder, problems)
+    data, word = _in_hertz(data, () if model is None else model.parameter_names, problems)
     tables = {name: None if name in wrong else _table(data, name, table, problems) for name, table in TABLES.items()}
-    axes, drift = _axes(data, problems), moving.drift_tables(data, problems)
+    axes, drift = _axes(data, word, problems), moving.drift_tables(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     if model is None:  # the remaining checks need the model's states and parameters
         model = stand_in(data.get("model"), folder, forced="section" not in data)
@@ -122,7 +135,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     if ramps and not problems:
         problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
     if problems:
-        raise SpecError(problems)
+        raise SpecError([_AS_GIVEN.sub(rf"\1.{word}", p) for p in problems])
     return {
         "kind": kind,
         "title": title,
@@ -223,8 +236,32 @@ def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: lis
     return None if is_left_out else checked(model, data.get(name, {}), name, problems)
 
 
-def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
+def _in_hertz(data: Mapping[str, Any], own: tuple[str, ...], problems: list[str]) -> tuple[Mapping[str, Any], str]:
+    """Name an axis of the drive's rate, whatever its word, ``frequency_hz``; return also the word of the rate.
+
+    A parameter of the model that has one of the words for its name stays what it is.
+    """
+    axes, parameters = dict(data.get("axes", {})), data.get("parameters", {})
+    swept = [word for word in RATES if word in axes and word not in own]
+    given = [*(f"axes.{word}" for word in swept), *(f"parameters.{word}" for word in RATES if word in parameters)]
+    if len(given) > 1:
+        problems.append(f"{' and '.join(given)}: all give the rate of the drive; keep one.")
+        return {**data, "axes": {name: axis for name, axis in axes.items() if name not in swept}}, FREQUENCY
+    word = given[0].partition(".")[2] if given else FREQUENCY
+    found = {FREQUENCY if name in swept else name: value for name, value in axes.items()}
+    walk = data.get("continuation", {})
+    if data.get("kind") == "continuation" and walk.get("path", FREQUENCY) in (FREQUENCY, *swept):
+        data = {**data, "continuation": {**walk, "path": FREQUENCY}}
+        if word == "period":
+            problems.append("continuation.path = 'period': branches follow frequency_hz or omega; sweep one of these.")
+    return {**data, "axes": found}, word
+
+
+def _axes(data: Mapping[str, Any], word: str, problems: list[str]) -> dict[str, Range]:
+    axes = {
+        name: checked(RANGES[word] if name == FREQUENCY else Range, value, f"axes.{name}", problems)
+        for name, value in data.get("axes", {}).items()
+    }
     return {name: axis for name, axis in axes.items() if axis is not None}
 
 
@@ -273,10 +310,10 @@ def _drift_problems(
 ) -> list[str]:
     """Return the problems of moving parameters: their values, and what the model's equations do not allow."""
     values = model.load(table.chosen, **table.overrides)
-    problems = moving.motion_problems(ramps, values, axes, table.frequency_hz)
+    problems = moving.motion_problems(ramps, values, axes, table.hertz)
     if problems or not imports:
         return problems
-    return moving.system_problems(model, ramps, values, axes, table.frequency_hz)
+    return moving.system_problems(model, ramps, values, axes, table.hertz)
 
 
 _NOT_OF_MAPS = {
@@ -292,13 +329,13 @@ def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
     """Return the problems of tables and keys that a map, which has no time and no steps, cannot have."""
     what = f"{model.name} is a map"
     problems = [f"{name}: {what}, {why}; drop the table." for name, why in _NOT_OF_MAPS.items() if name in data]
-    for table in ("parameters", "axes"):
-        if FREQUENCY in data.get(table, {}):
-            problems.append(f"{table}.{FREQUENCY}: {what}, which has no drive; drop the key.")
-    given = data.get("integration", {})
+    rates = [*(f"parameters.{word}" for word in RATES), f"axes.{FREQUENCY}"]
+    given = [key for key in rates for table, _, word in [key.partition(".")] if word in data.get(table, {})]
+    problems += [f"{key}: {what}, which has no drive; drop the key." for key in given]
+    own = data.get("integration", {})
     # a stored specification has all keys, with their defaults
     fields = Integration.model_fields
-    steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if given.get(k, d := fields[k].default) != d]
+    steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if own.get(k, d := fields[k].default) != d]
     problems += [f"integration.{key}: {what}, whose iterations have no steps; drop the key." for key in steps]
     if "extremes" in data.get("products", {}):
         problems.append(f"products.extremes: {what}, without motion between its iterations; drop the product.")

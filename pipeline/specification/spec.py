@@ -47,7 +47,15 @@ from pipeline.specification.recorded_drive import DriveTable, RecordedDrive, rec
 from pipeline.specification.section import SectionTable, seen_through
 from pipeline.specification.starts import GridStarts, Starts
 from pipeline.specification.table_methods import TableMethod, knows_its_keys
-from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range
+from pipeline.specification.tables import (
+    FREQUENCY,
+    Continuation,
+    Execution,
+    Integration,
+    ParametersTable,
+    Range,
+    word_of,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -104,8 +112,8 @@ class Spec:
 
     Examples
     --------
-    >>> spec = Spec("sweep", "x' = -x + A*cos(2*pi*f*t)\nA = 1.0").with_axis("A", 0.5, 1.0, 3)
-    >>> spec = spec.with_parameters(frequency_hz=0.2).with_start_grid(x=(-1, 1, 4)).with_integration(n_keep=2)
+    >>> spec = Spec("sweep", "x' = -x + A*cos(omega*t)\nA = 1.0").with_axis("A", 0.5, 1.0, 3)
+    >>> spec = spec.with_parameters(omega=1.0).with_start_grid(x=(-1, 1, 4)).with_integration(n_keep=2)
     >>> spec.tables["axes"]
     {'A': {'start': 0.5, 'stop': 1.0, 'num': 3}}
     >>> spec.integration.rtol
@@ -258,7 +266,12 @@ class Spec:
         """
         if self.model.clock_hz is not None:
             return self.model.clock_hz
-        return self.parameters.frequency_hz if self.recorded is None else self.recorded.frequency_hz
+        return self.parameters.hertz if self.recorded is None else self.recorded.frequency_hz
+
+    @property
+    def rate(self) -> str:
+        """Word in which the drive's rate is given: ``frequency_hz``, ``omega`` or ``period``."""
+        return word_of(self.axes[FREQUENCY]) if FREQUENCY in self.axes else (*self.parameters.rates, FREQUENCY)[0]
 
     @property
     def refine(self) -> int | None:
@@ -300,7 +313,7 @@ class Spec:
         Parameters
         ----------
         name
-            ``frequency_hz`` or a parameter of the model.
+            ``frequency_hz``, ``omega`` or ``period`` of the drive, or a parameter of the model.
         start
             First value.
         stop
@@ -430,7 +443,12 @@ class Spec:
         tables["products"] = {name: options.plain() for name, options in self.products.items()}
         if self.drift:
             tables["drift"] = {name: table.plain() for name, table in self.drift.items()}
-        tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
+        tables["axes"] = {
+            self.rate if name == FREQUENCY else name: axis.model_dump(mode="json", exclude_none=True)
+            for name, axis in self.axes.items()
+        }
+        if self.continuation is not None and self.continuation.path == FREQUENCY:
+            tables["continuation"]["path"] = self.rate
         return tables
 
     def __eq__(self, other: object) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -16,9 +17,45 @@ from magpend_core.models.presets import Preset
 FREQUENCY = "frequency_hz"
 """Name of the drive frequency among the parameters."""
 
+
+@dataclass(frozen=True)
+class Rate:
+    """A word for the drive's rate, with its unit and the factor that converts it to Hz."""
+
+    column: str  # in tables, where period is the number of drive periods of an orbit
+    meaning: str
+    unit: str
+    factor: float = 1.0
+    inverse: bool = False  # whether it is a time
+
+    def hertz(self, given: Any) -> Any:
+        """Return the frequency [Hz] for a value in this word; for arrays, too."""
+        return 1.0 / given if self.inverse else given / self.factor
+
+    def given(self, hertz: Any) -> Any:
+        """Return the value in this word for a frequency [Hz]; for arrays, too."""
+        return 1.0 / hertz if self.inverse else hertz * self.factor
+
+    def slope(self, hertz: Any) -> Any:
+        """Return the size of the derivative of `given` by the frequency."""
+        return hertz**-2.0 if self.inverse else self.factor
+
+
+RATES = {
+    FREQUENCY: Rate(FREQUENCY, "drive frequency", "Hz"),
+    "omega": Rate("omega", "angular drive frequency", "rad/s", 2.0 * math.pi),
+    "period": Rate("drive_period", "drive period", "s", inverse=True),
+}
+"""Words by which the drive's rate may be given. Cubes hold the frequency."""
+
 MAX_POINTS = 10_000_000
 EXACT = 2**53
 """Largest bound up to which all whole numbers are exact in float64."""
+
+
+def word_named(name: str) -> str:
+    """Return the word for the drive's rate that a name of it in options or tables stands for; empty if it is none."""
+    return next((word for word, rate in RATES.items() if name in (word, rate.column)), "")
 
 
 class Table(BaseModel):
@@ -70,7 +107,11 @@ class Range(Table):
         return (stop - start) // step + 1
 
     def array(self) -> np.ndarray:
-        """Return the values, each rounded once from its exact decimal number to float64."""
+        """Return the values that cells have."""
+        return self.given()
+
+    def given(self) -> np.ndarray:
+        """Return the values as they are given, each rounded once from its exact decimal number to float64."""
         if self.values is not None:
             return np.array(self.values, dtype=np.float64)
         start, stop = Fraction(repr(self.start)), Fraction(repr(self.stop))
@@ -85,6 +126,31 @@ class Range(Table):
         if max(abs(first), abs(first + (num - 1) * each), below) <= EXACT:
             return np.asarray((first + each * np.arange(num)) / below)
         return np.array([(first + i * each) / below for i in range(num)], dtype=np.float64)
+
+
+class OmegaRange(Range):
+    """Angular frequencies of the drive [rad/s]; `array` has the frequencies [Hz]."""
+
+    word: ClassVar[str] = "omega"
+
+    def array(self) -> np.ndarray:
+        """Return the frequencies of the drive [Hz], rising."""
+        found: np.ndarray = np.sort(RATES[self.word].hertz(self.given()))
+        return found
+
+
+class PeriodRange(OmegaRange):
+    """Periods of the drive [s]; `array` has the frequencies [Hz]."""
+
+    word: ClassVar[str] = "period"
+
+
+RANGES: dict[str, type[Range]] = {FREQUENCY: Range, "omega": OmegaRange, "period": PeriodRange}
+
+
+def word_of(axis: Range | None) -> str:
+    """Return the word in which an axis gives the drive's rate."""
+    return axis.word if isinstance(axis, OmegaRange) else FREQUENCY
 
 
 class PresetTable(Table):
@@ -124,6 +190,22 @@ class ParametersTable(Table):
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(
         default=None, description="Drive frequency [Hz], unless it is an axis."
     )
+    omega: Annotated[float, Field(gt=0)] | None = Field(
+        default=None, description="Angular frequency of the drive [rad/s], instead of frequency_hz."
+    )
+    period: Annotated[float, Field(gt=0)] | None = Field(
+        default=None, description="Period of the drive [s], instead of frequency_hz."
+    )
+
+    @property
+    def rates(self) -> tuple[str, ...]:
+        """Words in which the drive's rate is given: one, or none if it is swept."""
+        return tuple(word for word in RATES if getattr(self, word) is not None)
+
+    @property
+    def hertz(self) -> float | None:
+        """Drive frequency [Hz]; None if it is swept."""
+        return RATES[self.rates[0]].hertz(getattr(self, self.rates[0])) if self.rates else None
 
     @property
     def chosen(self) -> str | Preset | None:

@@ -202,9 +202,13 @@ def make_folder(path: Path) -> None:
         sync_folder(path.parent)
 
 
+_TO_SYNC = "rb" if hasattr(os, "O_DIRECTORY") else "r+b"
+"""Mode in which a file is opened to be synced: Windows refuses to sync one that is open for reading alone."""
+
+
 def sync_file(path: Path) -> None:
     """Make a file's content durable on disk."""
-    with writing(path), open_plain(path, "rb") as file:
+    with writing(path), open_plain(path, _TO_SYNC) as file:
         os.fsync(file.fileno())
 
 
@@ -376,9 +380,12 @@ def _holder_in(content: bytes) -> dict[str, Any] | None:
 
 
 def has_ended(content: bytes) -> bool:
-    """Return whether the holder of a lock was a process of this machine that has ended."""
+    """Return whether the holder of a lock was a process of this machine that has ended, as far as the system tells.
+
+    Windows does not tell: there, `os.kill` with the signal 0 sends Ctrl-C.
+    """
     found = _holder_in(content)
-    if found is None or found["host"] != platform.node():
+    if found is None or found["host"] != platform.node() or not hasattr(os, "killpg"):
         return False
     try:
         os.kill(found["pid"], 0)

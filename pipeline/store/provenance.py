@@ -50,7 +50,11 @@ def git_commit() -> str:
 def _git(*arguments: str) -> str | None:
     try:
         done = subprocess.run(
-            ["git", "-C", str(_ROOT), *arguments], capture_output=True, text=True, check=True, timeout=_GIT_SECONDS
+            ["git", "-C", str(_ROOT), *arguments],
+            capture_output=True,
+            encoding="utf-8",
+            check=True,
+            timeout=_GIT_SECONDS,
         )
     except (OSError, subprocess.SubprocessError):
         return None

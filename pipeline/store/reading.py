@@ -18,6 +18,7 @@ from magpend_core.models.model import Model
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.conventions import conventional, netcdf_safe
 from pipeline.layout.identity import numbered
+from pipeline.layout.own_words import rate_attribute
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import (
     drift_attributes,
@@ -86,6 +87,7 @@ def _attributes(run: OpenedRun) -> dict[str, Any]:
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
         **overrides_attribute(run.spec.parameters.overrides),
+        **rate_attribute(run.spec.rate),
         **section_attributes(run.model.crossing),
         **drift_attributes(run.model),
         **noise_attributes(run.model.disturbance),

@@ -1,7 +1,7 @@
 """Read a model from lines of equations, as one writes them on paper, into the table of a model as text.
 
     x'' = -d*x' + x - x**3 + drive      a rate; the states are x and x_dot
-    drive = A*cos(2*pi*f*t)             a part with a name
+    drive = A*cos(omega*t)              a part with a name
     d = 0.2                             a parameter and its value
 
 A comment begins with #. A line with an open bracket goes on in the next one.

@@ -5,6 +5,8 @@ Needs nothing but numpy; takes milliseconds, whatever is given.
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -20,6 +22,8 @@ from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsRead
 from magpend_core.sizes import MAX_STATES
 
 MAX_DEFINED = 200
+OMEGA = "omega"
+"""The drive's angular frequency, in a text that uses time and gives the name no other meaning."""
 ESCAPE = 1e9
 """Bound beyond which a trajectory has diverged, if the text gives none."""
 BOUNDS = {"finite": FINITE, "positive": POSITIVE, "non-negative": NON_NEGATIVE, "fraction": FRACTION}
@@ -107,7 +111,7 @@ class _Reading(ViewsReader):
         if isinstance(table.get("states"), Mapping) and len(table["states"]) > MAX_STATES:
             return None  # every use of a state would be a problem of its own
         parameters, values = self._parameters(table.get("parameters", {}))
-        define = self._defined(table.get("define", {}))
+        define = self._defined(self._with_omega(table))
         states, equations = self._equations(table.get("equations", {}), states, "equations" in table)
         described, quantities = self._quantities(table.get("quantities", {}))
         state_names = tuple(s.name for s in states)
@@ -217,6 +221,15 @@ class _Reading(ViewsReader):
                 values[name] = self.number(entry["value"], place)
             parameters.append(parameter)
         return tuple(parameters), values
+
+    def _with_omega(self, table: Mapping[str, Any]) -> Any:
+        """Return the table of definitions; where a text uses time and an ``omega`` that it does not define, that is the
+        drive's angular frequency.
+        """
+        given = table.get("define", {})
+        words = set(re.findall(r"[A-Za-z_]\w*", json.dumps(_plain(table), default=str)))
+        is_drive = {"t", OMEGA} <= words and OMEGA not in self.known and isinstance(given, Mapping)
+        return {OMEGA: "2*pi*f", **given} if is_drive else given
 
     def _defined(self, given: Any) -> dict[str, Tree]:
         table = self.table(given, self.at("define"), MAX_DEFINED, "definitions")

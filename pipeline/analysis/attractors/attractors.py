@@ -335,7 +335,7 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
     rate, error = first["lyapunov"].values, first["lyapunov_stderr"].values
     counts = on_attractor(ds, n_sigma=signs.n_sigma, least=signs.least).transpose(*dims).values
     ids, kind, number = result["attractor_id"].values, result["kind"].values, result["attractor"].values
-    points = np.array(index_of_rows(result), np.int64).reshape(result[ROW_SIZE].ndim, -1).T
+    points = np.array(index_of_rows(result), np.int64).reshape(result[ROW_SIZE].ndim, result.sizes[SET]).T
     for row in np.flatnonzero(np.isin(kind, APERIODIC)).tolist():
         point = tuple(points[row].tolist())
         which = (ids[point] == number[row]) & counts[point]

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.bifurcations import FOLD
+from pipeline.analysis.branches.bifurcations import FOLD, LABELS
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values
@@ -178,6 +178,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
             {
                 parameter: float(one["value"]),
                 "bracket": float(one["bracket"]),
+                "label": LABELS[told["kind"]],
                 "type": told["kind"],
                 "criticality": "" if told["criticality"] == "unknown" else told["criticality"],
                 "period": int(ds["orbit_period"].values[branch]),
@@ -222,6 +223,7 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
     to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
     return {
         name if unit == "1" else f"{name} {unit}".rstrip(): f"{row[parameter_name(name)]:.7f}",
+        "label": row["label"],
         "type": row["type"],
         "criticality": row["criticality"],
         "normal_form": _with_error(row["normal_form"], row["normal_form_error"]),
@@ -385,8 +387,10 @@ def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
     one = ds.isel(special=k)
     ranges = [float(np.nanmax(ds[role].values) - np.nanmin(ds[role].values)) for role in ("first", "second")]
     errors = [float(one[f"special_{role}_error"]) for role in ("first", "second")]
+    kind = values(one, "special_kind")["special_kind"]
     return {
-        "type": values(one, "special_kind")["special_kind"],
+        "label": LABELS[kind],
+        "type": kind,
         names[0]: float(one["special_first"]),
         names[1]: float(one["special_second"]),
         "period": int(one["special_period"]),
@@ -405,4 +409,5 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     lines = [one[role].values[:n] for role in ("first", "second")]
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
     ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
-    return f"  {number}: {told['kind']}, period {told['orbit_period']}: {spans}" + (f"; ends: {ends}" if ends else "")
+    what = f"{LABELS[told['kind']]} {told['kind']}, period {told['orbit_period']}"
+    return f"  {number}: {what}: {spans}" + (f"; ends: {ends}" if ends else "")

@@ -18,7 +18,7 @@ import xarray as xr
 from magpend_core.models.model import Parameters
 from pipeline.analysis.branches.analysis import settle_branches
 from pipeline.analysis.branches.arclength import Point
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, TORUS
+from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, LABELS, TORUS
 from pipeline.analysis.branches.carrying import (
     ORBIT,
     PARAMETER,
@@ -321,6 +321,7 @@ def bands_table(ds: xr.Dataset) -> Table:
         low, middle, high, n = interval_of(ds["bifurcation_value"].values[:, k])
         rows.append(
             {
+                "label": LABELS[words[int(ds["kind"].values[k])]],
                 "type": words[int(ds["kind"].values[k])],
                 "period": int(ds["orbit_period"].values[k]),
                 "branch": int(ds["of_branch"].values[k]),
@@ -339,6 +340,7 @@ def bands_table(ds: xr.Dataset) -> Table:
     shown = [
         {
             name: f"{row['value']:.7g}",
+            "label": row["label"],
             "type": row["type"],
             "period": str(row["period"] or "equilibrium"),
             "median": f"{row['median']:.7g}",

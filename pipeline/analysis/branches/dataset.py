@@ -72,6 +72,8 @@ def dataset_of(
     states = state_units(model)
     variables = arrays.variables(parameter_units(parameter, model), states)
     variables |= _per_branch(branches, events, n_angles, model) | _per_event(branches, events, longest, names, states)
+    for name in ("value", "bracket"):
+        variables[name][2]["units"] = parameter_units(parameter, model)
     variables |= _fixed(branches, parameter, parameters)
     if words:
         variables |= _side_variables(arrays.side, events, words)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.layout.conventions import code_flags
+from pipeline.layout.own_words import hertz_of
 from pipeline.layout.vocabulary import PERIODIC, model_of
 from pipeline.products.lyapunov import LyapunovFlag
 
@@ -113,8 +114,8 @@ def period_seconds(ds: xr.Dataset) -> xr.DataArray:
         return xr.DataArray(1.0)
     if "return_time" in ds:
         return ds["return_time"].mean("period_index")
-    frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
-    return 1.0 / frequency
+    frequency = hertz_of(ds)
+    return 1.0 / (xr.DataArray(float(ds.attrs["frequency_hz"])) if frequency is None else frequency)
 
 
 def _running(blocks: xr.DataArray) -> xr.DataArray:

@@ -13,6 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, words_of
@@ -65,18 +66,19 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     base = parameters_of(run.cube())
     places = [(i, j) for i in range(located.sizes["branch"]) for j in range(int(located["n_points"][i]))]
     run.echo(f"response: {len(places)} orbits")
+    flow = of_flow(base).model
+    both: list[State | Quantity] = [*flow.states, *flow.quantities]
     rows = tuple(np.array(places, int).reshape(-1, 2).T)
     variables: dict[str, Any] = {}
-    for name, (dims, found, about) in _measured([_at_point(located, base, *p) for p in places], options).items():
+    sizes = {"channel": len(both), "harmonic": options.harmonics}
+    for name, (dims, found, about) in _measured([_at_point(located, base, *p) for p in places], sizes).items():
         whole = np.full((located.sizes["branch"], located.sizes["point"], *found.shape[1:]), np.nan)
         whole[rows] = found
         variables[name] = (("branch", "point", *dims), whole, about)
     events = [_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
-    there = _measured(events, options)
+    there = _measured(events, sizes)
     variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
     variables |= _jumps(located, base, events, options)
-    flow = of_flow(base).model
-    both: list[State | Quantity] = [*flow.states, *flow.quantities]
     kept = located.drop_vars([name for name in map(str, located.variables) if name.startswith((*_LEFT_OUT, "state"))])
     return kept.assign(variables).assign_coords(
         channel=("channel", [v.name for v in both], {"long_name": "state or quantity"}),
@@ -85,9 +87,9 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     )
 
 
-def _measured(orbits: Sequence[Orbit], options: ResponseOptions) -> dict[str, Variable]:
-    """Return the measures of orbits as variables, without the dims of the orbits."""
-    found = measures_of(orbits, options.harmonics)
+def _measured(orbits: Sequence[Orbit], sizes: dict[str, int]) -> dict[str, Variable]:
+    """Return the measures of orbits as variables, without the dims of the orbits; `sizes` of the others."""
+    found = measures_of(orbits, sizes["harmonic"])
     over = ("channel",)
     columns = {
         "amplitude": (found.amplitude, "half of peak to peak"),
@@ -101,7 +103,10 @@ def _measured(orbits: Sequence[Orbit], options: ResponseOptions) -> dict[str, Va
     variables["harmonic_amplitude"] = (both, np.abs(found.harmonics), {"long_name": "amplitude of the harmonic"})
     about = {"units": "rad", "long_name": "lag of the harmonic behind that of the drive"}
     variables["phase"] = (both, lags_of(orbits, found.harmonics), about)
-    return variables
+    return {  # with all dims, even of no orbits
+        name: (dims, values.reshape(len(orbits), *(sizes[dim] for dim in dims)), text)
+        for name, (dims, values, text) in variables.items()
+    }
 
 
 def _at_point(located: xr.Dataset, base: Parameters, branch: int, point: int) -> Orbit:
@@ -167,6 +172,7 @@ def _jumps(
     }
     found: dict[str, Variable] = {n: (("jump",), v, {"long_name": text}) for n, (v, text) in columns.items()}
     about = {"long_name": "where a trajectory lands", **code_flags([*LANDINGS])}
+    found["jump_beyond"][2]["units"] = str(located.attrs["parameter_units"])
     found["jump_landing"] = (("jump",), codes, about)
     text = {"long_name": "half of peak to peak of the orbit on which a trajectory lands"}
     found["jump_amplitude"] = (("jump", "channel"), amplitude.reshape(-1, len(nothing)), text)
@@ -289,6 +295,7 @@ def _jump(ds: xr.Dataset, name: str, k: int) -> Words:
     return {
         **{key: f"{value:g}" for key, value in fixed_of(ds, branch).items()},
         name: f"{float(ds['value'][event]):.7g}",
+        "label": LABELS[words_of(ds["kind"])[int(ds["kind"][event])]],
         "as it": "rises" if bool(one["jump_rises"]) else "falls",
         "from": f"{float(ds['bifurcation_amplitude'][event, 0]):.6g} (period {int(ds['orbit_period'][branch])})",
         "to": LANDINGS[word] or lands,

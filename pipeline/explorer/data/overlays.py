@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.bifurcations import KINDS as BIFURCATIONS
+from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.outcomes import share_interval
 from pipeline.analysis.ragged import dense, isel
@@ -35,7 +36,7 @@ from pipeline.layout.vocabulary import (
     time_unit,
 )
 from pipeline.plots import palette
-from pipeline.plots.branches import NAMES, SHORT, pieces
+from pipeline.plots.branches import NAMES, pieces
 from pipeline.plots.labels import state_measure
 from pipeline.plots.lyapunov import EXPONENT_COLOURS
 from pipeline.store.run import RunDirectory
@@ -217,7 +218,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
         "kind": NAMES[kind],
         "x": float(found["value"][k]),
         "y": [float(v) for v in values if np.isfinite(v)],
-        "label": f"{SHORT[kind]}{period or ''}",
+        "label": f"{LABELS[kind]}{period or ''}",
         "branch": branch,
         "period": period,
         "criticality": criticality or None,

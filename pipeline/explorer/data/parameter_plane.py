@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
-from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
@@ -19,7 +19,7 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import TOLERANCE, fixed_points, orbit_series, parts_of
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
-from pipeline.plots.branches import NAMES, POINT_NAMES
+from pipeline.plots.branches import NAMES
 from pipeline.plots.labels import swept_label
 from pipeline.store.run import RunDirectory
 
@@ -65,7 +65,7 @@ def _special(found: xr.Dataset, k: int) -> dict[str, Any]:
     kind = names[int(found["special_kind"][k])]
     return {
         "kind": kind.replace("_", " "),
-        "label": POINT_NAMES[kind],
+        "label": LABELS[kind],
         "x": float(found["special_first"][k]),
         "y": float(found["special_second"][k]),
         "period": int(found["special_period"][k]),

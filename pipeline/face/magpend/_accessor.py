@@ -173,8 +173,8 @@ class DatasetAccessor:
         nearest
             Whether to take the nearest value of an axis. Otherwise a value must be on its axis, except for rounding.
         values
-            Value by axis: ``frequency`` or ``frequency_hz``, a parameter, ``branch``, or for a grid of initial states
-            the state, with ``_deg`` in degrees.
+            Value by axis: ``frequency_hz``, ``omega`` or ``period``, a parameter, ``branch``, or for a grid of
+            initial states the state, with ``_deg`` in degrees.
 
         Returns
         -------

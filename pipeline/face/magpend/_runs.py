@@ -13,13 +13,13 @@ from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions,
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
-from pipeline.products.product import Options, function_of
+from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
 from pipeline.runs.arguments import names_arguments
-from pipeline.runs.derive import stale, stored_each
+from pipeline.runs.derive import shown_table, stale, stored_each
 from pipeline.runs.progress import bar_in_notebook
 from pipeline.runs.run import run as complete
 from pipeline.runs.stopping import InterruptedRunError, interrupt
@@ -267,7 +267,7 @@ class Run(RunDirectory):
         out
             Directory of the wider run. By default it replaces this run, which is renamed to ``DIR.before``.
         axes
-            New ranges by ``frequency_hz``, parameter, or state of a grid:
+            New ranges by ``frequency_hz``, ``omega``, ``period``, parameter, or state of a grid:
             ``{"frequency_hz": {"start": 2.0, "stop": 3.0, "num": 201}}``.
         products
             Additional products, with their options: ``{"lyapunov": {}}``.
@@ -306,7 +306,8 @@ class Run(RunDirectory):
         Parameters
         ----------
         ranges
-            Lowest and highest value by ``frequency_hz``, parameter or state (with ``_deg`` in degrees).
+            Lowest and highest value by ``frequency_hz``, ``omega``, ``period``, parameter or state (with ``_deg`` in
+            degrees).
         at
             One value by key, as in `ranges`.
         num
@@ -484,7 +485,7 @@ def table(found: xr.Dataset) -> pd.DataFrame:
     if name not in ANALYSES or not ANALYSES[name].table:
         known = ", ".join(key for key, analysis in ANALYSES.items() if analysis.table)
         raise ValueError(f"the Dataset is not the result of an analysis that has a table ({known}).")
-    return pd.DataFrame(function_of(ANALYSES[name].table)(found).rows)
+    return pd.DataFrame(shown_table(name, found).rows)
 
 
 def _tree_of(run: Run, chunks: Any, check: bool | None) -> xr.DataTree:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import magpend
 from magpend_core import load_model, sections
 from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.attractors.portraits import portraits
@@ -44,6 +45,17 @@ def strange(chaotic):
 @pytest.fixture(scope="module")
 def two():
     return cube("twin-well-periodic", 6, 400, 16)
+
+
+def test_attractors__of_a_run_without_a_swept_parameter_have_exponents(tmp_path):
+    """Ueda's attractor: the mean of its trajectories' exponents, near Sprott's .1034 (appendix A.4.5)."""
+    spec = magpend.Spec("sweep", "x'' = 7.5*cos(omega*t) - .05*x' - x**3").with_parameters(omega=1.0)
+    spec = spec.with_start_random(n=4, x=(-3.0, 3.0), x_dot=(-5.0, 5.0)).with_integration(n_transient=50, n_keep=200)
+    run = magpend.run(spec.with_lyapunov(n_transient=50, n_periods=500), tmp_path / "ueda", workers=0)
+    found, exponents = run.attractors(), run.cube()["lyapunov"].isel(exponent=0)
+    assert found["kind"].values.tolist() == [CHAOTIC_SET]
+    assert found["lyapunov_max"].item() == pytest.approx(exponents.mean().item(), rel=1e-12)
+    assert found["lyapunov_max"].item() == pytest.approx(0.1034, abs=0.01)
 
 
 @pytest.mark.slow

@@ -59,7 +59,9 @@ def test_branches__all_periods_or_a_line(directory):
         ds = derive(directory, "branches", ALONG)
     assert sorted(set(ds["orbit_period"].values.tolist())) == [1, 2, 4]
     assert any("following branches" in what and 0 < done <= total for what, done, total in heard)
-    lines = branches_table(ds).lines
+    told = branches_table(ds)
+    assert {(row["label"], row["type"]) for row in told.rows} >= {("PD", "period_doubling")}
+    lines = told.lines
     assert any("does not close" in line and "--recurrences" in line for line in lines)
     short = derive(directory, "branches", SHORT)
     left_out = [line for line in branches_table(short).lines if "take it with --period 4" in line]

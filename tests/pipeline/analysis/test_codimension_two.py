@@ -8,6 +8,7 @@ import pytest
 from magpend_core.models import load_model
 from pipeline.analysis.branches import codimension_two
 from pipeline.analysis.branches.analysis import curves_table
+from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.branches.curves import continue_curves, curves_dataset
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
@@ -202,3 +203,7 @@ def test_two_bifurcations_at_once(kind, free, bifurcations):
     assert {name for name, _ in located(curves)} == {kind}
     for _, value in located(curves):
         np.testing.assert_allclose(value, 0.0, atol=1e-7)
+
+
+def test_labels__each_kind_has_one():
+    assert set(LABELS) == {*KINDS, *codimension_two.POINT_KINDS}

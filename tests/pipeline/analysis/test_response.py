@@ -232,7 +232,7 @@ def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
     assert not ds["jump_rises"][jump]
     # beyond, trajectories spiral to rest
     assert (ds["jump_amplitude"][jump] < 1e-6).all()
-    assert re.search(r"^ *-0\.25 +falls .* rest$", "\n".join(response_table(ds).lines), re.MULTILINE)
+    assert re.search(r"^ *-0\.25 +LP +falls .* rest$", "\n".join(response_table(ds).lines), re.MULTILINE)
 
 
 @pytest.mark.slow

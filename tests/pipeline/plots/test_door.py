@@ -128,6 +128,7 @@ def test_label__tells_close_values_apart_and_has_what_was_given():
     # a quantity replaces the state; where and how it is written is no part of the name
     assert options_of("bifurcation", state="psi1", quantity="energy.max").label() == "_energy.max"
     assert options_of("regimes", out="a.png", format="pdf").label() == ""
+    assert options_of("branches", over=r"C:\runs\line").label() == "_over_C--runs-line"  # a name on Windows, too
 
 
 def test_place__value_of_the_axis_or_its_neighbours():

@@ -194,7 +194,8 @@ def test_plot_branches__solid_where_stable_and_dashed_where_not(folded):
     assert (np.asarray(lines["--"].get_ydata()) <= 0.0).all()
     # both go up to the fold itself
     assert np.max(lines["-"].get_xdata()) == np.max(lines["--"].get_xdata()) == 3.0
-    assert [text.get_text() for text in figure.axes[0].texts] == ["F1"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["LP1"]
+    assert "LP fold" in [text.get_text() for text in figure.legends[0].get_texts()]
     assert not branch_lines(plot_branches(folded, max_period=0))
     with pytest.raises(ValueError, match="unknown state"):
         plot_branches(folded, state="psi3")

@@ -352,7 +352,7 @@ def test_curves__alone_in_a_table_and_over_the_map(map_of_two, curves_of_two):
     (line,) = [one for one in fig.axes[0].lines if one.get_gid() == "curve:0"]
     np.testing.assert_allclose(line.get_xydata(), [[2.1, 1.0], [2.15, 1.5], [2.2, 2.0]])
     assert [text.get_text() for text in fig.axes[0].texts] == ["CP"]
-    assert "solid: fold" in caption_of(fig)
+    assert "solid: LP fold" in caption_of(fig)
     np.testing.assert_allclose(fig.data["special_first_curves"], [1.5])
     with pytest.raises(ValueError, match="plane of q and damping"):
         plot_regimes(map_of_two, curves=curves_of_two.assign_attrs(second_parameter="damping"))
@@ -360,8 +360,9 @@ def test_curves__alone_in_a_table_and_over_the_map(map_of_two, curves_of_two):
     assert [text.get_text() for text in ax.texts if text.get_text()] == ["CP"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("q", "drive frequency [Hz]")
     table = curves_table(curves_of_two)
-    row = {"type": "cusp", "q": 1.5, "frequency_hz": 2.15, "period": 1, "error": pytest.approx(1e-8), "curve": 0}
-    assert table.rows[0] == row
+    row = {"q": 1.5, "frequency_hz": 2.15, "period": 1, "error": pytest.approx(1e-8), "curve": 0}
+    assert table.rows[0] == {"label": "CP", "type": "cusp", **row}
+    assert table.lines[1].startswith("  0: LP fold, period 1")
     assert table.lines[1].endswith("; ends: stuck")
 
 

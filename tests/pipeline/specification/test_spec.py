@@ -109,7 +109,8 @@ def test_parse_spec__single_problem(sweep_text, change, path, remedy):
 
 def test_parse_spec__what_must_be_there(sweep_text, walk_text):
     problems = problems_of(sweep_text.replace("frequency_hz = { start = 2.0, stop = 3.0, num = 5 }", ""))
-    assert problems == ["parameters.frequency_hz: missing; set it there, or sweep it as axes.frequency_hz."]
+    missing = "parameters.frequency_hz: missing; set it there (or omega, or period), or sweep it as axes.frequency_hz."
+    assert problems == [missing]
     problems = problems_of(walk_text.replace("[continuation]", '[continuation]\npath = "q"'))
     assert problems[0].startswith("continuation.path = 'q'")
     assert "frequency_hz" in problems[0]

@@ -1,0 +1,96 @@
+"""Show datasets in the word by which a specification gives the drive's rate: as omega, or as period."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of
+from pipeline.specification.tables import FREQUENCY, RATES
+
+RATE = "drive_rate"
+"""Attribute with the word, if it is not ``frequency_hz``."""
+
+_FLIPPED = ("jump_rises", "rises_before", "rises_after")
+"""Variables that tell whether the frequency rises: the period falls."""
+
+_ERRORS = {"bracket": "value", "special_first_error": "special_first", "special_second_error": "special_second"}
+"""Variables with the width of an interval of frequencies, and those with the frequency."""
+
+
+def rate_attribute(word: str) -> dict[str, str]:
+    """Return the dataset attribute that names the word; `in_own_words` reads it."""
+    return {} if word == FREQUENCY else {RATE: word}
+
+
+def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:
+    """Return the names of dims with that of the drive's frequency as the word of its rate."""
+    return tuple(RATES[word].column if dim == FREQUENCY_DIM and word != FREQUENCY else dim for dim in dims)
+
+
+def in_own_words(ds: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with the drive's rate in the word of its specification, for tables and figures.
+
+    All variables in Hz are converted and rounded to 15 digits, the dim and the coordinate ``frequency`` are named like
+    the word, and so are attributes whose value is this name. Others are returned unchanged.
+    """
+    word = str(ds.attrs.get(RATE, FREQUENCY))
+    if word == FREQUENCY:
+        return ds
+    rate = RATES[word]
+    unit = "1" if all(state.unit == "1" for state in model_of(ds).states) else rate.unit
+    found = {}
+    for name, variable in ds.variables.items():
+        if variable.attrs.get("units") == "Hz":
+            about = {**variable.attrs, "units": unit}
+            if name == FREQUENCY_DIM:
+                about["long_name"] = about["long_name"].replace("drive frequency", rate.meaning)
+            of = _ERRORS.get(str(name))
+            values = rate.given(variable.values) if of is None else variable.values * rate.slope(ds[of].values)
+            found[name] = (variable.dims, _rounded(values), about)
+        elif rate.inverse and name in _FLIPPED:
+            found[name] = (variable.dims, 1 - variable.values, variable.attrs)
+    coordinates = {name: value for name, value in found.items() if name in ds.coords}
+    shown = ds.assign_coords(coordinates).assign({n: v for n, v in found.items() if n not in ds.coords})
+    named = {FREQUENCY: rate.column, FREQUENCY_DIM: rate.column, "Hz": unit}
+    shown.attrs = {k: named.get(v, v) if isinstance(v, str) else v for k, v in ds.attrs.items()}
+    if FREQUENCY_DIM not in ds.variables:
+        return shown
+    shown = shown.rename({FREQUENCY_DIM: rate.column})
+    return shown.sortby(rate.column) if rate.inverse and rate.column in shown.dims else shown
+
+
+def hertz_of(ds: xr.Dataset) -> xr.DataArray | None:
+    """Return the drive frequency of a dataset [Hz], also of one from `in_own_words`; None if there is none."""
+    word = str(ds.attrs.get(RATE, FREQUENCY))
+    rate = RATES[word]
+    if FREQUENCY_DIM in ds.coords or rate.column not in ds.coords:
+        return ds.coords.get(FREQUENCY_DIM)
+    found: xr.DataArray = rate.hertz(ds.coords[rate.column])
+    return found
+
+
+def arguments_in_own_words(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a figure with datasets, arrays over their cells and ``at`` in the word of the first."""
+    first = next((value for value in given.values() if isinstance(value, xr.Dataset)), None)
+    if first is None or RATE not in first.attrs:
+        return {}
+    rate, found = RATES[str(first.attrs[RATE])], dict[str, Any]()
+    for name, value in given.items():
+        if isinstance(value, xr.Dataset):
+            found[name] = in_own_words(value)
+        elif isinstance(value, xr.DataArray):
+            found[name] = in_own_words(value.to_dataset(name="value").assign_attrs(first.attrs))["value"]
+        elif name == "at" and value and FREQUENCY_DIM in value:
+            own = float(_rounded(rate.given(value[FREQUENCY_DIM])))
+            found[name] = {key: at for key, at in value.items() if key != FREQUENCY_DIM} | {rate.column: own}
+    return found
+
+
+def _rounded(values: Any) -> np.ndarray:
+    """Round to 15 digits, so that a decimal number that was converted to Hz and back is what it was."""
+    found = np.asarray(values, np.float64)
+    return np.array([float(f"{value:.15g}") for value in found.ravel().tolist()]).reshape(found.shape)

@@ -1,0 +1,149 @@
+"""The drive's rate as omega and as period, from the specification to tables and figures."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+from scipy.integrate import solve_ivp
+
+import magpend
+from pipeline.compute.simulate import simulate
+from pipeline.layout.cells import parameter_axes
+from pipeline.layout.own_words import in_own_words
+from pipeline.specification.tables import RATES
+
+SPRING = "x'' = F*cos(omega*t) - 0.1*x' - x - x**3\nF = 0.3"
+
+
+def spring(text=SPRING):
+    spec = magpend.Spec("sweep", text).with_start_random(n=2, x=(-3.0, 3.0), x_dot=(-3.0, 3.0), seed=1)
+    return spec.with_integration(n_transient=200, n_keep=2)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Runs along omega, period and frequency that have the same cells."""
+    folder, omega = tmp_path_factory.mktemp("rates"), np.linspace(1.2, 1.9, 8)
+    values = {"omega": omega, "period": 2 * pi / omega[::-1], "frequency_hz": omega / (2 * pi)}
+    return {
+        word: magpend.run(spring().with_axis(word, values=own), folder / word, workers=0, echo=lambda _: None)
+        for word, own in values.items()
+    }
+
+
+def test_cells__have_frequencies(runs):
+    for run in runs.values():
+        np.testing.assert_allclose(run.cube().frequency, np.linspace(1.2, 1.9, 8) / (2 * pi), rtol=1e-15)
+        assert run.cube().frequency.attrs["units"] == "Hz"
+    same = [run.cube()["section"].values for run in (runs["omega"], runs["frequency_hz"])]
+    np.testing.assert_array_equal(*same)
+
+
+def test_tables__have_the_word_of_the_specification(runs):
+    """Located folds and jumps: values converted, directions of a period turned round."""
+    hertz, omega, period = (runs[word].branches().magpend.table() for word in ("frequency_hz", "omega", "period"))
+    folds = hertz["frequency_hz"].values
+    assert len(folds) == 2
+    np.testing.assert_allclose(omega["omega"], 2 * pi * folds, rtol=1e-7)
+    np.testing.assert_allclose(np.sort(period["drive_period"]), np.sort(1 / folds), rtol=1e-7)
+    rises = {word: in_own_words(runs[word].response())["jump_rises"].values.tolist() for word in runs}
+    assert rises["omega"] == rises["frequency_hz"] == [1 - turned for turned in rises["period"]]
+
+
+@pytest.mark.parametrize("word", RATES)
+def test_widths__are_scaled_by_the_derivative(word):
+    rate, width = RATES[word], 1e-6
+    assert rate.slope(0.2) * width == pytest.approx(abs(rate.given(0.2 + width) - rate.given(0.2)), rel=1e-5)
+
+
+def test_options__take_values_in_the_word_that_they_name(runs):
+    part = runs["frequency_hz"].branches(parameter="omega", low=1.3, high=1.5)
+    assert (part.attrs["parameter"], len(part["value"])) == ("frequency", 1)
+    np.testing.assert_allclose(part["parameter"].max(), 1.5 / (2 * pi), rtol=1e-12)
+    own = runs["period"].branches(low=2 * pi / 1.5, high=2 * pi / 1.3)  # of the only axis, so in its word
+    np.testing.assert_allclose(own["value"], part["value"], rtol=1e-7)
+    cell = runs["frequency_hz"].cube().magpend.sel_cell(omega=1.3)
+    np.testing.assert_allclose(float(cell.frequency), 1.3 / (2 * pi), rtol=1e-15)
+
+
+def test_figures__are_labelled_as_the_user_wrote(runs):
+    for word, label in (("omega", r"$\omega$"), ("period", "drive period")):
+        upper, _ = runs[word].plot.response()
+        low, high = upper.get_xlim()
+        wanted = (1.2, 1.9) if word == "omega" else (2 * pi / 1.9, 2 * pi / 1.2)
+        assert low < wanted[0] < wanted[1] < high < 1.2 * wanted[1]
+        texts = [text.get_text() for text in upper.figure.findobj(Text)]
+        assert label in texts
+        assert not any("Hz" in text or "frequency" in text for text in texts)
+    ax = runs["omega"].plot.bifurcation()
+    assert ax.get_xlabel() == r"angular drive frequency $\omega$"
+
+
+def test_specification__keeps_the_word(tmp_path):
+    spec = spring().with_axis("omega", 0.5, 2.0, 4)
+    again = magpend.Spec.parse(spec.as_dict())
+    assert (again, again.rate, again.tables["axes"]) == (
+        spec,
+        "omega",
+        {"omega": {"start": 0.5, "stop": 2.0, "num": 4}},
+    )
+    (axis,) = parameter_axes(spec)
+    np.testing.assert_array_equal(axis.values, np.array([0.5, 1.0, 1.5, 2.0]) / (2 * pi))
+    assert spring().with_parameters(period=4.0).with_axis("F", 0.1, 0.2, 2).frequency_hz == 0.25
+    walk = magpend.Spec.parse({**spec.as_dict(), "kind": "continuation", "continuation": {"path": "omega"}})
+    assert walk.as_dict()["continuation"]["path"] == "omega"
+    assert magpend.Spec.parse(walk.as_dict()) == walk
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"parameters": {"omega": 1.0, "period": 2.0}}, "parameters.omega and parameters.period: all give the rate"),
+        ({"parameters": {"omega": 1.0}, "axes": {"period": {"values": [1.0]}}}, "axes.period and parameters.omega"),
+        ({"axes": {"omega": {"values": [-1.0, 1.0]}}}, "axes.omega: its least value -1.0 must be greater than 0 rad/s"),
+        ({"parameters": {"omega": -1.0}}, "parameters.omega"),
+        ({"axes": {"omega": {"start": 1.0}}}, "axes.omega: give start, stop and num"),
+        ({}, "parameters.frequency_hz: missing; set it there (or omega, or period)"),
+        (
+            {"kind": "continuation", "axes": {"period": {"values": [1.0, 2.0]}}},
+            "continuation.path = 'period': branches follow frequency_hz or omega",
+        ),
+    ],
+)
+def test_specification__says_what_is_wrong_with_a_rate(change, words):
+    with pytest.raises(magpend.SpecError) as caught:
+        magpend.Spec.parse({**spring().tables, **change})
+    assert words in str(caught.value)
+
+
+def test_omega__of_a_text_is_the_drives():
+    """The name omega in a text that uses time is 2 pi f: scipy's trajectory at this angular frequency."""
+    ds = simulate(None, [1.0, 0.5], model=magpend.model(SPRING), overrides={"omega": 1.3}, n_periods=4, rtol=1e-11)
+    own = solve_ivp(
+        lambda t, y: [y[1], 0.3 * np.cos(1.3 * t) - 0.1 * y[1] - y[0] - y[0] ** 3],
+        (0.0, 8.0 * pi / 1.3),
+        [1.0, 0.5],
+        rtol=1e-11,
+        atol=1e-11,
+    )
+    np.testing.assert_allclose(float(ds["x"][-1]), own.y[0, -1], rtol=1e-7)
+
+
+def test_omega__of_a_model_stays_its_parameter():
+    """A text that gives omega a value, or does not use time, has its own."""
+    free = magpend.model("x'' = A*cos(2*pi*f*t) - omega**2*x", omega=1.5, A=0.1)
+    assert set(free.parameter_names) == {"omega", "A"}
+    spec = spring(free).with_axis("omega", 1.0, 2.0, 3).with_parameters(period=4.0)
+    assert [(a.dim, *a.values) for a in parameter_axes(spec)] == [("omega", 1.0, 1.5, 2.0)]
+    with pytest.raises(magpend.SpecError, match="unknown name 'omega'"):
+        magpend.model("x'' = -omega**2*x")
+
+
+def test_zoom_and_extension__take_the_word(runs):
+    closer = runs["omega"].zoom({"omega": (1.3, 1.5)}, num=5)
+    assert closer.tables["axes"]["omega"] == {"start": 1.3, "stop": 1.5, "num": 5}
+    other = runs["omega"].zoom({"period": (4.5, 5.0)}, num=3)
+    assert list(other.as_dict()["axes"]) == ["period"]
