@@ -162,7 +162,7 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
     elif kind is bool:
         flag = f"{flag}/--no-{flag[2:]}" if default else flag
     elif get_origin(kind) is dict:
-        declared |= {"metavar": "AXIS=VALUE"}
+        declared |= {"metavar": "NAME=VALUE"}
         kind = list[str]
     elif get_origin(kind) is tuple:
         declared |= {"metavar": "LOW HIGH" if float in get_args(kind) else "A B"}

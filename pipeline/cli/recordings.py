@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import MAPPING, Json, json_rows, tell, tell_data
+from pipeline.cli.common import MAPPING, Csv, Json, json_rows, tell, tell_data
 from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.options import drawing
 from pipeline.cli.outputs import check_file, check_place
@@ -59,6 +59,52 @@ def show(
     _tell(ds, as_json)
     if out is not None:
         _draw(_smoothed(ds, smooth, smoothing_window), out, as_json)
+
+
+def spectrum(
+    file: File,
+    mapping: Annotated[Path, typer.Option(metavar="MAP", help=MAPPING)],
+    channel: Annotated[str, typer.Option(help="Measured quantity; by default the first.")] = "",
+    window: Window = None,
+    taper: Annotated[str, typer.Option(help="Window of each segment, by its name in scipy.signal.")] = "hann",
+    nperseg: Annotated[
+        int | None, typer.Option(min=4, help="Samples of a segment; by default a sixteenth of the longest piece.")
+    ] = None,
+    scaling: Annotated[
+        Literal["density", "spectrum"], typer.Option(help="Power per hertz, or power; as in scipy.signal.welch.")
+    ] = "density",
+    axis: Annotated[
+        Literal["", "order", "Hz"], typer.Option(help="Frequencies as orders or in hertz; by default orders.")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
+    csv: Csv = None,
+    as_json: Json = None,
+) -> None:
+    """Measure the spectrum of a recording, as scipy.signal.welch does; orders count from the drive's measured edges.
+
+    Segments overlap by half, and those of all pieces are averaged.
+    """
+    from pipeline.analysis.spectrum.analysis import spectrum_table
+    from pipeline.rig.recordings.figure import spectrum_of_recording
+    from pipeline.specification.problems import SpecError
+
+    if out is not None:
+        check_figure_path(out)
+    try:
+        found = spectrum_of_recording(
+            _read(file, mapping, window), channel, window=taper, nperseg=nperseg, scaling=scaling
+        )
+        tell(spectrum_table(found), csv, as_json)
+        if out is not None:
+            from pipeline.plots import save_data, save_figure
+            from pipeline.plots.spectrum import plot_spectrum
+
+            figure = plot_spectrum(found, axis=axis)
+            say = console.note if as_json or csv else console.result
+            say(f"figure: {save_figure(figure, out)}")
+            say(f"data: {save_data(figure, out)}")
+    except ValueError as error:
+        raise SpecError(f"{file}: {error}") from None
 
 
 def convert(
@@ -202,5 +248,5 @@ def _draw(ds: xr.Dataset, out: Path, as_json: str | None) -> None:
     say(f"figure: {save_figure(plot_recording(ds), out)}")
 
 
-for _command in (drawing(show), convert, drive, simulate):
+for _command in (drawing(show), drawing(spectrum), convert, drive, simulate):
     add_command(recordings_app, _command)

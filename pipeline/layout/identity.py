@@ -26,12 +26,14 @@ CELLS = 1
 def identity_of(spec: Spec, plan: Plan) -> dict[str, Any]:
     """Return all data that determine the bytes of a run's store: specification, parameters, layout, versions.
 
-    The title and ``[execution]`` are left out; the chunks that follow from ``[execution]`` are included. So
-    is a digest of the coordinates, the numbers that ranges and seeds stand for.
+    The title, the source of a function and ``[execution]`` are left out; the chunks that follow from ``[execution]``
+    are included. So is a digest of the coordinates, the numbers that ranges and seeds stand for.
     """
     tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
     if spec.drive is not None:  # the file's name does not matter, and its digest stands for its text
         tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in ("file", "text")}
+    if isinstance(tables["model"], dict):  # the function from which the equations were read, for readers
+        tables["model"] = {k: v for k, v in tables["model"].items() if k != "function"}
     for table in tables.get("drift", {}).values():
         for key in ("file", "text"):
             table.pop(key, None)

@@ -34,8 +34,9 @@ def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:
 def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset with the drive's rate in the word of its specification, for tables and figures.
 
-    All variables in Hz are converted and rounded to 15 digits, the dim and the coordinate ``frequency`` are named like
-    the word, and so are attributes whose value is this name. Others are returned unchanged.
+    All variables in Hz are converted and rounded to 15 digits, unless their names end in ``_hz``; the dim and the
+    coordinate ``frequency`` are named like the word, and so are attributes whose value is this name. Others are
+    returned unchanged.
     """
     word = str(ds.attrs.get(RATE, FREQUENCY))
     if word == FREQUENCY:
@@ -44,7 +45,7 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     unit = "1" if all(state.unit == "1" for state in model_of(ds).states) else rate.unit
     found = {}
     for name, variable in ds.variables.items():
-        if variable.attrs.get("units") == "Hz":
+        if variable.attrs.get("units") == "Hz" and not str(name).endswith("_hz"):
             about = {**variable.attrs, "units": unit}
             if name == FREQUENCY_DIM:
                 about["long_name"] = about["long_name"].replace("drive frequency", rate.meaning)

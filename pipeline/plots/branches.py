@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
+from pipeline.analysis.branches.analysis import isolas_of
 from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import axis_name
@@ -54,7 +55,7 @@ def plot_branches(
     """Draw branches of periodic orbits over a parameter by their section points: stable solid, unstable dashed.
 
     All bifurcations are marked. Where a stable orbit appears or disappears, the name and period (for example
-    PD1) stand beside the curves if there is room.
+    PD1) stand beside the curves if there is room, and so does ``isola``.
 
     Parameters
     ----------
@@ -92,6 +93,8 @@ def plot_branches(
     names = _draw_lines(ax, ds, chosen, measure, below is None)
     if below is None:
         _dress(ax, frame, measure)
+    elif frame.ylim is None:
+        _hold_isolas(ax, ds, chosen, measure)
     style.label_axes(ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label)
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
     if bands is not None:
@@ -212,7 +215,27 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
         )
         if stable:
             names.append(_Name(period, x, float(y.min()), float(y.max()), f"{LABELS[kind]}{period or ''}"))
+    names += [_isola(ds, i, measure) for i in isolas_of(ds) if i in chosen]
     return sorted(names, key=lambda n: (n.period, n.x, n.low))
+
+
+def _hold_isolas(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure) -> None:
+    """Widen the range of a diagram to hold the isolas, on which cells of the diagram need not end."""
+    own = [i for i in isolas_of(ds) if i in chosen]
+    if own:
+        y = measure.shown(ds["section"].sel(state=measure.name).values[own])
+        low, high = float(np.nanmin(y)), float(np.nanmax(y))
+        margin = 0.06 * (high - low)
+        ax.set_ylim(min(ax.get_ylim()[0], low - margin), max(ax.get_ylim()[1], high + margin))
+
+
+def _isola(ds: xr.Dataset, branch: int, measure: Measure) -> _Name:
+    """Return the label of an isola, at its highest section point."""
+    y = measure.shown(ds["section"].sel(state=measure.name).values[branch])
+    point, phase = np.unravel_index(int(np.nanargmax(y)), y.shape)
+    highest = float(y[point, phase])
+    x = float(ds["parameter"].values[branch, point])
+    return _Name(int(ds["orbit_period"][branch]), x, highest, highest, "isola")
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:

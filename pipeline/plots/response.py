@@ -11,8 +11,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
-from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.analysis import fixed_of, isolas_of
 from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import model_of, parameter_name
@@ -50,6 +51,7 @@ def plot_response(
 
     Each value of a further swept parameter, such as the level of the force, has its colour. All bifurcations are
     marked. Arrows lead from the end of a stable orbit to the amplitude of the orbit on which a trajectory lands.
+    Isolas are named.
 
     Parameters
     ----------
@@ -87,15 +89,16 @@ def plot_response(
     fig = style.new_figure(5.2 if has_phase else 4.0, _stored(ds, points), frame)
     ratios = [2, 1] if has_phase else [1]
     axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
-    levels = _levels(ds)
-    chosen = [_amplitude(ds, channel, harmonic), _phase(ds, channel, max(harmonic, 1))][: len(axes)]
+    levels = levels_of(ds)
+    chosen = [amplitude_of(ds, channel, harmonic), _phase(ds, channel, max(harmonic, 1))][: len(axes)]
     phase = Measure("phase", "lag", "deg" if degrees else "rad", 180.0 / np.pi if degrees else 1.0, True)
     for ax, (of_points, of_bifurcations), shown in zip(axes, chosen, (measure, phase), strict=False):
         style.style_axes(ax)
         for i in range(ds.sizes["branch"]):
-            _draw_branch(ax, ds, i, of_points, of_bifurcations, shown, levels)
+            draw_branch(ax, ds, i, of_points, of_bifurcations, shown, levels)
     if not harmonic:
         _draw_jumps(axes[0], ds, channel, measure, levels)
+    _name_isolas(axes[0], ds, measure.shown(chosen[0][0].values))
     _draw_points(axes, points, (measure, phase))
     name = str(ds.attrs["parameter"])
     what = "amplitude" if not harmonic else f"harmonic {harmonic}"
@@ -120,7 +123,7 @@ def _stored(ds: xr.Dataset, points: Mapping[str, np.ndarray] | None) -> xr.Datas
     return plain.assign({f"measured_{name}": ("measured", values) for name, values in points.items()})
 
 
-def _levels(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
+def levels_of(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
     """Return the colour of each combination of fixed parameters: black if there is one."""
     found = sorted({tuple(fixed_of(ds, i).items()) for i in range(ds.sizes["branch"])})
     if len(found) <= 1:
@@ -128,7 +131,8 @@ def _levels(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
     return {level: style.PALETTE[k % len(style.PALETTE)] for k, level in enumerate(found)}
 
 
-def _amplitude(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:
+def amplitude_of(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return half of peak to peak (harmonic 0), or the amplitude of a harmonic, at the points and bifurcations."""
     where: dict[str, Any] = {"channel": channel, **({"harmonic": harmonic} if harmonic else {})}
     name = "harmonic_amplitude" if harmonic else "amplitude"
     return ds[name].sel(where), ds[f"bifurcation_{name}"].sel(where)
@@ -139,7 +143,7 @@ def _phase(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, x
     return ds["phase"].sel(where), ds["bifurcation_phase"].sel(where)
 
 
-def _draw_branch(
+def draw_branch(
     ax: Axes,
     ds: xr.Dataset,
     branch: int,
@@ -148,6 +152,7 @@ def _draw_branch(
     measure: Measure,
     levels: Mapping[Any, str],
 ) -> None:
+    """Draw a measure along a branch, solid where stable, with marks at its bifurcations."""
     x = with_located(ds, branch, ds["parameter"], ds["value"])
     y = measure.shown(with_located(ds, branch, of_points, of_bifurcations))
     colour = levels[tuple(fixed_of(ds, branch).items())]
@@ -179,6 +184,21 @@ def _draw_jumps(ax: Axes, ds: xr.Dataset, channel: str, measure: Measure, levels
     for k in np.flatnonzero(np.isfinite(to)):
         x, colour = float(ends["value"][k]), levels[tuple(fixed_of(ds, int(ends["of_branch"][k])).items())]
         ax.annotate("", (x, to[k]), (x, before[k]), arrowprops={**_ARROW, "color": colour}, zorder=7.0)
+
+
+def _name_isolas(ax: Axes, ds: xr.Dataset, amplitude: np.ndarray) -> None:
+    """Write ``isola`` above each branch that is one."""
+    isolas = isolas_of(ds)
+    if isolas:
+        ax.margins(y=0.1)  # room for the name of the highest one
+    for i in isolas:
+        highest = int(np.nanargmax(amplitude[i]))
+        at = float(ds["parameter"].values[i, highest]), amplitude[i, highest]
+        halo = [withStroke(linewidth=1.5, foreground="white")]
+        ax.annotate(
+            "isola", at, (0.0, 4.0), textcoords="offset points", ha="center", va="bottom",
+            fontsize=style.figure_of(ax).look.tick, zorder=9.0, path_effects=halo,
+        )  # fmt: skip
 
 
 def _draw_points(axes: np.ndarray, points: Mapping[str, np.ndarray] | None, measures: tuple[Measure, Measure]) -> None:

@@ -7,12 +7,25 @@ from pipeline.products.product import Analysis, Options, option
 _ROOM = "pipeline.analysis.branches.analysis"
 
 
-class BranchOptions(Options):
-    """Options for continuing branches of periodic orbits."""
+class AlongOptions(Options):
+    """Options for an interval of one parameter."""
 
     parameter: str = option("", "Parameter to follow, or frequency_hz, omega or period; by default the swept one.")
     low: float | None = option(None, "Least value; by default the run's.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default the run's.", unit="SI", flag="--to")
+
+
+class PlaneOptions(AlongOptions):
+    """Options for a plane of two parameters."""
+
+    second: str = option(..., "Second parameter: its name, such as q, or frequency_hz, omega or period.")
+    second_low: float = option(..., "Least value of the second parameter.", unit="SI", flag="--second-from")
+    second_high: float = option(..., "Largest value of the second parameter.", unit="SI", flag="--second-to")
+
+
+class BranchOptions(AlongOptions):
+    """Options for continuing branches of periodic orbits."""
+
     max_period: int = option(
         0,
         "Longest orbit period of a branch; 0 follows all orbits that attract cells, and doublings up to the "
@@ -25,14 +38,17 @@ class BranchOptions(Options):
     recurrences: int = option(
         0, "Also start from orbits up to this period, near close recurrences of bounded cells.", ge=0
     )
+    isolas: int = option(
+        0,
+        "Number of parameter values, evenly spaced, at which all orbits are searched, also those of detached "
+        "branches; up to --period, or the longest period of the run's orbits, at most 4.",
+        ge=0,
+    )
 
 
-class CurveOptions(BranchOptions):
+class CurveOptions(BranchOptions, PlaneOptions):
     """Options for continuing bifurcations as curves in a plane of two parameters."""
 
-    second: str = option(..., "Second parameter: its name, such as q, or frequency_hz, omega or period.")
-    second_low: float = option(..., "Least value of the second parameter.", unit="SI", flag="--second-from")
-    second_high: float = option(..., "Largest value of the second parameter.", unit="SI", flag="--second-to")
     curve_period: int = option(
         0, "Longest orbit period; 0 takes all periods of the branches.", unit="drive periods or returns", ge=0
     )
@@ -115,7 +131,7 @@ ORBITS = Analysis(
 _ROOM = "pipeline.analysis.branches.tongues"
 
 
-class TongueOptions(CurveOptions):
+class TongueOptions(PlaneOptions):
     """Options for finding Arnold tongues and following their edges."""
 
     max_denominator: int = option(5, "Largest q of the tongues p/q.", ge=1, le=64, flag="--denominator")

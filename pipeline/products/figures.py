@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pipeline.products.backbone import BackboneOptions
 from pipeline.products.branches import BranchOptions, CurveOptions, TongueOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
@@ -11,6 +12,7 @@ from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, Options, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
+from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
 
 Per = Literal["s", "period"]
 
@@ -113,6 +115,30 @@ class ResponseFigureOptions(ResponseOptions, FigureOptions):
     channel: str = option("", "State or quantity to draw; by default the model's first state.")
     harmonic: int = option(0, "Draw the amplitude of this harmonic; 0 draws half of peak to peak.", ge=0)
     points: str = option("", "CSV file of measured points: columns of the parameter, amplitude and, if known, phase.")
+
+
+class BackboneFigureOptions(BackboneOptions, FigureOptions):
+    """Options of a figure of backbone curves."""
+
+
+Axis = Literal["", "order", "Hz"]
+
+_AXIS = "Frequencies as orders, multiples of the drive's, or in hertz; by default orders where there is a drive."
+
+
+class SpectrumFigureOptions(SpectrumOptions, FigureOptions):
+    """Options of a figure of spectra at one parameter point."""
+
+    axis: Axis = option("", _AXIS)
+
+
+class WaterfallOptions(SpectraOptions, FigureOptions):
+    """Options of a figure of spectra along a parameter."""
+
+    scaling: Literal["density", "spectrum"] = option(
+        "spectrum", "Colours show amplitudes, or power per hertz, as in scipy.signal.welch."
+    )
+    axis: Axis = option("", _AXIS)
 
 
 class TongueFigureOptions(TongueOptions, FigureOptions):
@@ -229,6 +255,25 @@ DIMENSION = Figure(
     panels="several",
 )
 
+SPECTRUM = Figure(
+    "spectrum",
+    "Draw the spectrum of each attractor of a parameter point: lines of closed orbits, otherwise densities.",
+    SpectrumFigureOptions,
+    "pipeline.plots.spectrum:draw_spectrum",
+    needs="pipeline.analysis.spectrum.analysis:needs_axis",
+    panels="several",
+)
+
+WATERFALL = Figure(
+    "waterfall",
+    """Draw spectra along the swept parameter, as colours.
+
+    At each value the spectrum is that of the attractor on which most cells end, or of --attractor.""",
+    WaterfallOptions,
+    "pipeline.plots.spectrum:draw_waterfall",
+    needs="pipeline.analysis.spectrum.analysis:needs_axis",
+)
+
 BRANCHES = Figure(
     "branches",
     "Draw branches of periodic orbits over the bifurcation diagram: solid stable, dashed unstable.",
@@ -263,6 +308,13 @@ RESPONSE = Figure(
     ResponseFigureOptions,
     "pipeline.plots.response:draw",
     panels="several",
+)
+
+BACKBONE = Figure(
+    "backbone",
+    "Draw backbone curves over the frequency: phase resonance over the response, and normal modes.",
+    BackboneFigureOptions,
+    "pipeline.plots.backbone:draw_backbone",
 )
 
 TONGUES = Figure(

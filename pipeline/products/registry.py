@@ -64,10 +64,11 @@ ANALYSES: Registry[Analysis] = Registry(
             "edge": ("resilience", "a sweep, and " + _POINT),
             "overlaps": ("tipping", "a sweep along the parameter that changes"),
         },
-        "Chaos": {"chaos": ("chaos", ""), "dimension": ("chaos", "")},
+        "Chaos and spectra": {"chaos": ("chaos", ""), "dimension": ("chaos", ""), "spectrum": ("spectrum", "")},
         "Orbits and branches, stable or not": {
             "branches": ("branches", ""),
             "response": ("response", ""),
+            "backbone": ("backbone", ""),
             "bands": ("branches", "a posterior of magpend identify"),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
@@ -98,16 +99,19 @@ _FIGURES = {
         "resilience": "a sweep, and at most " + _ONE,
         "edge": "a sweep, and " + _POINT,
     },
-    "Chaos": {
+    "Chaos and spectra": {
         "lyapunov": f"{_EXPONENTS}, and {_ONE}; two with --map",
         "convergence": f"{_EXPONENTS}, and {_POINT}",
         "dimension": _POINT,
+        "spectrum": f"{_POINT}, or a cell",
+        "waterfall": _ONE,
     },
     "Orbits and branches, stable or not": {
         "branches": "",
         "multipliers": "",
         "curves": "",
         "response": "",
+        "backbone": "",
         "rotation": f"{_ROTATION}, and {_ONE}, or {_TWO}",
         "tongues": f"{_ROTATION}, and {_ONE}",
         "manifolds": _POINT,

@@ -25,4 +25,5 @@ RESPONSE = Analysis(
     settle="pipeline.analysis.branches.analysis:settle_branches",
     builds_on=("branches",),
     figure="response",
+    version=2,
 )

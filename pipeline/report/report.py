@@ -21,9 +21,11 @@ from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.products.spectrum import SpectrumOptions
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
 from pipeline.runs.derive import AnalysedRun, shown_table
 from pipeline.runs.drawing import figure
+from pipeline.runs.naming import in_own_words as options_in_own_words
 from pipeline.runs.status import state
 from pipeline.runs.versions import current
 from pipeline.specification.problems import SpecError, unknown_name
@@ -80,6 +82,7 @@ SHOWN = {
     "tangency": ("Homoclinic tangencies", "Parameter values at which manifolds of a saddle orbit first touch"),
     "chaos": ("Regular and chaotic", "Kind of motion of each attractor"),
     "dimension": ("Dimensions", "Correlation dimensions of the attractors that do not close"),
+    "spectrum": ("Spectra", "Spectra"),
     "settling": ("Transient or attractor", "Sets that do not close, and the results of extending their cells"),
     "escapes": ("Escapes", "Rates at which cells with noise leave a set, and where they go"),
     "density": ("Densities", "Moments and peaks of the density of section points"),
@@ -282,6 +285,9 @@ def _analyses(shown: Shown) -> Iterator[Part]:
     for name, (heading, _) in SHOWN.items():
         if name == "attractors" or not _suits(shown, name):
             continue
+        if name == "spectrum":
+            yield Part(heading, list(_spectra(shown)))
+            continue
         known = shown.options_of(name)
         blocks: list[Block] = [] if known else [_missing(shown, name)]
         for options in known:
@@ -296,7 +302,33 @@ def _suits(shown: Shown, name: str) -> bool:
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
     if name == "basins":
         return sum(map(is_grid_dim, shown.starts)) >= 2
-    return name in ("branches", "chaos") or bool(stored_options(shown.run, name))
+    known = name in shown.computed or bool(stored_options(shown.run, name))
+    return known or name in ("branches", "chaos") or (name == "spectrum" and bool(shown.computed))
+
+
+def _spectra(shown: Shown) -> Iterator[Block]:
+    """Draw spectra at the gallery's point, and those that the run keeps; if they are asked for, along an axis."""
+    try:
+        if shown.computed:
+            found = in_own_words(shown.run.derive("attractors"))
+            if rows := [dict(row) for row in shown_table("attractors", found).rows]:
+                shown.run.derive("spectrum", at=_richest(rows, shown.axes))
+        if "spectrum" in shown.computed and len(_long_axes(shown)) == 1:
+            shown.run.derive("spectrum", scaling="spectrum")
+    except SpecError as error:
+        yield Note(str(error))
+    for options in stored_options(shown.run, "spectrum"):
+        at: dict[str, float] = options_in_own_words(shown.run, SpectrumOptions(**options)).at
+        along = [d for d in _long_axes(shown) if d not in at]
+        if not along or "cell" in options:
+            place = ", ".join(f"{name} = {value:g}" for name, value in at.items())
+            yield from _drawn(shown, "spectrum", f"Spectra at {place}" if place else "Spectra", **options)
+        elif len(along) == 1:
+            yield from _drawn(shown, "waterfall", f"Spectra along {along[0]}", **options)
+
+
+def _long_axes(shown: Shown) -> list[str]:
+    return [d for d in shown.axes if shown.cube.sizes[d] > 1]
 
 
 def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[Block]:

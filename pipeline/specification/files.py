@@ -308,10 +308,17 @@ def toml_value(value: Any) -> str:
     return repr(value)
 
 
+def _toml_of(key: str, value: Any) -> str:
+    """Return the TOML of a value; the source of a function has its lines."""
+    if key != "function" or not isinstance(value, str):
+        return toml_value(value)
+    return '"""\n' + "\n".join(toml_value(line)[1:-1] for line in value.split("\n")) + '"""'
+
+
 def table_lines(head: str, table: Mapping[str, Any]) -> list[str]:
     """Return the TOML lines of a table and of the tables in it, each below its own header."""
     plain = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
-    lines = [f"[{head}]", *(f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items())]
+    lines = [f"[{head}]", *(f"{toml_key(key)} = {_toml_of(key, value)}" for key, value in plain.items())]
     for key, inner in table.items():
         if key not in plain:
             entries = (f"{toml_key(k)} = {toml_value(v)}" for k, v in inner.items())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import tomllib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from magpend_core.models import load_model as named_model
 from magpend_core.models.imported import KEY, is_object_path
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError
+from magpend_core.models.text.functions import read_function
 from magpend_core.models.text.lines import is_equations, read_lines
 from pipeline.specification.files import read_toml, toml_tables
 from pipeline.specification.problems import SpecError, shown
@@ -182,7 +183,7 @@ def with_model_table(data: Mapping[str, Any], folder: str | Path) -> Mapping[str
 
 
 def model(
-    equations: str | Path | Mapping[str, Any] | Model,
+    equations: str | Path | Mapping[str, Any] | Model | Callable[..., Any],
     /,
     *,
     name: str | None = None,
@@ -190,8 +191,9 @@ def model(
     title: str | None = None,
     source: str | None = None,
     section: str | None = None,
-    states: Mapping[str, str | Mapping[str, Any]] | None = None,
+    states: Mapping[str, str | Mapping[str, Any]] | Sequence[str] | None = None,
     parameters: Mapping[str, float | Mapping[str, Any]] | None = None,
+    drive: str | None = None,
     define: Mapping[str, str] | None = None,
     quantities: Mapping[str, str | Mapping[str, Any]] | None = None,
     impacts: Sequence[Mapping[str, Any]] | None = None,
@@ -201,17 +203,18 @@ def model(
     classifier: Mapping[str, Any] | None = None,
     **values: float | Mapping[str, Any],
 ) -> Model:
-    """Return a model from its equations, or one given by name, path, TOML text or table.
+    """Return a model from a Python function or from equations, or one given by name, path, TOML text or table.
 
     Parameters
     ----------
     equations
-        Lines ``x' = v`` (rates), ``drive = A*cos(omega*t)`` (parts with a name) and ``d = 0.2`` (parameters);
-        ``x'' = ...`` makes the states ``x`` and ``x_dot``. Or a dict of right sides by state. In expressions
-        ``t`` is the time [s] and ``f`` the frequency of the drive [Hz]. The states have the order of the
-        equations, all derivatives last. Otherwise the name of a model that ships, the path of a model's file
-        or of a specification, TOML text of either, or a table with the keys of ``[model]``; then no keyword
-        is taken.
+        A function ``f(t, y, p)`` as for `scipy.integrate.solve_ivp`, which returns the rates of `states`: it is
+        called once with symbols, and its equations are then text like any others. Or lines ``x' = v`` (rates),
+        ``drive = A*cos(omega*t)`` (parts with a name) and ``d = 0.2`` (parameters); ``x'' = ...`` makes the
+        states ``x`` and ``x_dot``. Or a dict of right sides by state. In expressions ``t`` is the time [s], ``f``
+        the frequency of the drive [Hz], and ``omega`` 2 pi f. The states have the order of the equations, all
+        derivatives last. Otherwise the name of a model that ships, the path of a model's file or of a
+        specification, TOML text of either, or a table with the keys of ``[model]``; then no keyword is taken.
     kind
         ``"map"`` if a line ``x' = ...`` gives the next ``x``, and not its rate.
     name, title, source, section
@@ -220,6 +223,10 @@ def model(
     states, parameters, define, quantities
         Entries by name as in the table ``[model]``: a unit, ``{"unit": "rad", "on_circle": True}``,
         ``{"value": 0.2, "unit": "1/s", "bound": "positive"}``. What the lines do not say is added to them.
+        For a function: the names of the states, in the order of ``y``, and the parameters, in the order of ``p``.
+    drive
+        Of a function that depends on ``t``: the parameter that is the angular frequency, the frequency or the period of
+        its drive. Specifications give its value as ``frequency_hz``; in the text it is an expression of ``f``.
     impacts, drawing, mirror, presets, classifier
         Tables with the keys of ``[model]``.
     values
@@ -246,6 +253,12 @@ def model(
     >>> duffing = model("x'' = -d*x' + x - x**3 + A*cos(omega*t)", d=0.2, A=0.3)
     >>> duffing.state_names
     ('x', 'x_dot')
+    >>> model(lambda t, y, p: [y[1], -p.k * y[0]], states=("x", "v"), k=2.0)
+    model model
+      states x [1], v [1]
+      parameters k = 2
+      x' = v
+      v' = -k*x
     """
     tables = {
         "name": name,
@@ -264,7 +277,14 @@ def model(
         "classifier": classifier,
     }
     given = {key: table for key, table in tables.items() if table is not None}
-    if _is_equations(equations):
+    if callable(equations):
+        found = named_model(read_function(equations, given, values, drive))
+    elif drive is not None:
+        raise SpecError(
+            f"drive = {shown(drive)}: names a parameter of a function; equations as text have the frequency f of their "
+            'drive. A parameter of this name stands in parameters: parameters={"drive": 1.0}.'
+        )
+    elif _is_equations(equations):
         lines = read_lines(equations, given, values)  # type: ignore[arg-type]
         if problems := lines.judged():
             raise SpecError(problems)

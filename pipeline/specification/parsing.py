@@ -329,13 +329,13 @@ def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
     """Return the problems of tables and keys that a map, which has no time and no steps, cannot have."""
     what = f"{model.name} is a map"
     problems = [f"{name}: {what}, {why}; drop the table." for name, why in _NOT_OF_MAPS.items() if name in data]
-    rates = [*(f"parameters.{word}" for word in RATES), f"axes.{FREQUENCY}"]
-    given = [key for key in rates for table, _, word in [key.partition(".")] if word in data.get(table, {})]
-    problems += [f"{key}: {what}, which has no drive; drop the key." for key in given]
-    own = data.get("integration", {})
+    rates = [f"parameters.{word}" for word in RATES if word in data.get("parameters", {})]
+    rates += [f"axes.{FREQUENCY}"] if FREQUENCY in data.get("axes", {}) else []
+    problems += [f"{key}: {what}, which has no drive; drop the key." for key in rates]
+    given = data.get("integration", {})
     # a stored specification has all keys, with their defaults
     fields = Integration.model_fields
-    steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if own.get(k, d := fields[k].default) != d]
+    steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if given.get(k, d := fields[k].default) != d]
     problems += [f"integration.{key}: {what}, whose iterations have no steps; drop the key." for key in steps]
     if "extremes" in data.get("products", {}):
         problems.append(f"products.extremes: {what}, without motion between its iterations; drop the product.")

@@ -26,6 +26,8 @@ OMEGA = "omega"
 """The drive's angular frequency, in a text that uses time and gives the name no other meaning."""
 ESCAPE = 1e9
 """Bound beyond which a trajectory has diverged, if the text gives none."""
+MAX_FUNCTION = 20_000
+"""Characters of the source of a Python function from which the equations were read."""
 BOUNDS = {"finite": FINITE, "positive": POSITIVE, "non-negative": NON_NEGATIVE, "fraction": FRACTION}
 KINDS = ("flow", "map")
 """Values of the key ``kind``: equations for the rates of the states, the default, or for the next states."""
@@ -45,12 +47,13 @@ KEYS = (
     "mirror",
     "presets",
     "classifier",
+    "function",
 )
 _STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "size", "escape")
 _PARAMETER_KEYS = ("value", "unit", "meaning", "symbol", "bound")
 _QUANTITY_KEYS = ("value", "unit", "meaning", "symbol")
 # dims, coordinates and keys of runs: a state, a parameter or a quantity of the name would be taken for them
-_OF_RUNS = (
+OF_RUNS = (
     "frequency",
     "frequency_hz",
     "state",
@@ -106,6 +109,7 @@ class _Reading(ViewsReader):
             if key not in table:
                 self.report(f"{self.place}.{key}", "missing; a model has name, states and equations at least.")
         head = {key: self.text(table, key, self.place) for key in ("name", "title", "source", "section")}
+        self.text(table, "function", self.place, most=MAX_FUNCTION)  # for readers; never executed
         self._model_name(head["name"], "name" in table)
         states = self._states(table.get("states", {}))
         if isinstance(table.get("states"), Mapping) and len(table["states"]) > MAX_STATES:
@@ -165,7 +169,7 @@ class _Reading(ViewsReader):
         return True
 
     def _new_name(self, name: str, place: str, kind: str) -> bool:
-        if name in _OF_RUNS:
+        if name in OF_RUNS:
             self.report(place, f"{name!r} names something else in runs; choose another name, such as {name}_.")
             return False
         if not self.name(name, place, self.known):

@@ -59,14 +59,14 @@ class Reader:
             if key not in known:
                 self.report(f"{place}.{key[:SHOWN]}", f"is no key here; {near_names(key[:SHOWN], known, 'keys')}")
 
-    def text(self, table: Mapping[str, Any], key: str, place: str, default: str = "") -> str:
-        """Return a table's value if it is a text that is not too long; else report it and return `default`."""
+    def text(self, table: Mapping[str, Any], key: str, place: str, default: str = "", most: int = MAX_TEXT) -> str:
+        """Return a table's value if it is a text of at most `most` characters; else report it and return `default`."""
         value = table.get(key, default)
         if not isinstance(value, str):
             self.report(f"{place}.{key}", f"{shown(value)} must be a text in quotes.")
             return default
-        if len(value) > MAX_TEXT:
-            self.report(f"{place}.{key}", f"has {len(value)} characters; {MAX_TEXT} are the most.")
+        if len(value) > most:
+            self.report(f"{place}.{key}", f"has {len(value)} characters; {most} are the most.")
             return default
         return value
 

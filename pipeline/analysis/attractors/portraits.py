@@ -92,10 +92,10 @@ def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples:
     starts = here["attractor_points"].transpose("attractor", "point", "state").values[moving, 0]
     if not len(starts):
         return 0.1 / (n_samples * frequency)
-    return _mean_return(starts[:1], parameters, frequency) / n_samples
+    return mean_return(starts[:1], parameters, frequency) / n_samples
 
 
-def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
+def mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
     """Return the mean time between successive points on the Poincare section [s], over 16 returns."""
     result = run_branches(
         parameters.pack()[None, None],

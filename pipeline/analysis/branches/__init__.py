@@ -8,7 +8,8 @@ An orbit of period p is a fixed point of the p-fold stroboscopic map, or of the 
 crossings (`magpend_core.orbits` has its derivative); its branch is followed by pseudo-arclength continuation, whether
 it is stable or not. `problems` has the equations of orbits and equilibria, `lockstep` evaluates many of them in one
 call of the engine, `arclength` traces, `bifurcations` notices and locates, `following` makes one branch, `exploring`
-all that hang together, `curves` continues located points in two parameters. `connecting` says which orbits of a grid
+all that hang together, `searching` finds orbits of detached ones, `curves` continues located points in two
+parameters. `connecting` says which orbits of a grid
 of parameter points lie on one branch or sheet, which `sheets` keeps. Any `magpend_core.engine.system.System` will do;
 names, units and the class of a motion are the model's.
 
@@ -101,5 +102,11 @@ variable                          dims                     meaning
 ``bifurcation_side``              bifurcation              its side
 ``bifurcation_period_s``          bifurcation              its period [s]; of a Hopf point that of its cycles
 ``normal_form``, ``_error``       bifurcation              coefficient of the normal form, NaN if unknown
+``searched_value``, ...           searched                 parameter value where all orbits were searched, and
+                                                           those of the run's other axes (option ``isolas``)
+``coverage``                      searched                 estimated share of starts that lead to an orbit found
+``n_orbits``                      searched, times          orbits of this least period, with those on branches
+``index_sum``, ``index_verdict``  searched, times          sum of the indices of the fixed points of the map taken
+                                                           so many times; what it says (see `searching`)
 ================================= ======================== ===================================================
 """

@@ -10,13 +10,15 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.bifurcations import FOLD, LABELS
+from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, KINDS, LABELS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, values
+from pipeline.analysis.tabular import Row, Words, aligned, counted, values, words_of
+from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
+from pipeline.specification.tables import FREQUENCY as FREQUENCY_HZ
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -47,6 +49,7 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
     from pipeline.analysis.branches.dataset import dataset_of
     from pipeline.analysis.branches.exploring import Scope, explore
+    from pipeline.analysis.branches.searching import places_of, searched_variables
     from pipeline.analysis.branches.starting_orbits import attracting, recurrent
 
     cube, parameter = run.cube(), axis_name(options.parameter)
@@ -57,12 +60,20 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     if options.recurrences:
         found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
         starts += [s for s in found if low <= s.value <= high]
+    searched = places_of(cube, base, parameter, interval, options.isolas)
+    own = max([1, *(s.family.period for s in starts)])
+    periods = np.arange(1, 1 + (options.max_period or min(own, LEAST_PERIOD)))
+    for place in searched:
+        place.search(periods)
+        starts += place.starts()
     run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
     scope = Scope(low, high, longest, options.generations)
     followed = explore(starts, scope)
     if starts and not followed:
         left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
-    return dataset_of(followed, parameter, base, left_out)
+    return dataset_of(followed, parameter, base, left_out).assign(
+        searched_variables(searched, followed, periods, base.model)
+    )
 
 
 def _ends(options: BranchOptions) -> tuple[float, float]:
@@ -146,11 +157,11 @@ def branches_table(ds: xr.Dataset) -> Table:
     """
     rows = table_of(ds)
     if not ds.sizes["branch"]:
-        lines = ["no branch: no closed orbit to begin with", *_left_out(ds)]
+        lines = ["no branch: no closed orbit to begin with", *searched_lines(ds), *_left_out(ds)]
         return Table(rows, lines, _why_none(ds))
     head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
-    return Table(rows, [*lines, *_listed(ds, "stuck"), *_left_out(ds)])
+    return Table(rows, [*lines, *_detached(ds), *searched_lines(ds), *_listed(ds, "stuck"), *_left_out(ds)])
 
 
 def _why_none(ds: xr.Dataset) -> str:
@@ -203,9 +214,12 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     values.
     """
     parameter = str(ds.attrs["parameter"])
-    names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
-    names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
-    return {parameter_name(n): float(ds[n].values[branch]) for n in names}
+    found = {FREQUENCY: ds[FREQUENCY]} if parameter != FREQUENCY and FREQUENCY in ds else {}
+    for variable in ds.data_vars.values():
+        told = str(variable.attrs.get("long_name", ""))
+        if variable.dims == ("branch",) and told.startswith("value of "):
+            found[told.removeprefix("value of ")] = variable
+    return {parameter_name(name): float(variable.values[branch]) for name, variable in found.items()}
 
 
 def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
@@ -278,6 +292,76 @@ def _listed(ds: xr.Dataset, name: str) -> list[str]:
     """Return the lines of an attribute under its name."""
     lines = str(ds.attrs.get(name, "")).splitlines()
     return ["", name.replace("_", " "), *(f"  {line}" for line in lines)] if lines else []
+
+
+def isolas_of(ds: xr.Dataset) -> list[int]:
+    """Return the branches that are isolas: closed curves that no bifurcation connects to a branch of their period."""
+    return [i for i in _unconnected(ds) if _ends_of(ds, i)[0] == "closed"]
+
+
+def cut_of(ds: xr.Dataset) -> list[int]:
+    """Return the branches that are detached within the interval of the parameter, and leave it twice at one bound.
+
+    Beyond the bound they may close or be connected to another branch.
+    """
+    cut = [i for i in _unconnected(ds) if _ends_of(ds, i) == ("bound", "bound")]
+    line, last = ds["parameter"].values, ds["n_points"].values - 1
+    return [i for i in cut if np.isclose(line[i, 0], line[i, last[i]], rtol=1e-9, atol=0.0)]
+
+
+def _unconnected(ds: xr.Dataset) -> list[int]:
+    """Return the branches that spring from no other one and are connected to none by a branch point."""
+    crossing = np.isin(ds["kind"].values, [KINDS.index(kind) for kind in (BRANCHING, PITCHFORK, TRANSCRITICAL)])
+    connected = {*ds["of_branch"].values[crossing].tolist(), *ds["to_branch"].values[crossing].tolist()}
+    return [i for i in range(ds.sizes["branch"]) if int(ds["origin"][i]) < 0 and i not in connected]
+
+
+def _detached(ds: xr.Dataset) -> list[str]:
+    lines = []
+    for branches, head in (
+        (isolas_of(ds), "isolas: closed curves that no bifurcation connects to another branch"),
+        (cut_of(ds), "detached within the interval, which they leave twice at one bound: widen it"),
+    ):
+        lines += ["", head] if branches else []
+        for i in branches:
+            line = ds["parameter"].values[i, : int(ds["n_points"][i])]
+            what = f"period {int(ds['orbit_period'][i])}, branch {i}{_at(ds, i)}"
+            lines.append(f"  {what}: {line.min():.7f} to {line.max():.7f}")
+    return lines
+
+
+_VERDICTS = {
+    "agrees": "as if none is missing",
+    "missing": "orbits are missing",
+    "diverged": "says nothing: cells diverged",
+    "unfinished": "says nothing: cells are unfinished",
+    "flow": "says nothing of a flow",
+}
+
+
+def searched_lines(ds: xr.Dataset) -> list[str]:
+    """Return text lines on the points at which all orbits were searched; none if there was no search."""
+    if "searched_value" not in ds:
+        return []
+    word = str(ds.attrs.get(RATE, FREQUENCY_HZ))
+    dims = {n: str(n).removeprefix("searched_") for n in ds.data_vars if str(n).startswith("searched_")}
+    dims["searched_value"] = str(ds.attrs["parameter"])
+    names = {n: parameter_name(dims_in_own_words([dim], word)[0]) for n, dim in dims.items()}
+    rows = []
+    for k in range(ds.sizes["searched"]):
+        one = ds.isel(searched=k)
+        told = {words_of(ds["index_verdict"])[code] for code in one["index_verdict"].values.tolist()}
+        counts = zip(ds["times"].values.tolist(), one["n_orbits"].values, one["index_sum"].values, strict=True)
+        rows.append(
+            {
+                **{name: f"{float(one[n]):.7g}" for n, name in names.items()},
+                **{f"period {p}": f"{n} ({total:+d})" for p, n, total in counts},
+                "coverage": f"{float(one['coverage']):.0%}" if np.isfinite(one["coverage"]) else "?",
+                "sum": _VERDICTS["missing" if "missing" in told else told.pop()],
+            }
+        )
+    head = ["", "all orbits searched: their number and, in brackets, the sum of their indices"]
+    return [*head, *aligned(rows)]
 
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:

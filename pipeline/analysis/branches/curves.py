@@ -269,9 +269,13 @@ def _has_torus(point: Point) -> bool:
 
 def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
     """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points."""
-    if curve.kind != kind or curve.family.period != family.period:
-        return False
-    for a, b in pairwise(np.array([p.u for p in curve.points])):
+    is_alike = curve.kind == kind and curve.family.period == family.period
+    return is_alike and lies_on(curve.points, family, start)
+
+
+def lies_on(points: Sequence[Point], family: Family, start: Point) -> bool:
+    """Return whether a curve in two parameters passes through an orbit, at any of the orbit's section points."""
+    for a, b in pairwise(np.array([p.u for p in points])):
         chord = b - a
         length = float(np.linalg.norm(chord))
         if not length:

@@ -24,6 +24,9 @@ from magpend_core.orbits import polish_orbits, scaled_distance, section_map, wra
 from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_ON_BRANCH
 from pipeline.products.reporting import report
 
+WIDER = 1.5
+"""Side of the box of random starts, in units of that which the states seen span."""
+
 ROUNDS = 6
 """Most rounds of deflated iterations; the search ends earlier with a round that finds nothing."""
 
@@ -76,6 +79,7 @@ def search_orbits(
     system: System,
     *,
     rounds: int = ROUNDS,
+    what: str = "searching orbits",
 ) -> list[FoundOrbit]:
     """Find the periodic orbits near many starts by plain and then by deflated Newton iterations, each orbit once.
 
@@ -93,6 +97,8 @@ def search_orbits(
         System of equations to integrate.
     rounds
         Largest number of rounds with deflation.
+    what
+        Name of the work in progress reports.
 
     Returns
     -------
@@ -102,14 +108,46 @@ def search_orbits(
     found: list[FoundOrbit] = []
     generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)
     for number in range(1 + rounds):
-        report("searching orbits", number, 1 + rounds)
+        report(what, number, 1 + rounds)
         moved = starts + spread * generator.standard_normal(starts.shape) if number else starts
         ends = _iterate(moved, periods, frequency_hz, packed, system, found)
         n_before = len(found)
-        _add(found, *ends, number, frequency_hz, packed, system)
+        add_orbits(found, *ends, number, frequency_hz, packed, system)
         if len(found) == n_before:
             break
     return sorted(found, key=lambda one: (one.period, -one.n_hits))
+
+
+def starts_around(
+    section: np.ndarray, n: int, seed: int, system: System, reach: np.ndarray | None = None
+) -> np.ndarray:
+    """Return states from which a search starts: half of them section points that were seen, half random in a box.
+
+    Parameters
+    ----------
+    section
+        Section points that were seen, shape (any, n_states).
+    n
+        Number of starts.
+    seed
+        Seed of the random numbers.
+    system
+        System of equations.
+    reach
+        Further states that the box spans, of the same shape.
+    """
+    generator = np.random.default_rng(seed)
+    if not len(section):
+        section = np.zeros((1, system.n_states)) + np.asarray(system.scales) * [[-1.0], [1.0]]
+    spanned = section if reach is None else np.concatenate([section, reach])
+    low, high = spanned.min(axis=0), spanned.max(axis=0)
+    middle, half = (low + high) / 2.0, WIDER * np.maximum(high - low, np.asarray(system.scales)) / 2.0
+    low, high = middle - half, middle + half
+    angles = np.flatnonzero(system.is_angle)
+    low[angles], high[angles] = -np.pi, np.pi
+    n_drawn = n // 2
+    drawn = section[generator.integers(len(section), size=n_drawn)]
+    return np.concatenate([drawn, generator.uniform(low, high, (n - n_drawn, system.n_states))])
 
 
 def _iterate(
@@ -172,7 +210,7 @@ def _stretch(
     return np.asarray(1.0 / np.where(nearly, 1e-3, 1.0 - along))
 
 
-def _add(
+def add_orbits(
     found: list[FoundOrbit],
     states: np.ndarray,
     periods: np.ndarray,
@@ -181,8 +219,8 @@ def _add(
     packed: np.ndarray,
     system: System,
 ) -> None:
-    """Refine the section points to which Newton's method converged, and add new orbits to `found`. Count how often each
-    orbit was hit in the first round.
+    """Refine section points close to orbits, and add new orbits to `found`. Count how often each orbit was hit in the
+    first round, which has the number 0.
     """
     if not len(states):
         return

@@ -89,19 +89,27 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
     if not divides or not same_others(family, own):
         return
     here = start.unknowns
-    away = np.array([point.u[-1] for point in branch.points]) - here[-1]
-    away[np.abs(away) <= SAME_VALUE] = 0.0
-    for i in np.flatnonzero(away[:-1] * away[1:] <= 0.0):
-        a, b = branch.points[i], branch.points[i + 1]
-        share = away[i] / (away[i] - away[i + 1]) if away[i] != away[i + 1] else 0.0
-        guess = a.u + share * (b.u - a.u)
-        guess[-1] = here[-1]
+    for a, b, share, guess in chords_at(branch, here[-1]):
         for x, y in zip(a.value.images, b.value.images, strict=True):
             first, second = family.mismatch(here, x), family.mismatch(here, y)
             # phases move at different rates along a branch: between two points as far as they are apart
             if np.abs(first + share * (second - first)).max() < GUESS + 0.5 * np.abs(second - first).max():
                 yield guess
                 break
+
+
+def chords_at(branch: Branch, value: float) -> Iterator[tuple[Point, Point, float, np.ndarray]]:
+    """Yield where a branch passes a value of its parameter [its scale]: the points before and after it, the share of
+    the way between them, and a guess of the orbit there.
+    """
+    away = np.array([point.u[-1] for point in branch.points]) - value
+    away[np.abs(away) <= SAME_VALUE] = 0.0
+    for i in np.flatnonzero(away[:-1] * away[1:] <= 0.0):
+        a, b = branch.points[i], branch.points[i + 1]
+        share = away[i] / (away[i] - away[i + 1]) if away[i] != away[i + 1] else 0.0
+        guess = a.u + share * (b.u - a.u)
+        guess[-1] = value
+        yield a, b, share, guess
 
 
 def same_others(a: Family, b: Family) -> bool:

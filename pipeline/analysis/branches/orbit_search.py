@@ -8,9 +8,16 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from pipeline.analysis.branches.deflation import FoundOrbit, coverage, expected_index, index_sums, search_orbits
+from pipeline.analysis.branches.deflation import (
+    FoundOrbit,
+    coverage,
+    expected_index,
+    index_sums,
+    search_orbits,
+    starts_around,
+)
 from pipeline.analysis.branches.problems import state_units
-from pipeline.analysis.branches.starting_orbits import parameters_at
+from pipeline.analysis.branches.starting_orbits import parameters_at, sections_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.tabular import Row, Words, aligned, counted
@@ -24,9 +31,6 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.products.branches import OrbitOptions
 from pipeline.products.product import Table
-
-WIDER = 1.5
-"""Side of the box of random starts, in units of that which the cells' sections span."""
 
 
 def needs_point(run: OpenRun, options: OrbitOptions) -> None:
@@ -46,7 +50,7 @@ def orbits(run: OpenRun, options: OrbitOptions) -> xr.Dataset:
     point, base = point_of(cube, options), parameters_of(cube)
     frequency, packed = parameters_at(point, base)
     system = base.model.system
-    starts = _starts(point, system, options)
+    starts = starts_around(sections_of(point), options.starts, options.seed, system)
     periods = np.arange(1, options.max_period + 1)
     found = search_orbits(
         np.tile(starts, (len(periods), 1)),
@@ -57,25 +61,6 @@ def orbits(run: OpenRun, options: OrbitOptions) -> xr.Dataset:
         rounds=options.rounds,
     )
     return _dataset(found, system, options, point)
-
-
-def _starts(point: xr.Dataset, system: System, options: OrbitOptions) -> np.ndarray:
-    """Return start states for the search: half are drawn from the run's section points, half at random from a wider
-    box.
-    """
-    generator = np.random.default_rng(options.seed)
-    section = point["section"].transpose(..., "state").values.reshape(-1, system.n_states)
-    section = section[np.isfinite(section).all(axis=1)]
-    if not len(section):
-        section = np.zeros((1, system.n_states)) + np.asarray(system.scales) * [[-1.0], [1.0]]
-    low, high = section.min(axis=0), section.max(axis=0)
-    middle, half = (low + high) / 2.0, WIDER * np.maximum(high - low, np.asarray(system.scales)) / 2.0
-    low, high = middle - half, middle + half
-    angles = np.flatnonzero(system.is_angle)
-    low[angles], high[angles] = -np.pi, np.pi
-    n_drawn = options.starts // 2
-    drawn = section[generator.integers(len(section), size=n_drawn)]
-    return np.concatenate([drawn, generator.uniform(low, high, (options.starts - n_drawn, system.n_states))])
 
 
 def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, point: xr.Dataset) -> xr.Dataset:

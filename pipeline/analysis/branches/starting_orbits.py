@@ -156,6 +156,13 @@ def parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarra
     return frequency_of(base.model, {str(k): v for k, v in point.coords.items()}), base.replace(**axes).pack()
 
 
+def sections_of(cells: xr.Dataset) -> np.ndarray:
+    """Return all finite section points of some cells, shape (any, n_states)."""
+    section = cells["section"].transpose(..., "state").values
+    section = section.reshape(-1, section.shape[-1])
+    return np.asarray(section[np.isfinite(section).all(axis=1)])
+
+
 def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int) -> list[Start]:
     """Find the periodic orbits, mostly unstable, that trajectories of a run come near.
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Parameters, Quantity, State
+from magpend_core.models.model import Model, Parameters, Quantity, State
 from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
-from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, searched_lines
 from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun
@@ -46,6 +46,9 @@ _LANDED = {
     Status.DIVERGED: "diverged",
     Status.NO_RETURN: "no_return",
 }
+MEASURES = ("amplitude", "mean", "rms", "error", "dominant_order", "harmonic_amplitude", "phase")
+"""Names of the measures along a branch."""
+
 _LEFT_OUT = ("section", "multiplier", "eigenvalue", "residual", "bifurcation_section", "bifurcation_multiplier")
 
 Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
@@ -66,31 +69,42 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     base = parameters_of(run.cube())
     places = [(i, j) for i in range(located.sizes["branch"]) for j in range(int(located["n_points"][i]))]
     run.echo(f"response: {len(places)} orbits")
-    flow = of_flow(base).model
-    both: list[State | Quantity] = [*flow.states, *flow.quantities]
     rows = tuple(np.array(places, int).reshape(-1, 2).T)
     variables: dict[str, Any] = {}
-    sizes = {"channel": len(both), "harmonic": options.harmonics}
-    for name, (dims, found, about) in _measured([_at_point(located, base, *p) for p in places], sizes).items():
+    flow = of_flow(base).model
+    orbits = [_at_point(located, base, *p) for p in places]
+    for name, (dims, found, about) in measured(orbits, flow, options.harmonics).items():
         whole = np.full((located.sizes["branch"], located.sizes["point"], *found.shape[1:]), np.nan)
         whole[rows] = found
         variables[name] = (("branch", "point", *dims), whole, about)
     events = [_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
-    there = _measured(events, sizes)
+    there = measured(events, flow, options.harmonics)
     variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
     variables |= _jumps(located, base, events, options)
     kept = located.drop_vars([name for name in map(str, located.variables) if name.startswith((*_LEFT_OUT, "state"))])
-    return kept.assign(variables).assign_coords(
-        channel=("channel", [v.name for v in both], {"long_name": "state or quantity"}),
-        unit=("channel", [v.unit for v in both], {"long_name": "unit of the channel"}),
-        harmonic=np.arange(1, options.harmonics + 1),
-    )
+    kept = kept.rename({name: _own_name(name) for name in base.names if name in kept and name in variables})
+    return kept.assign(variables).assign_coords(channel_coordinates(flow, options.harmonics))
 
 
-def _measured(orbits: Sequence[Orbit], sizes: dict[str, int]) -> dict[str, Variable]:
-    """Return the measures of orbits as variables, without the dims of the orbits; `sizes` of the others."""
-    found = measures_of(orbits, sizes["harmonic"])
-    over = ("channel",)
+def _own_name(parameter: str) -> str:
+    """Return the name of a variable or column for a parameter whose own name is that of a measure."""
+    return f"parameter_{parameter}" if parameter in MEASURES else parameter
+
+
+def channel_coordinates(model: Model, n_harmonics: int) -> dict[str, Any]:
+    """Return the coordinates of measures: a model's states and quantities with their units, and the harmonics."""
+    both: list[State | Quantity] = [*model.states, *model.quantities]
+    return {
+        "channel": ("channel", [v.name for v in both], {"long_name": "state or quantity"}),
+        "unit": ("channel", [v.unit for v in both], {"long_name": "unit of the channel"}),
+        "harmonic": np.arange(1, n_harmonics + 1),
+    }
+
+
+def measured(orbits: Sequence[Orbit], model: Model, n_harmonics: int) -> dict[str, Variable]:
+    """Return the measures of orbits of a model as variables, without the dims of the orbits."""
+    found = measures_of(orbits, n_harmonics)
+    n = len(model.states) + len(model.quantities)  # also if there is no orbit
     columns = {
         "amplitude": (found.amplitude, "half of peak to peak"),
         "mean": (found.mean, "mean over the period"),
@@ -98,15 +112,14 @@ def _measured(orbits: Sequence[Orbit], sizes: dict[str, int]) -> dict[str, Varia
         "error": (found.error, "largest error of the amplitudes"),
         "dominant_order": (found.dominant, "order of the largest component, in units of the drive's frequency"),
     }
-    variables: dict[str, Variable] = {name: (over, v, {"long_name": text}) for name, (v, text) in columns.items()}
-    both = (*over, "harmonic")
-    variables["harmonic_amplitude"] = (both, np.abs(found.harmonics), {"long_name": "amplitude of the harmonic"})
-    about = {"units": "rad", "long_name": "lag of the harmonic behind that of the drive"}
-    variables["phase"] = (both, lags_of(orbits, found.harmonics), about)
-    return {  # with all dims, even of no orbits
-        name: (dims, values.reshape(len(orbits), *(sizes[dim] for dim in dims)), text)
-        for name, (dims, values, text) in variables.items()
+    variables: dict[str, Variable] = {
+        name: (("channel",), v.reshape(-1, n), {"long_name": text}) for name, (v, text) in columns.items()
     }
+    both, harmonics = ("channel", "harmonic"), found.harmonics.reshape(-1, n, n_harmonics)
+    variables["harmonic_amplitude"] = (both, np.abs(harmonics), {"long_name": "amplitude of the harmonic"})
+    about = {"units": "rad", "long_name": "lag of the harmonic behind that of the drive"}
+    variables["phase"] = (both, lags_of(orbits, harmonics), about)
+    return variables
 
 
 def _at_point(located: xr.Dataset, base: Parameters, branch: int, point: int) -> Orbit:
@@ -225,20 +238,23 @@ def _landed(starts: Sequence[Orbit], frequency_hz: Sequence[float]) -> list[tupl
 def response_table(ds: xr.Dataset) -> Table:
     """Return the table of a response.
 
-    Rows are those of the branches' points and channels: value of the parameter, fixed parameters, branch, period,
-    whether the orbit is stable, ``amplitude`` (half of peak to peak), ``mean``, ``rms``, ``error``,
-    ``dominant_order``, and ``harmonic_1``, ``phase_1`` [rad], ... The text shows the largest amplitude of each
-    branch, and for each jump the amplitudes before and after it, of the first channel.
+    Rows are those of the branches' points and channels: value of the parameter, fixed parameters (with the prefix
+    ``parameter_`` if they are called like a measure), branch, period, whether the branch is an isola, whether the orbit
+    is stable, ``amplitude`` (half of peak to peak), ``mean``, ``rms``, ``error``, ``dominant_order``, and
+    ``harmonic_1``, ``phase_1`` [rad], ... The text shows the largest amplitude of each branch, and for each jump the
+    amplitudes before and after it, of the first channel.
     """
     rows = _rows(ds)
     if not rows:
         return Table(rows, ["no orbit to measure"], "no branch: no closed orbit to begin with")
     name, first = parameter_name(str(ds.attrs["parameter"])), str(ds["channel"].values[0])
     lines = [f"amplitude of {first}{_unit(ds)} along {name}, the largest of each branch"]
-    lines += ["", *aligned([_peak(ds, name, i) for i in range(ds.sizes["branch"])], "")]
+    detached = dict.fromkeys(isolas_of(ds), "isola") | dict.fromkeys(cut_of(ds), "detached within the interval")
+    lines += ["", *aligned([_peak(ds, name, i, detached) for i in range(ds.sizes["branch"])], "")]
     jumps = [_jump(ds, name, k) for k in np.argsort(_jump_values(ds), kind="stable")]
     none = "no jump: no stable orbit ends at a fold or a subcritical bifurcation"
     lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", none]
+    lines += searched_lines(ds)
     return Table(rows, lines)
 
 
@@ -246,13 +262,15 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     name = parameter_name(str(ds.attrs["parameter"]))
     rows = []
     arrays = {key: ds[key].values for key in ("parameter", "n_unstable", "orbit_period", "harmonic_amplitude", "phase")}
+    isolas = isolas_of(ds)
     measures = {key: ds[key].values for key in ("amplitude", "mean", "rms", "error", "dominant_order")}
     for i in range(ds.sizes["branch"]):
-        fixed = fixed_of(ds, i)
+        fixed = {_own_name(key): value for key, value in fixed_of(ds, i).items()}
         for j in range(int(ds["n_points"][i])):
             for c, channel in enumerate(ds["channel"].values):
-                row: Row = {name: float(arrays["parameter"][i, j]), **fixed, "branch": i}
-                row |= {"period": int(arrays["orbit_period"][i]), "stable": bool(arrays["n_unstable"][i, j] == 0)}
+                row: Row = {_own_name(name): float(arrays["parameter"][i, j]), **fixed, "branch": i}
+                row |= {"period": int(arrays["orbit_period"][i]), "isola": i in isolas}
+                row |= {"stable": bool(arrays["n_unstable"][i, j] == 0)}
                 row |= {"channel": str(channel), **{key: float(v[i, j, c]) for key, v in measures.items()}}
                 for k, order in enumerate(ds["harmonic"].values):
                     row[f"harmonic_{order}"] = float(arrays["harmonic_amplitude"][i, j, c, k])
@@ -266,7 +284,7 @@ def _unit(ds: xr.Dataset) -> str:
     return "" if unit in ("", "1") else f" [{unit}]"
 
 
-def _peak(ds: xr.Dataset, name: str, branch: int) -> Words:
+def _peak(ds: xr.Dataset, name: str, branch: int, detached: Mapping[int, str]) -> Words:
     n = int(ds["n_points"][branch])
     amplitude = ds["amplitude"].values[branch, :n, 0]
     at = int(np.nanargmax(amplitude))
@@ -279,6 +297,7 @@ def _peak(ds: xr.Dataset, name: str, branch: int) -> Words:
         "largest": f"{amplitude[at]:.6g}",
         "at": f"{x[at]:.6g}",
         "stable": f"{stable.mean():.0%}",
+        "curve": detached.get(branch),
     }
 
 

@@ -67,7 +67,7 @@ class Measures:
     error: Array
 
 
-def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
+def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = False) -> Measures:
     """Integrate orbits over one period each, and measure them. Samples are doubled until the measures settle.
 
     Parameters
@@ -76,6 +76,8 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
         Of one model.
     n_harmonics
         Number of harmonics.
+    of_orbit
+        Whether the harmonics are those of the orbit's own period, with a drive as well.
 
     Returns
     -------
@@ -91,8 +93,8 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int) -> Measures:
     left, n = np.arange(len(orbits)), FEWEST
     while len(left) and n <= MOST:
         for rows in _blocks(orbits, left, n):
-            values = _sampled([orbits[i] for i in rows], n)
-            base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven else 1
+            values = sampled([orbits[i] for i in rows], n)
+            base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven and not of_orbit else 1
             _measure(found, rows, values, base, n_harmonics)
         scale = np.abs(found.mean[left]) + found.amplitude[left]
         left, n = left[(found.error[left] > SETTLED * scale).any(axis=1)], 2 * n
@@ -108,7 +110,7 @@ def _blocks(orbits: Sequence[Orbit], rows: Array, n: int) -> Iterator[Array]:
         yield from (own[k : k + step] for k in range(0, len(own), step))
 
 
-def _sampled(orbits: Sequence[Orbit], n: int) -> Array:
+def sampled(orbits: Sequence[Orbit], n: int) -> Array:
     """Return states and quantities at even instants of a period, (orbit, sample, channel), without an angle's turns."""
     period = max(orbits[0].period, 1)
     flows = [of_flow(orbit.parameters) for orbit in orbits]
@@ -143,12 +145,12 @@ def _sampled(orbits: Sequence[Orbit], n: int) -> Array:
 
 def _measure(found: Measures, rows: Array, values: Array, base: int, n_harmonics: int) -> None:
     """Measure sampled values; the error compares with every second sample."""
-    amplitude, harmonics = _amplitude(values), _harmonics(values, base, n_harmonics)
+    amplitude, harmonics = _amplitude(values), harmonics_of(values, base, n_harmonics)
     found.amplitude[rows], found.harmonics[rows] = amplitude, harmonics
     found.mean[rows] = values.mean(axis=1)
     found.rms[rows] = np.sqrt((values**2).mean(axis=1))
     coarse = values[:, ::2]
-    change = np.abs(harmonics - _harmonics(coarse, base, n_harmonics)).max(axis=-1)
+    change = np.abs(harmonics - harmonics_of(coarse, base, n_harmonics)).max(axis=-1)
     found.error[rows] = np.maximum(np.abs(amplitude - _amplitude(coarse)), change)
     parts = np.abs(np.fft.rfft(values, axis=1)[:, 1:])
     found.dominant[rows] = np.where(parts.max(axis=1) > 0.0, (1 + parts.argmax(axis=1)) / base, 0.0)
@@ -169,7 +171,7 @@ def _highest(values: Array) -> Array:
         return np.asarray(here - np.where(bend < 0.0, 0.5 * slope**2 / bend, 0.0))
 
 
-def _harmonics(values: Array, base: int, n_harmonics: int) -> Array:
+def harmonics_of(values: Array, base: int, n_harmonics: int) -> Array:
     """Return the complex amplitudes of the multiples of `base`, (orbit, channel, harmonic)."""
     parts = 2.0 * np.fft.rfft(values, axis=1) / values.shape[1]
     order = base * np.arange(1, n_harmonics + 1)

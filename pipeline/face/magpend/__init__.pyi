@@ -33,6 +33,7 @@ from pipeline.analysis.chaos.dimensions import correlation_dimension as correlat
 from pipeline.analysis.chaos.dimensions import kaplan_yorke_dimension as kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
+from pipeline.analysis.spectrum.estimate import spectrum_of as spectrum_of
 from pipeline.compute.simulate import simulate as simulate
 from pipeline.explorer.notebook import explorer as explorer
 from pipeline.plots import DataFigure as DataFigure
@@ -88,11 +89,13 @@ hysteresis = Run.hysteresis
 settling = Run.settling
 chaos = Run.chaos
 dimension = Run.dimension
+spectrum = Run.spectrum
 branches = Run.branches
 bands = Run.bands
 curves = Run.curves
 orbits = Run.orbits
 response = Run.response
+backbone = Run.backbone
 tongues = Run.tongues
 manifolds = Run.manifolds
 tangency = Run.tangency

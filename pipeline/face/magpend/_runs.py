@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from magpend._methods import AnalysisMethod
 from pipeline.products.attractors import AttractorOptions
+from pipeline.products.backbone import BackboneOptions
 from pipeline.products.basins import BasinOptions
 from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions, TongueOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
@@ -17,6 +18,7 @@ from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
+from pipeline.products.spectrum import SpectrumOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
 from pipeline.runs.arguments import names_arguments
 from pipeline.runs.derive import shown_table, stale, stored_each
@@ -68,12 +70,14 @@ class Run(RunDirectory):
     settling = AnalysisMethod(Options)
     chaos = AnalysisMethod(ChaosOptions)
     dimension = AnalysisMethod(DimensionOptions)
+    spectrum = AnalysisMethod(SpectrumOptions)
     branches = AnalysisMethod(BranchOptions)
     bands = AnalysisMethod(BandOptions)
     curves = AnalysisMethod(CurveOptions)
     orbits = AnalysisMethod(OrbitOptions)
     tongues = AnalysisMethod(TongueOptions)
     response = AnalysisMethod(ResponseOptions)
+    backbone = AnalysisMethod(BackboneOptions)
     manifolds = AnalysisMethod(ManifoldOptions)
     tangency = AnalysisMethod(TangencyOptions)
     tipping = AnalysisMethod(TippingOptions)

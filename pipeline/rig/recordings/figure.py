@@ -1,7 +1,8 @@
-"""Draw the measured quantities of a recording over time, and mark the faults found in it."""
+"""Draw the measured quantities of a recording over time with the faults found in it, and measure its spectrum."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from pipeline.analysis.spectrum.estimate import spectrum_of
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
+from pipeline.rig.edges import edges_of
 from pipeline.rig.recordings.channels import findings_of
 from pipeline.rig.recordings.mapping import DRIVE
+from pipeline.specification.problems import SpecError
 
 MOST_DOTS = 6000
 """Most samples of a line that are drawn singly; of more, the minima and maxima by column."""
@@ -174,3 +178,21 @@ def _caption(ds: xr.Dataset) -> str:
     ]
     others = sorted({f.kind for f in findings_of(ds) if f.kind not in MARKS or np.isnan(f.start_s)})
     return style.join([*parts, f"also found: {', '.join(others)}" if others else ""])
+
+
+def spectrum_of_recording(ds: xr.Dataset, channel: str = "", **settings: Any) -> xr.Dataset:
+    """Return the spectrum of a recording, with orders if the edges of its drive have a frequency.
+
+    Parameters
+    ----------
+    ds
+        Recording from `read_recording` or `smooth`.
+    channel, settings
+        See `magpend.spectrum_of`.
+    """
+    drive_hz = None
+    if DRIVE in ds:
+        with contextlib.suppress(SpecError):  # not periodic, or not switched: then there are no orders
+            drive_hz = edges_of(ds).frequency().frequency_hz
+    found = spectrum_of(ds, channel, drive_hz=drive_hz, **settings)
+    return found.assign_attrs(file=str(ds.attrs.get("file", "")))

@@ -109,6 +109,25 @@ def test_duffing__has_the_folds_and_the_landings_of_an_independent_integration(r
 
 
 @pytest.mark.slow
+def test_duffing__has_a_response_without_a_bifurcation_to_a_force_called_amplitude(tmp_path):
+    spec = (
+        magpend.Spec("sweep", "duffing")
+        .with_parameters(preset="hardening")
+        .with_axis("amplitude", values=[0.01, 0.02])
+        .with_axis("frequency_hz", 0.1, 0.13, 3)
+        .with_start_list(points=[(0.0, 0.0)])
+        .with_integration(n_transient=100, n_keep=4)
+    )
+    ds = magpend.run(spec, tmp_path / "run", workers=0).response(parameter="frequency_hz")
+    assert (ds.sizes["bifurcation"], ds.sizes["branch"]) == (0, 2)
+    largest = ds["amplitude"].sel(channel="x").max("point")
+    np.testing.assert_allclose(largest / ds["parameter_amplitude"], largest[0] / 0.01, rtol=1e-2)
+    row = response_table(ds).rows[0]
+    assert row["parameter_amplitude"] == 0.01
+    assert row["amplitude"] == float(ds["amplitude"][0, 0, 0])
+
+
+@pytest.mark.slow
 def test_quantities__are_measured_like_states(response):
     i, j = points_of(response)[2]
     one = response.isel(branch=i, point=j)

@@ -93,6 +93,7 @@ def other_value(model, name):
         "shown": 2,
         "between": ("A", "C"),
         "radius": 0.5,
+        "cell": 3,
     }
     if name in special:
         return special[name]

@@ -161,7 +161,7 @@ def folded():
     section = np.zeros((1, len(psi), 1, 4))
     section[0, :, 0, 0] = psi
     multipliers = np.stack([1.0 - psi, 0.5 + 0 * psi, 0.2 + 0.1j + 0 * psi, 0.2 - 0.1j + 0 * psi], axis=1)[None]
-    event = {"kind": 0, "value": 3.0, "of_branch": 0, "after": int(np.flatnonzero(psi > 0)[-1])}
+    event = {"kind": 0, "value": 3.0, "of_branch": 0, "to_branch": -1, "after": int(np.flatnonzero(psi > 0)[-1])}
     event |= {"n_unstable_before": 0, "n_unstable_after": 1, "bifurcation_side": 2}
     return xr.Dataset(
         {
@@ -172,6 +172,8 @@ def folded():
             "n_unstable": (("branch", "point"), (psi < 0)[None].astype(np.int8)),
             "n_points": ("branch", [len(psi)]),
             "orbit_period": ("branch", [1]),
+            "origin": ("branch", [-1]),
+            **{f"{end}_end": ("branch", [0], {"flag_meanings": "bound"}) for end in ("first", "last")},
             "bifurcation_section": (("bifurcation", "phase", "state"), np.zeros((1, 1, 4))),
             **{name: ("bifurcation", [value]) for name, value in event.items()},
             "critical_real": ("bifurcation", [1.0]),

@@ -110,13 +110,17 @@ def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
 
 
 def test_report__its_commands_work(folder, command):
-    html = written(command, folder, "run", "--with", "branches")
-    assert html == written(command, folder, "run", "--with", "branches")  # now of what is stored
+    html = written(command, folder, "run", "--with", "branches", "--with", "spectrum")
+    assert html == written(command, folder, "run", "--with", "branches", "--with", "spectrum")  # now of what is stored
     commands = [markup.unescape(c) for c in re.findall(r'<p class="command"><code>(.*?)</code>', html)]
     mine = [c for c in commands if re.match(r"magpend (analyse|plot) ", c) and "chaos" not in c]
-    assert {"magpend plot basins", "magpend analyse branches", "magpend plot gallery"} <= {
-        " ".join(c.split()[:3]) for c in mine
-    }
+    assert {
+        "magpend plot basins",
+        "magpend analyse branches",
+        "magpend plot gallery",
+        "magpend plot spectrum",
+        "magpend plot waterfall",
+    } <= {" ".join(c.split()[:3]) for c in mine}
     for c in mine:
         _, notes = command(folder, *shlex.split(c)[1:])
         assert not re.search(r": computed", notes), c

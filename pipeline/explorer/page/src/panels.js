@@ -11,6 +11,7 @@ import { Portraits } from "./portrait.js";
 import { saveMenu } from "./save.js";
 import { Series } from "./series.js";
 import { showFacts } from "./facts.js";
+import { Spectrum } from "./spectrum.js";
 
 /** How long a connection may be away before that is said [ms]. */
 const PATIENCE_MS = 2000;
@@ -49,15 +50,16 @@ class Panels {
     const cards = {
       facts: card("Orbit", "facts"), machine: card(view.model.drawing ? "Motion" : "Time", "machine"),
       portraits: card("Phase portraits", "portraits"), series: card("Over time", "series"),
-      multipliers: card("Multipliers", "multipliers"), plane: card("Initial states", "plane"), follow: card("Drag a parameter", "follow"),
+      multipliers: card("Multipliers", "multipliers"), spectrum: card("Spectrum", "spectrum"), plane: card("Initial states", "plane"), follow: card("Drag a parameter", "follow"),
     };
     const stack = (...names) => el("div", { class: "stack" }, ...names.map((name) => cards[name].element));
-    this.grid.append(stack("facts", "machine", "follow"), stack("portraits", "multipliers"), stack("series", "plane"));
+    this.grid.append(stack("facts", "machine", "follow"), stack("portraits", "multipliers", "spectrum"), stack("series", "plane"));
     this.cards = cards;
     this.machine = new Machine(cards.machine.body, view, clock);
     this.portraits = new Portraits(cards.portraits.body, view, clock);
     this.series = new Series(cards.series.body, view, clock);
     this.multipliers = new Multipliers(cards.multipliers.body);
+    this.spectrum = new Spectrum(cards.spectrum.body, view);
     const starter = this.live && { start: (request, onPiece) => this.start(request, onPiece) };
     this.plane = new Plane(cards.plane.body, view, this.state, this.source, starter);
     if (this.live) this.follow = new Follow(cards.follow.body, view, this.live, { show: (orbit) => this.showFollowed(orbit), back: () => this.back() });
@@ -72,7 +74,7 @@ class Panels {
     const menus = {
       machine: this.view.model.drawing && { frames: () => [this.machine.frame] },
       portraits: { frames: () => this.portraits.frames, data }, series: { frames: () => this.series.frames, data },
-      multipliers: { frames: () => [this.multipliers.frame] },
+      multipliers: { frames: () => [this.multipliers.frame] }, spectrum: { frames: () => [this.spectrum.frame] },
       plane: { frames: () => [this.plane.frame], data: { kind: "plane", query: () => ({ at: this.plane.indices }) } },
     };
     for (const [key, menu] of Object.entries(menus)) {
@@ -178,6 +180,7 @@ class Panels {
     this.portraits.show(orbit);
     this.series.show(orbit);
     this.multipliers.show(orbit);
+    this.spectrum.show(orbit);
     this.machine.show(orbit, keepsTime);
   }
 
@@ -203,7 +206,7 @@ class Panels {
     this.startJob?.cancel();
     this.clock.pause();
     for (const end of this.forget) end?.();
-    for (const part of [this.machine, this.portraits, this.series, this.multipliers, this.plane, this.follow]) part?.destroy();
+    for (const part of [this.machine, this.portraits, this.series, this.multipliers, this.spectrum, this.plane, this.follow]) part?.destroy();
     this.element.replaceChildren();
   }
 }

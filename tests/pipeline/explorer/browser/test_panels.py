@@ -13,6 +13,8 @@ import pytest
 import xarray as xr
 
 from pipeline.analysis.ragged import dense
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.data.orbits import orbit
 from pipeline.layout.vocabulary import letter
 from pipeline.runs.derive import stored
 from pipeline.store.run import RunDirectory, open_run
@@ -131,6 +133,19 @@ def test_click__shows_the_orbit_of_the_cube(shown, cube, owners, section):
     shown.page.locator(".panel-multipliers .value").nth(3).wait_for()
     assert shown.complaints == []
     assert shown.outside == []
+
+
+def test_spectrum__of_a_closed_orbit_has_its_lines(shown, looked_at, cube, owners, section):
+    cell = alone(cube, owners, section)
+    choose(shown, cell)
+    found, _ = unpack_arrays(orbit(RunDirectory.open(looked_at), cell, 0))
+    psi = found["states"][:, 0]
+    psi = (psi - np.linspace(0.0, psi[-1] - psi[0], len(psi)))[:-1]
+    lines = np.abs(2.0 * np.fft.rfft(psi) / len(psi))[1:11]
+    order = np.argsort(-lines)[:2]
+    told = re.findall(r"([\d.]+) at ([\d.]+)", note_of(shown, "spectrum", "Lines"))
+    assert [int(place) for _, place in told[:2]] == (1 + order).tolist()
+    assert [float(size) for size, _ in told[:2]] == pytest.approx(lines[order], rel=1e-3)
 
 
 def test_live_start__ends_on_the_label_of_the_cube(page, cube, owners):

@@ -7,6 +7,8 @@ import re
 import tomllib
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from pipeline.rig.recordings.mapping import parse_mapping
@@ -128,3 +130,44 @@ def test_recordings__never_replace_what_they_read(main, swing, tmp_path):
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
     assert main("recordings", "simulate", "rig.toml", "--out", "swing.csv")[0] == 0  # the same again
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+SINES = """
+model = "pendulum"
+format = "csv"
+[time]
+channel = "time"
+[channels.psi1]
+channel = "a"
+[channels.psi2]
+channel = "b"
+[drive]
+channel = "coil"
+kind = "signal"
+"""
+
+
+@pytest.mark.slow
+def test_recordings_spectrum__finds_lines_and_counts_orders_from_the_drive(main, tmp_path):
+    """Sines of known amplitudes, and a drive that switches at 2 Hz: orders 1.5 and 4."""
+    t = np.arange(8000) / 400.0
+    columns = [t, 0.3 * np.sin(2 * np.pi * 3.0 * t), 0.02 * np.cos(2 * np.pi * 8.0 * t), ((t + 0.1) % 0.5 < 0.2) * 5.0]
+    table = pd.DataFrame(dict(zip(("time", "a", "b", "coil"), columns, strict=True)))
+    table.to_csv(tmp_path / "sines.csv", index=False)
+    (tmp_path / "sines.toml").write_text(SINES)
+    words = ("recordings", "spectrum", "sines.csv", "--mapping", "sines.toml")
+    words += ("--nperseg", "800", "--scaling", "spectrum")
+    code, out, err = main(*words, "--out", "spectrum.png", "--csv", "lines.csv")
+    assert code == 0, err
+    assert (tmp_path / "spectrum.png").stat().st_size > 5_000
+    lines = pd.read_csv(tmp_path / "lines.csv")
+    top = lines.loc[lines["power"].idxmax()]
+    assert top["frequency_hz"] == pytest.approx(3.0, rel=1e-9)
+    assert top["order"] == pytest.approx(1.5, rel=1e-4)
+    assert top["power"] == pytest.approx(0.3**2 / 2, rel=1e-6)
+    assert "19" in out  # averages
+    code, out, err = main(*words, "--channel", "psi2")
+    assert code == 0, err
+    assert f"{0.02**2 / 2:.4g} at 4" in out
+    code, _, err = main(*words, "--channel", "psi3")
+    assert (code, "'psi3'" in err, "psi2" in err) == (2, True, True)

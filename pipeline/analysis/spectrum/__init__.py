@@ -1,0 +1,1 @@
+"""Spectra of motions: amplitudes of lines, and densities."""

@@ -1,0 +1,436 @@
+"""Measure the spectra of the motions of a run: lines of closed orbits, and densities of motions that do not close.
+
+A row of the result is the spectrum of one set at one parameter point, or of one cell. Lines are the harmonics of an
+orbit's own period, from `pipeline.analysis.response.orbits`. Of other motions one long trajectory is sampled finely
+enough that almost no power lies in the upper half of the band, where it would fold back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy import signal
+
+from magpend_core.models.model import Model, Parameters, Quantity, State
+from magpend_core.models.sectioned import of_flow
+from magpend_core.pointwise import evaluate
+from magpend_core.sampling import Drive, sample
+from magpend_core.status import Status
+from pipeline.analysis.attractors.portraits import mean_return
+from pipeline.analysis.ragged import dims_of, places_of_rows, points_of_rows
+from pipeline.analysis.response.orbits import AT_ONCE, Orbit, measures_of
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.selection import select_points
+from pipeline.analysis.spectrum.estimate import ALL, Averaged, averaged, frequencies_of, power_unit
+from pipeline.analysis.tabular import Row, Words, aligned, number, plain, words_of
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.own_words import RATE, dims_in_own_words
+from pipeline.layout.vocabulary import (
+    BOUNDED_SET,
+    EQUILIBRIUM,
+    FREQUENCY_DIM,
+    KINDS,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    STABILITIES,
+    TORUS,
+    frequency_of,
+    letter,
+    parameters_of,
+    split_dims,
+    told_by,
+)
+from pipeline.products.figures import SpectrumFigureOptions, WaterfallOptions
+from pipeline.products.product import Table
+from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
+from pipeline.specification.problems import unknown_name
+from pipeline.specification.tables import FREQUENCY
+
+FEWEST, MOST = 128, 2048
+"""Samples per drive period or return of a motion that does not close: at first, and at most."""
+
+FOLDED = 1e-6
+"""Share of the power in the upper half of the band, below which samples are not doubled."""
+
+ESTIMATES = ("none", "lines", "average")
+NONE, LINES, AVERAGE = range(len(ESTIMATES))
+"""Values of `estimate`: a trajectory that failed, the lines of a closed orbit, an averaged periodogram."""
+
+SHOWN_LINES = 4
+"""Largest lines that the printed table names."""
+
+Array = np.ndarray
+
+
+class Motion(NamedTuple):
+    """A motion whose spectrum is measured: a set at a parameter point, or where a cell goes on."""
+
+    where: dict[str, float]  # values of the swept parameters
+    attractor: int  # id, -1 of a cell on no set
+    kind: int
+    stability: int
+    period: int  # drive periods or returns, 0 if it does not close
+    seconds: float  # of the period
+    share: float  # of the initial conditions
+    state: Array
+    parameters: Parameters
+    clock_hz: float  # frequency of the drive or the strobe; of a flow with a section one over its longest return
+
+
+def _channels(model: Model) -> list[State | Quantity]:
+    both: list[State | Quantity] = [*model.flow.states, *model.flow.quantities]
+    return both
+
+
+def needs_channel(run: OpenRun, options: SpectraOptions) -> None:
+    """Raise ValueError unless the options name a channel, a window, and a set or a cell that can be there."""
+    names = [v.name for v in _channels(run.model)]
+    if options.channel and options.channel not in names:
+        raise ValueError(unknown_name("channel", options.channel, names))
+    try:
+        signal.get_window(options.window, 8)
+    except ValueError as error:
+        raise ValueError(f"window {options.window!r}: {error}; scipy.signal.windows lists the names.") from None
+    if options.attractor and not options.attractor.strip().isalnum():
+        raise ValueError(f"attractor {options.attractor!r}: give its letter or its id.")
+    status = run.cube()["status"]
+    select_points(run.cube(), options.at)
+    cell = getattr(options, "cell", None)
+    if cell is None:
+        return
+    if cell >= status.size:
+        raise ValueError(f"cell = {cell} is out of bounds: the run has cells 0 to {status.size - 1}.")
+    if options.at or options.attractor:
+        raise ValueError("cell names a motion already: drop at and attractor.")
+
+
+def needs_axis(run: OpenRun, options: SpectrumFigureOptions | WaterfallOptions) -> None:
+    """Raise ValueError unless the run has what a figure of spectra shows: one parameter point, or one axis."""
+    needs_channel(run, options)
+    if options.axis == "order" and run.model.autonomous:
+        raise ValueError("axis order: the model has no drive whose multiples orders could be; take Hz.")
+    if isinstance(options, WaterfallOptions):
+        free = [d for d in split_dims(run.cube()["status"])[0] if run.cube().sizes[d] > 1 and d not in options.at]
+        if len(free) != 1:
+            left = (
+                f"{len(free)} are left ({', '.join(free)}): choose values of others with --at"
+                if free
+                else "none is left"
+            )
+            raise ValueError(f"a waterfall is drawn along one axis, and {left}; plot spectrum draws a parameter point.")
+    elif options.cell is None and not options.nearest:
+        select_points(run.cube(), options.at, purpose="spectra are drawn of one parameter point or one cell")
+
+
+def settle_spectrum(run: OpenRun, options: SpectrumOptions) -> SpectrumOptions:
+    """Fill in the channel, and replace the id of an attractor by its letter."""
+    name = options.attractor.strip().upper()
+    chosen = letter(int(name)) if name.isdigit() else name
+    return options.model_copy(update={"channel": options.channel or run.model.state_names[0], "attractor": chosen})
+
+
+def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
+    """Measure the spectra of the sets of a run, or of the motion of a cell.
+
+    Returns
+    -------
+    Dataset
+        Over ``spectrum`` (rows) and ``bin``: ``amplitude`` of each line of a closed orbit, in the channel's unit;
+        ``power`` of other motions, in unit^2/Hz or unit^2; both have the coordinates ``frequency_hz`` and, with a
+        drive, ``order``. Rows have the swept parameters (``frequency``, others as ``at_NAME``), ``attractor``,
+        ``kind``, ``stability``, ``orbit_period``, ``share`` and ``estimate``, a code of `ESTIMATES`. Evidence:
+        ``n_averages``, ``resolution_hz``, ``bandwidth_hz``; ``variance``, and ``kept``, its share in the bins; of lines
+        ``error``; of a torus ``first_hz``, ``second_hz`` (NaN if undecided) and ``explained``, the share of its power
+        at their combinations.
+    """
+    motions = _motions(run, options)
+    run.echo(f"spectrum: {len(motions)} motions")
+    place = [v.name for v in _channels(run.model)].index(options.channel)
+    rows: list[dict[str, Any]] = [{"estimate": NONE} for _ in motions]
+    closed = [i for i, m in enumerate(motions) if m.kind in (PERIODIC_ORBIT, EQUILIBRIUM)]
+    for period in sorted({motions[i].period for i in closed}):
+        own = [i for i in closed if motions[i].period == period]
+        for i, row in zip(own, _lines([motions[i] for i in own], place, options), strict=True):
+            rows[i] = row
+    for i in sorted(set(range(len(motions))) - set(closed)):
+        rows[i] = _average(motions[i], place, options)
+    return _dataset(run, options, motions, rows)
+
+
+def _motions(run: OpenRun, options: SpectrumOptions) -> list[Motion]:
+    """Return the motions of the chosen sets, or of a cell."""
+    found = run.derive("attractors")
+    dims, _ = split_dims(found["attractor_id"])
+    chosen, where, attractor = run.cube(), dict(options.at), options.attractor
+    if options.cell is not None:
+        status = chosen["status"]
+        place = np.unravel_index(options.cell, status.shape)
+        index = {str(d): int(i) for d, i in zip(status.dims, place, strict=True)}
+        cell = chosen[["status", "section"]].isel(index).load()
+        where = {d: float(found[d][index[d]]) for d in dims}
+        number = int(found["attractor_id"].isel(index))
+        if number < 0:
+            return [_of_cell(found, cell, where)]
+        attractor = letter(number)
+    here = select_points(found, where)
+    axes = dict(zip(dims, places_of_rows(here, dims_of(here)), strict=True))
+    points = points_of_rows(here)
+    motions = []
+    for i, number in enumerate(here["attractor"].values.tolist()):
+        if not attractor or letter(number) == attractor:
+            at = {d: float(values[i]) for d, values in axes.items()}
+            columns = ("kind", "stability", "orbit_period", "period_s", "share")
+            kind, stability, period, seconds, share = (here[name].values[i] for name in columns)
+            base, hertz = _parameters(found, at)
+            told = (int(kind), int(stability), int(period), float(seconds), float(share))
+            motions.append(Motion(at, number, *told, points[i][0], base, hertz))
+    if not motions:
+        there = ", ".join(letter(i) for i in sorted(set(here["attractor"].values.tolist()))) or "none"
+        raise ValueError(f"no set {attractor} is there; it has {there} (magpend analyse attractors).")
+    return motions
+
+
+def _of_cell(found: xr.Dataset, cell: xr.Dataset, where: dict[str, float]) -> Motion:
+    """Return the motion of a cell that is on no known set: where its trajectory goes on."""
+    section = cell["section"].transpose("period_index", "state").values
+    kept = np.flatnonzero(np.isfinite(section).all(axis=1))
+    if not len(kept):
+        raise ValueError(f"the cell has no section from which it could go on: {Status(int(cell['status'])).sentence}.")
+    base, hertz = _parameters(found, where)
+    return Motion(where, -1, BOUNDED_SET, NOT_SETTLED, 0, np.nan, np.nan, section[kept[-1]], base, hertz)
+
+
+def _parameters(found: xr.Dataset, where: Mapping[str, float]) -> tuple[Parameters, float]:
+    """Return the parameters at a point, and the frequency of the drive or the strobe [Hz]."""
+    base = parameters_of(found)
+    values = {**{str(k): float(v) for k, v in found.coords.items() if not v.ndim and v.dtype.kind == "f"}, **where}
+    return base.replace(**{k: v for k, v in values.items() if k in base}), frequency_of(base.model, values)
+
+
+def _lines(motions: Sequence[Motion], place: int, options: SpectrumOptions) -> list[dict[str, Any]]:
+    """Measure the lines of closed orbits of one period."""
+    # a limit cycle of equal samples has no period in strobes: its own is one
+    orbits = [
+        Orbit(m.parameters, m.state, *((1.0, 0) if m.kind == EQUILIBRIUM else (m.seconds, max(m.period, 1))))
+        for m in motions
+    ]
+    n = options.orders * max(motions[0].period, 1)
+    found = measures_of(orbits, n, of_orbit=True)
+    rows: list[dict[str, Any]] = []
+    for i, (motion, orbit) in enumerate(zip(motions, orbits, strict=True)):
+        amplitude = np.abs(found.harmonics[i, place])
+        if not np.isfinite(amplitude).all():
+            rows.append({"estimate": NONE})
+            continue
+        variance = float(found.rms[i, place] ** 2 - found.mean[i, place] ** 2)
+        at_rest = motion.kind == EQUILIBRIUM
+        frequency = np.full(n, np.nan) if at_rest else np.arange(1, n + 1) / orbit.seconds
+        kept = np.nan if at_rest or variance <= 0.0 else 0.5 * float((amplitude**2).sum()) / variance
+        row = {"estimate": LINES, "frequency_hz": frequency, "amplitude": amplitude, "variance": max(variance, 0.0)}
+        row |= {"kept": kept, "error": float(found.error[i, place]), "rate_hz": orbit.frequency_hz}
+        rows.append(row)
+    return rows
+
+
+def _average(motion: Motion, place: int, options: SpectrumOptions) -> dict[str, Any]:
+    """Average periodograms of a long trajectory; samples are doubled until almost no power folds back."""
+    model = motion.parameters.model
+    rate = motion.clock_hz
+    if model.crossing is not None:
+        returns = 1.0 / mean_return(motion.state[None], motion.parameters, motion.clock_hz)
+        rate = returns if np.isfinite(returns) else rate
+    n_periods = -(-options.segment * (options.averages + 1) // 2)
+    n_samples = max(FEWEST, 1 << (8 * options.orders - 1).bit_length())
+    while True:
+        values = _sampled(motion, rate, n_periods, n_samples, place)
+        if values is None:
+            return {"estimate": NONE}
+        found = averaged(
+            [values],
+            rate * n_samples,
+            window=options.window,
+            nperseg=options.segment * n_samples,
+            scaling=options.scaling,
+        )
+        high = found.power[len(found.power) // 2 :].sum()
+        too_long = 2 * n_samples * n_periods * len(motion.state) > 8 * AT_ONCE
+        if high <= FOLDED * found.power.sum() or 2 * n_samples > MOST or too_long:
+            return _row(motion, found, values, rate, n_samples, options)
+        n_samples *= 2
+
+
+def _row(
+    motion: Motion, found: Averaged, values: Array, rate: float, n_samples: int, options: SpectrumOptions
+) -> dict[str, Any]:
+    n = options.orders * options.segment + 1
+    row = {
+        "estimate": AVERAGE,
+        "frequency_hz": found.frequency_hz[:n],
+        "power": found.power[:n],
+        "n_averages": found.n_averages,
+        "resolution_hz": found.resolution_hz,
+        "bandwidth_hz": found.bandwidth_hz,
+        "variance": found.variance,
+        "kept": found.power_below(n, options.scaling) / found.variance if found.variance else np.nan,
+        "rate_hz": rate,
+    }
+    if motion.kind == TORUS:
+        drive = None if motion.parameters.model.autonomous else rate
+        own = frequencies_of(values, rate * n_samples, drive)
+        row |= {"first_hz": own.first_hz, "explained": own.share}
+        row["second_hz"] = own.second_hz if own.share >= ALL else np.nan
+    return row
+
+
+def _sampled(motion: Motion, rate: float, n_periods: int, n_samples: int, place: int) -> Array | None:
+    """Return a channel at even instants of a trajectory, without an angle's mean turning; None if it fails."""
+    flow = of_flow(motion.parameters)
+    times = np.arange(n_periods * n_samples) / (rate * n_samples)
+    # for a flow intervals only bound the steps
+    drive = Drive(np.full(n_periods + 1, 1.0 / rate))
+    found = sample(
+        flow.model.system,
+        flow.pack()[None],
+        motion.state[None],
+        [times],
+        drives=[drive],
+        rtol=PORTRAIT_RTOL,
+        atol=PORTRAIT_RTOL,
+        limits_first_step=False,
+    )
+    if found.status[0] != Status.BOUNDED:
+        return None
+    n_states = len(flow.model.states)
+    if place >= n_states:
+        name = flow.model.quantities[place - n_states].name
+        return np.asarray(evaluate([name], times, found.states[0], flow, rate)[:, 0])
+    values = found.states[0, :, place]
+    turns = values[-1] - values[0]
+    if flow.model.system.is_angle[place] and abs(turns) > 2.0 * np.pi:
+        values = values - turns * np.linspace(0.0, 1.0, len(values))
+    return np.asarray(values)
+
+
+_NUMBERS = {
+    "n_averages": ("", "number of averaged segments"),
+    "resolution_hz": ("Hz", "distance of two bins"),
+    "bandwidth_hz": ("Hz", "equivalent noise bandwidth of the window"),
+    "kept": ("1", "share of the variance in the bins"),
+    "rate_hz": ("Hz", "frequency of the drive, or mean rate of returns"),
+    "first_hz": ("Hz", "first frequency of a torus: the drive's, or that of its strongest line"),
+    "second_hz": ("Hz", "second frequency of a torus, up to its sign and multiples of the first"),
+    "explained": ("1", "share of a torus' power at combinations of its two frequencies"),
+}
+
+
+def _dataset(
+    run: OpenRun, options: SpectrumOptions, motions: Sequence[Motion], rows: Sequence[dict[str, Any]]
+) -> xr.Dataset:
+    model, cube = run.model, run.cube()
+    unit = next(v.unit for v in _channels(model) if v.name == options.channel)
+    bins = max((len(row["frequency_hz"]) for row in rows if "frequency_hz" in row), default=0)
+    table = {name: np.full((len(rows), bins), np.nan) for name in ("frequency_hz", "amplitude", "power")}
+    for i, row in enumerate(rows):
+        for name, values in table.items():
+            if name in row:
+                values[i, : len(row[name])] = row[name]
+    over, both = ("spectrum",), ("spectrum", "bin")
+    rate = np.array([row.get("rate_hz", np.nan) for row in rows])
+    power = {"units": power_unit(unit, options.scaling), "long_name": f"{options.scaling} of {options.channel}"}
+    variables: dict[str, Any] = {
+        "amplitude": (both, table["amplitude"], {"units": unit, "long_name": f"amplitude of {options.channel}"}),
+        "power": (both, table["power"], power),
+        "estimate": (over, np.array([row["estimate"] for row in rows], np.int8), code_flags(ESTIMATES)),
+        "kind": (over, np.array([m.kind for m in motions], np.int8), code_flags(KINDS)),
+        "stability": (over, np.array([m.stability for m in motions], np.int8), code_flags(STABILITIES)),
+        "orbit_period": (over, np.array([m.period for m in motions], np.int32), {"long_name": "period"}),
+        "share": (over, np.array([m.share for m in motions]), {"long_name": "share of the initial conditions"}),
+        "variance": (over, _column(rows, "variance"), {"units": power_unit(unit, "spectrum"), "long_name": "variance"}),
+        "error": (over, _column(rows, "error"), {"units": unit, "long_name": "largest error of the amplitudes"}),
+    }
+    for name, (units, text) in _NUMBERS.items():
+        variables[name] = (over, _column(rows, name), {"units": units, "long_name": text})
+    coords: dict[str, Any] = {
+        "frequency_hz": (both, table["frequency_hz"], {"units": "Hz", "long_name": "frequency"}),
+        "attractor": (over, np.array([m.attractor for m in motions], np.int32), {"long_name": "attractor id"}),
+    }
+    if not model.autonomous:
+        about = {"units": "1", "long_name": "multiple of the drive frequency"}
+        coords["order"] = (both, table["frequency_hz"] / rate[:, None], about)
+    coords |= {str(k): v for k, v in cube.coords.items() if not v.ndim and v.dtype.kind == "f"}
+    for name in motions[0].where:
+        coords[row_axis(name)] = (over, np.array([m.where[name] for m in motions]), dict(cube[name].attrs))
+    attrs = {"title": "spectra", "channel": options.channel, "unit": unit, "scaling": options.scaling}
+    attrs |= {"window": options.window, "axes": " ".join(map(row_axis, motions[0].where)), **told_by(cube.attrs)}
+    return xr.Dataset(variables, coords, attrs)
+
+
+def _column(rows: Sequence[dict[str, Any]], name: str) -> Array:
+    return np.array([row.get(name, np.nan) for row in rows], float)
+
+
+def axes_of(ds: xr.Dataset) -> list[str]:
+    """Return the names of the coordinates with the swept parameters along the rows."""
+    return list(dims_in_own_words(str(ds.attrs.get("axes", "")).split(), str(ds.attrs.get(RATE, FREQUENCY))))
+
+
+def row_axis(name: str) -> str:
+    """Return the name of the coordinate with a swept parameter along the rows, which is none of a variable's."""
+    return name if name == FREQUENCY_DIM else f"at_{name}"
+
+
+_EVIDENCE = ("variance", "kept", "n_averages", "resolution_hz", "bandwidth_hz", "error")
+_EVIDENCE_OF_TORI = ("first_hz", "second_hz", "explained")
+
+
+def spectrum_table(ds: xr.Dataset) -> Table:
+    """Return the table of spectra, also of those that `magpend.spectrum_of` returns.
+
+    Rows are bins: swept parameters (``at_NAME``, and the drive's rate), ``attractor_id``, ``kind``, ``stability``,
+    ``estimate``, ``frequency_hz``, ``order`` (with a drive), ``amplitude``, ``power``, and the evidence of the whole
+    spectrum. The text has a line for each spectrum.
+    """
+    coded = {name: words_of(ds[name]) for name in ("kind", "stability", "estimate") if name in ds}
+    rows: list[Row] = []
+    lines: list[Words] = []
+    for i in range(ds.sizes["spectrum"]):
+        one = ds.isel(spectrum=i).load()
+        head: Row = {name: float(one[name]) for name in axes_of(ds)}
+        head |= {"attractor_id": int(one["attractor"])} if "attractor" in one.coords else {}
+        head |= {name: words[int(one[name])] for name, words in coded.items()}
+        evidence = {name: float(one[name]) for name in (*_EVIDENCE, *_EVIDENCE_OF_TORI) if name in one}
+        names = [name for name in ("frequency_hz", "order", "amplitude", "power") if name in one.variables]
+        for values in zip(*(one[name].values.tolist() for name in names), strict=True):
+            if np.isfinite(values[0]):
+                rows.append({**head, **dict(zip(names, values, strict=True)), **evidence})
+        lines.append(_words(one, head))
+    unit = str(ds.attrs["unit"])
+    heading = f"spectrum of {ds.attrs['channel']}" + ("" if unit == "1" else f" [{unit}]")
+    return Table(rows, [heading, *aligned(lines)])
+
+
+def _words(one: xr.Dataset, head: Row) -> Words:
+    column, unit = ("order", "") if "order" in one.coords else ("frequency_hz", " Hz")
+    is_average = head.get("estimate", "average") == "average"
+    values = np.nan_to_num(one["power" if is_average else "amplitude"].values)
+    places = signal.find_peaks(values, distance=3)[0] if is_average else np.flatnonzero(values)
+    best = places[np.argsort(-values[places], kind="stable")][:SHOWN_LINES]
+    largest = ", ".join(f"{values[k]:.4g} at {float(one[column][k]):.5g}{unit}" for k in best)
+
+    def told(name: str, form: str) -> str | None:
+        return number(float(one[name]), form) if name in one else None
+
+    return {
+        **{key.removeprefix("at_"): f"{value:.6g}" for key, value in head.items() if isinstance(value, float)},
+        "id": (str(head["attractor_id"]) if head["attractor_id"] >= 0 else "-") if "attractor_id" in head else None,
+        **{key: plain(str(head[key])) for key in ("kind", "stability", "estimate") if key in head},
+        "largest": largest or "-",
+        "averages": told("n_averages", ".0f"),
+        "resolution [Hz]": told("resolution_hz", ".4g"),
+        "second [Hz]": told("second_hz", ".7g") if head.get("kind") == "torus" else None,
+        "kept": told("kept", ".4f"),
+    }

@@ -1,0 +1,232 @@
+"""Estimate spectra of time series: averaged periodograms, and the frequencies of the lines of a torus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import optimize, signal
+
+from pipeline.layout.conventions import shown_unit
+from pipeline.layout.vocabulary import told_by
+
+UNEVEN = 0.01
+"""Largest deviation of a sampling interval from their median, as a share of it, at which a series counts as even."""
+
+SEGMENTS = 16
+"""Segments without overlap into which a series is divided by default."""
+
+LOBE = 4
+"""Half width of a line in bins, of the window by which lines are told apart (Blackman-Harris, side lobes at -92 dB)."""
+
+MOST_FIRST, MOST_SECOND = 12, 6
+"""Largest multiples of the two frequencies of a torus in its lines."""
+
+ALL = 0.99
+"""Share of the power in combinations of two frequencies from which on a motion is said to have these two."""
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """An averaged periodogram, with its resolution."""
+
+    frequency_hz: Array  # of the bins, from 0 to half of the sampling rate
+    power: Array  # per hertz, or of each bin
+    n_averages: int  # segments
+    resolution_hz: float  # distance of two bins
+    bandwidth_hz: float  # equivalent noise bandwidth of the window: power per hertz times this is power
+    variance: float  # of the series, about its mean
+
+    def power_below(self, n_bins: int, scaling: str) -> float:
+        """Return the power in the first bins, whatever the scaling: the integral of the density."""
+        width = self.resolution_hz * (1.0 if scaling == "density" else 1.0 / self.bandwidth_hz)
+        return float(self.power[:n_bins].sum() * width)
+
+
+def averaged(pieces: Sequence[Array], rate_hz: float, *, window: str, nperseg: int, scaling: str) -> Averaged:
+    """Average the periodograms of segments that overlap by half, as `scipy.signal.welch`, over pieces of a series.
+
+    Parameters
+    ----------
+    pieces
+        Evenly sampled values; each has at least `nperseg`. Segments of all pieces have equal weight.
+    rate_hz
+        Samples per second.
+    window, nperseg, scaling
+        As in `scipy.signal.welch`.
+    """
+    counts = [1 + (len(piece) - nperseg) // (nperseg - nperseg // 2) for piece in pieces]
+    settings = {"fs": rate_hz, "window": window, "nperseg": nperseg, "scaling": scaling}
+    found = [signal.welch(piece, **settings) for piece in pieces]
+    weights = signal.get_window(window, nperseg)
+    return Averaged(
+        found[0][0],
+        np.average([power for _, power in found], axis=0, weights=counts),
+        sum(counts),
+        rate_hz / nperseg,
+        float(rate_hz * (weights**2).sum() / weights.sum() ** 2),
+        float(np.concatenate(pieces).var()),
+    )
+
+
+@dataclass(frozen=True)
+class Frequencies:
+    """The two frequencies of a torus [Hz], and the share of its power at their combinations."""
+
+    first_hz: float
+    second_hz: float
+    share: float
+
+
+def frequencies_of(values: Array, rate_hz: float, drive_hz: float | None = None) -> Frequencies:
+    """Return the two frequencies whose combinations k f1 + l f2 are the lines of a torus.
+
+    The first is the drive's; without a drive, that of the strongest line. The second is that of the strongest line
+    that is no multiple of the first. It is known up to its sign and multiples of the first. Both maximise the
+    transform of the whole series with a Blackman-Harris window.
+
+    Parameters
+    ----------
+    values
+        Evenly sampled, over many periods of both.
+    rate_hz
+        Samples per second.
+    drive_hz
+        Frequency of the drive [Hz]; None without one.
+    """
+    n = len(values)
+    weighted = (values - values.mean()) * signal.get_window("blackmanharris", n)
+    power = np.abs(np.fft.rfft(weighted)) ** 2
+    power[: LOBE + 1] = 0.0  # the mean's line
+    first = drive_hz or _peak(weighted, rate_hz, power)
+    rest = np.where(_near(len(power), n / rate_hz * first * np.arange(1, n)), 0.0, power)
+    second = _peak(weighted, rate_hz, rest)
+    multiples = np.add.outer(
+        first * np.arange(-MOST_FIRST, MOST_FIRST + 1), second * np.arange(-MOST_SECOND, MOST_SECOND + 1)
+    )
+    inside = _near(len(power), n / rate_hz * np.abs(multiples).ravel())
+    return Frequencies(first, second, float(power[inside].sum() / power.sum()))
+
+
+def _near(n_bins: int, lines: Array) -> Array:
+    """Return which bins belong to lines, whose places are given in bins."""
+    mask = np.zeros(n_bins, bool)
+    middle = np.round(lines[lines < n_bins - 0.5]).astype(int)
+    places = np.add.outer(middle, np.arange(-LOBE, LOBE + 1)).ravel()
+    mask[places[(places >= 0) & (places < n_bins)]] = True
+    return mask
+
+
+def _peak(weighted: Array, rate_hz: float, power: Array) -> float:
+    """Return the frequency near the largest bin at which the transform is largest [Hz]."""
+    turns = np.arange(len(weighted)) / len(weighted)
+    middle = int(power.argmax())
+
+    def size(place: float) -> float:
+        return -float(np.abs(weighted @ np.exp(-2j * np.pi * place * turns)))
+
+    found = optimize.minimize_scalar(
+        size, bounds=(middle - 1.0, middle + 1.0), method="bounded", options={"xatol": 1e-7}
+    )
+    return float(found.x) * rate_hz / len(weighted)
+
+
+def power_unit(unit: str, scaling: str) -> str:
+    """Return the unit of a power, per hertz for a density: such as m^2/Hz."""
+    plain = "1" if unit in ("", "1") else f"{unit}^2" if unit.isalpha() else f"({unit})^2"
+    return f"{plain}/Hz" if scaling == "density" else plain
+
+
+def spectrum_of(
+    ds: xr.Dataset,
+    channel: str = "",
+    *,
+    window: str = "hann",
+    nperseg: int | None = None,
+    scaling: str = "density",
+    drive_hz: float | None = None,
+) -> xr.Dataset:
+    """Average the periodograms of a recording or a trajectory, as `scipy.signal.welch`.
+
+    Parameters
+    ----------
+    ds
+        Evenly sampled variables over ``time`` [s], perhaps in several pieces, see `magpend.read_recording`. Stretches
+        with missing samples divide a piece.
+    channel
+        Variable; by default the first.
+    window, scaling
+        As in `scipy.signal.welch`.
+    nperseg
+        Samples of a segment; by default a sixteenth of the longest piece.
+    drive_hz
+        Frequency of the drive, for orders [Hz]; by default the attribute ``frequency_hz``, if there is one.
+
+    Returns
+    -------
+    Dataset
+        Over ``spectrum`` (one) and ``bin``: ``power`` in unit^2/Hz or unit^2, with the coordinates ``frequency_hz``
+        and, with a drive, ``order``. ``n_averages``, ``resolution_hz``, ``bandwidth_hz`` (the window's equivalent noise
+        bandwidth), ``variance``, and ``kept``, the share of it in the bins.
+
+    Raises
+    ------
+    ValueError
+        If there is no such channel, samples are not even, or no piece is as long as a segment.
+    """
+    names = [str(name) for name, v in ds.data_vars.items() if v.ndim == 1 and v.dims == ds["time"].dims]
+    channel = channel or names[0]
+    if channel not in names:
+        raise ValueError(f"channel {channel!r} is not there; it has {', '.join(names)}.")
+    pieces, rate = _pieces(ds, channel)
+    nperseg = nperseg or max(len(piece) for piece in pieces) // SEGMENTS
+    long = [piece for piece in pieces if len(piece) >= nperseg >= 4]
+    if not long:
+        raise ValueError(
+            f"nperseg = {nperseg}: no piece of {channel} is as long; the longest without a gap has "
+            f"{max(len(piece) for piece in pieces)} samples. A segment has at least 4."
+        )
+    found = averaged(long, rate, window=window, nperseg=nperseg, scaling=scaling)
+    drive_hz = drive_hz or ds.attrs.get("frequency_hz")
+    unit = shown_unit(ds[channel].attrs, "1")
+    about = {"units": power_unit(unit, scaling), "long_name": f"{scaling} of {channel}"}
+    numbers: dict[str, Any] = {
+        name: ("spectrum", [getattr(found, name)]) for name in ("n_averages", "resolution_hz", "bandwidth_hz")
+    }
+    numbers |= {"variance": ("spectrum", [found.variance], {"units": power_unit(unit, "spectrum")})}
+    numbers |= {"kept": ("spectrum", [found.power_below(len(found.power), scaling) / found.variance])}
+    result = xr.Dataset({"power": (("spectrum", "bin"), found.power[None], about), **numbers})
+    own: dict[str, Any] = {
+        "frequency_hz": (("spectrum", "bin"), found.frequency_hz[None], {"units": "Hz", "long_name": "frequency"})
+    }
+    if drive_hz:
+        order = found.frequency_hz[None] / float(drive_hz)
+        own["order"] = (("spectrum", "bin"), order, {"units": "1", "long_name": "order"})
+    attrs = {"title": "spectrum", "channel": channel, "unit": unit, "scaling": scaling, "window": window}
+    return result.assign_coords(own).assign_attrs({**told_by(ds.attrs), **attrs})
+
+
+def _pieces(ds: xr.Dataset, channel: str) -> tuple[list[Array], float]:
+    """Return the stretches of a series without gaps, and its samples per second."""
+    time, values = (np.asarray(ds[name].values, np.float64) for name in ("time", channel))
+    piece = ds["piece"].values if "piece" in ds else np.zeros(len(time), int)
+    good = np.isfinite(values)
+    cuts = np.flatnonzero((np.diff(piece) != 0) | (np.diff(good.astype(int)) != 0)) + 1
+    stretches = [part for part in np.split(np.arange(len(time)), cuts) if len(part) > 1 and good[part[0]]]
+    if not stretches:
+        raise ValueError(f"channel {channel!r} has no two samples in a row.")
+    steps = np.concatenate([np.diff(time[part]) for part in stretches])
+    step = float(np.median(steps))
+    if (np.abs(steps - step) > UNEVEN * step).any():
+        raise ValueError(
+            f"the samples of {channel} are {steps.min():.6g} to {steps.max():.6g} s apart, and a spectrum needs even "
+            "ones: interpolate the series first."
+        )
+    # the mean interval of the longest stretch is more exact than the median of rounded times
+    longest = max(stretches, key=len)
+    return [values[part] for part in stretches], (len(longest) - 1) / float(time[longest[-1]] - time[longest[0]])
