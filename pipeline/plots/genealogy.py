@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
-from pipeline.analysis.events.analysis import NAMES, RANGE_END, UNDECIDED
-from pipeline.analysis.events.cascades import CASCADE
+from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.events.names import CASCADE, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain, words_of
 from pipeline.layout.vocabulary import letter

@@ -12,11 +12,12 @@ import xarray as xr
 from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
-from pipeline.analysis.branches.bifurcations import BRANCHING, KINDS
 from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
-from pipeline.analysis.events.cascades import CASCADE, Born, cascade_of, torus_of
+from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
+from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -37,11 +38,6 @@ from pipeline.layout.vocabulary import (
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.products.branches import BranchOptions
 from pipeline.products.events import EventOptions
-
-UNDECIDED, RANGE_END, LIVES_ON = "not_decided", "range_end", "lives_on"
-
-NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, CASCADE)
-"""Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""
 
 LOCATED = 1e-9
 """Least error of a located bifurcation, as a share of the interval: integrations have the tolerance 1e-12."""

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.bifurcations import DOUBLING, KINDS, TORUS
+from pipeline.analysis.branches.kinds import DOUBLING, KINDS, TORUS
 from pipeline.analysis.events.lines import Fate, at
+from pipeline.analysis.events.names import CASCADE
 from pipeline.analysis.sets import Geometry, mean_distance
 from pipeline.analysis.tabular import words_of
-
-CASCADE = "cascade"
 
 DELTA = 4.669201609
 """Feigenbaum's constant: the limit of the ratio of successive intervals between doublings of smooth maps."""

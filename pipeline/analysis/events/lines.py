@@ -10,8 +10,9 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
-from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, KINDS, PITCHFORK, SAME_PLACE, TRANSCRITICAL
+from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.exploring import BESIDE
+from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.known import GUESS, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family

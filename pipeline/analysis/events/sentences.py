@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
-from pipeline.analysis.events.analysis import LIVES_ON, RANGE_END, UNDECIDED
-from pipeline.analysis.events.cascades import CASCADE
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
+from pipeline.analysis.events.names import CASCADE, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tabular import MOST_ROWS, Row, counted, plain, values
 from pipeline.layout.vocabulary import letter, parameter_name

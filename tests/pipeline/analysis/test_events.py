@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import fsolve
 
 import magpend
-from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.events.cascades import cascade_of
 from pipeline.analysis.events.lines import Fate, crossing_at, lines_of
 from pipeline.analysis.sets import Geometry

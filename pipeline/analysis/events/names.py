@@ -1,0 +1,10 @@
+"""Name the events of attractors; this module imports no kernel, so that figures and tables need no compiler."""
+
+from __future__ import annotations
+
+from pipeline.analysis.branches.kinds import KINDS
+
+UNDECIDED, RANGE_END, LIVES_ON, CASCADE = "not_decided", "range_end", "lives_on", "cascade"
+
+NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, CASCADE)
+"""Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""
