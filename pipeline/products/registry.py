@@ -70,6 +70,7 @@ ANALYSES: Registry[Analysis] = Registry(
             "response": ("response", ""),
             "backbone": ("backbone", ""),
             "bands": ("branches", "a posterior of magpend identify"),
+            "sensitivities": ("branches", ""),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
             "tongues": ("branches", _ROTATION),
@@ -109,6 +110,7 @@ _FIGURES = {
     "Orbits and branches, stable or not": {
         "branches": "",
         "multipliers": "",
+        "sensitivities": "",
         "curves": "",
         "response": "",
         "backbone": "",
