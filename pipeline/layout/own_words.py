@@ -71,7 +71,7 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     return shown.sortby(rate.column) if rate.inverse and rate.column in shown.dims else shown
 
 
-def _sensitivities(ds: xr.Dataset, rate: Rate) -> dict[str, tuple[Any, ...]]:
+def _sensitivities(ds: xr.Dataset, rate: Rate) -> dict[Any, Any]:
     """Return derivatives of, and by, the drive's frequency as those of, and by, its rate; a period falls with it."""
     sign = -1.0 if rate.inverse else 1.0
     by, size = np.ones((2, ds.sizes["bifurcation"], ds.sizes["parameter"]))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from pipeline.analysis.branches.bifurcations import LABELS
@@ -16,7 +19,10 @@ from pipeline.plots.figure import frame_of
 from pipeline.products.branches import SensitivityOptions
 from pipeline.products.figures import SensitivityFigureOptions
 
-LOOKS = {True: {"facecolor": style.ORANGE, "hatch": ""}, False: {"facecolor": style.BLUE, "hatch": "////"}}
+LOOKS: dict[bool, dict[str, Any]] = {
+    True: {"facecolor": style.ORANGE, "hatch": ""},
+    False: {"facecolor": style.BLUE, "hatch": "////"},
+}
 """Bars of parameters that raise the value of a bifurcation, and of those that lower it."""
 
 COLUMNS = 2
@@ -76,7 +82,7 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
     return fig
 
 
-def _draw_bars(ax: style.Axes, one: xr.Dataset) -> None:
+def _draw_bars(ax: Axes, one: xr.Dataset) -> None:
     values = one["elasticity"].values
     there = np.flatnonzero(np.abs(values) > NO_INFLUENCE)
     order = there[np.argsort(np.abs(values[there]), kind="stable")]

@@ -367,28 +367,27 @@ def _unit(unit: str) -> str:
 
 
 def _lines(rows: Sequence[Row], label: str, ds: xr.Dataset) -> list[str]:
-    shown, idle = list[Words](), list[str]()
+    shown, idle, unit = list[Words](), list[str](), _unit(str(ds.attrs["parameter_units"]))
     for row in rows:
         size = abs(row["elasticity"]) if np.isfinite(row["elasticity"]) else abs(row["derivative"])
         if row["status"] == "known" and size <= max(NO_INFLUENCE, row["elasticity_error"]):
             idle.append(row["parameter"])
             continue
-        per = f" per {f'({row["unit"]})' if '/' in row['unit'] else row['unit']}" if row["unit"] != "1" else ""
-        known = row["status"] == "known"
+        known, deviation = row["status"] == "known", row["parameter_deviation"]
         shown.append(
             {
                 "1 % more": row["parameter"],
                 f"moves this {label} by": _percent(row) if known else _WHY[row["status"]],
-                "derivative": f"{row['derivative']:+.6g}{_unit(str(ds.attrs['parameter_units']))}{per}"
-                if known
-                else "",
+                "derivative": f"{row['derivative']:+.6g}{unit}{_per(row['unit'])}" if known else "",
                 "error": f"{row['derivative_error']:.0e}" if known else "",
-                "by one deviation": f"{row['derivative'] * row['parameter_deviation']:+.3g}"
-                if row["parameter_deviation"] > 0.0
-                else None,
+                "by one deviation": f"{row['derivative'] * deviation:+.3g}{unit}" if deviation > 0.0 else None,
             }
         )
     return [*aligned(shown), *([f"  without influence: {', '.join(idle)}"] if idle else [])]
+
+
+def _per(unit: str) -> str:
+    return "" if unit in ("", "1") else f" per ({unit})" if "/" in unit else f" per {unit}"
 
 
 _WHY = {"breaks": "it does not survive", "failed": "not decided"}
