@@ -24,7 +24,7 @@ from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, HOPF, LABEL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test, parameter_units
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, words_of
+from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, values, words_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import axis_name, frequency_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, SensitivityOptions
@@ -284,7 +284,8 @@ def sensitivities_of(branches: xr.Dataset, base: Parameters) -> xr.Dataset:
     at = np.array([one.family.values(one.u)[1:] for one in located]).reshape(shape)
     ratio = np.where(at != 0.0, at, np.nan) / np.where(value != 0.0, value, np.nan)[:, None]
     dims, one = ("bifurcation", "parameter"), {"units": "1"}
-    kept = branches[["kind", "of_branch"]].drop_vars("state", errors="ignore")
+    sides = [name for name in ("bifurcation_side",) if name in branches]
+    kept = branches[["kind", "of_branch", *sides]].drop_vars("state", errors="ignore")
     kept.attrs = {k: v for k, v in branches.attrs.items() if k not in ("left_out", "stuck")}
     return kept.assign(
         value=("bifurcation", value, {"units": branches.attrs["parameter_units"], "long_name": f"value of {first}"}),
@@ -329,6 +330,7 @@ def sensitivities_table(ds: xr.Dataset) -> Table:
             "label": LABELS[kind],
             "type": kind,
             "period": int(one["orbit_period"]),
+            **({"side": values(one, "bifurcation_side")["bifurcation_side"]} if "bifurcation_side" in one else {}),
             "branch": int(one["of_branch"]),
             "deviation": float(one["deviation"]),
         }
@@ -359,7 +361,8 @@ def _head(about: Mapping[str, Any], name: str, unit: str) -> str:
     what = f"period {about['period']}" if about["period"] else "equilibrium"
     spread = f" ± {about['deviation']:.2g}" if np.isfinite(about["deviation"]) else ""
     at = f"{name} {about[name]:.7g}{spread}{unit}"
-    return f"{about['label']} {plain(about['type'])} at {at}, {what}, branch {about['branch']}"
+    side = f", {about['side']}" if "side" in about else ""
+    return f"{about['label']} {plain(about['type'])} at {at}, {what}{side}, branch {about['branch']}"
 
 
 def _unit(unit: str) -> str:

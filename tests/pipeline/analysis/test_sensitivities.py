@@ -190,6 +190,23 @@ def test_doubling_with_the_drive(tmp_path):
 
 
 @pytest.mark.slow
+def test_pitchfork_of_orbits(tmp_path):
+    """Along the amplitude of the symmetric oscillator: the same sums."""
+    spec = (
+        magpend.Spec("sweep", "duffing", "symmetric")
+        .with_parameters(preset="hardening", omega=1.0, overrides={"damping": 0.1})
+        .with_axis("amplitude", values=[3.3, 3.4])
+        .with_start_list(points=[(0.0, 0.0)])
+        .with_integration(n_transient=300, n_keep=4)
+    )
+    found = magpend.run(spec, tmp_path / "symmetric", workers=0).sensitivities(low=3.3, high=3.6, max_period=1)
+    at = found["kind"].values.tolist().index(found["kind"].attrs["flag_meanings"].split().index("pitchfork"))
+    by = {str(n): float(found["elasticity"].sel(parameter=n)[at]) for n in found["parameter"].values}
+    assert by["cubic"] == pytest.approx(-0.5, rel=1e-7)
+    assert by["damping"] + 2.0 * (by["linear"] + by["cubic"]) + by["frequency"] == pytest.approx(2.0, rel=1e-7)
+
+
+@pytest.mark.slow
 def test_draws_of_the_parameters(computed, tmp_path):
     """Fold of cycles on a section, m = h - 1/(4 g): its deviation with correlated draws; refusals."""
     directory, random = computed(SWEEP), np.random.default_rng(3)
