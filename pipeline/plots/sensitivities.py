@@ -12,9 +12,10 @@ from matplotlib.patches import Patch
 from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.branches.sensitivities import NO_INFLUENCE
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import plain, words_of
+from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.plots import labels, style
+from pipeline.plots.branches import NAMES
 from pipeline.plots.figure import frame_of
 from pipeline.products.branches import SensitivityOptions
 from pipeline.products.figures import SensitivityFigureOptions
@@ -23,9 +24,10 @@ LOOKS: dict[bool, dict[str, Any]] = {
     True: {"facecolor": style.ORANGE, "hatch": ""},
     False: {"facecolor": style.BLUE, "hatch": "////"},
 }
-"""Bars of parameters that raise the value of a bifurcation, and of those that lower it."""
+"""Bars of parameters by which the value of a bifurcation grows, and shrinks."""
 
-COLUMNS = 2
+MOST_BARS = 10
+"""Most bars of a panel, which are those of the largest moves."""
 
 
 @style.drawn
@@ -44,14 +46,15 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
     Returns
     -------
     DataFigure
-        Its `data` are the sensitivities.
+        Its `data` are the sensitivities. A panel has at most `MOST_BARS` bars.
     """
     name, unit = str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"])
     there = np.flatnonzero((np.abs(ds["elasticity"].values) > NO_INFLUENCE).any(axis=1))
     chosen = there[np.argsort(ds["value"].values[there], kind="stable")][:shown]
-    n_columns = min(COLUMNS, max(len(chosen), 1))
+    n_columns = min(1 if frame.compact else 2, max(len(chosen), 1))
     n_rows = -(-max(len(chosen), 1) // n_columns)
-    most = max([1, *((np.abs(ds["elasticity"].values[chosen]) > NO_INFLUENCE).sum(axis=1))])
+    counts = (np.abs(ds["elasticity"].values[chosen]) > NO_INFLUENCE).sum(axis=1)
+    most = min(max([1, *counts]), MOST_BARS)
     height = 1.1 + n_rows * (0.8 + 0.2 * float(most))
     fig = style.new_figure(height, ds.assign_attrs(title="sensitivities of bifurcations"), frame)
     axes = fig.subplots(n_rows, n_columns, squeeze=False)
@@ -66,7 +69,7 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
         period = int(ds["orbit_period"][k])
         what = f"period {period}" if period else "equilibrium"
         value = f"{float(ds['value'][k]):.5g}{'' if unit in ('', '1') else f' {labels.raised(unit)}'}"
-        ax.set_title(f"{LABELS[kind]} {plain(kind)} at {value}, {what}", loc="left", fontsize=fig.look.tick)
+        ax.set_title(f"{LABELS[kind]} {NAMES[kind]} at {value}, {what}", loc="left", fontsize=fig.look.tick)
     if not len(chosen):
         axes.flat[0].set_visible(True)
         axes.flat[0].text(0.5, 0.5, "no bifurcation with elasticities", ha="center", va="center")
@@ -75,9 +78,13 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
         f"change of {symbol.removesuffix(' [Hz]')} at the bifurcation for 1 % more [%]", fontsize=fig.look.label
     )
     handles = [
-        Patch(edgecolor="black", linewidth=0.6, label=t, **LOOKS[up]) for up, t in ((True, "rises"), (False, "falls"))
+        Patch(edgecolor="black", linewidth=0.6, label=t, **LOOKS[up]) for up, t in ((True, "grows"), (False, "shrinks"))
     ]
     style.legend_above(fig, handles, size=fig.look.tick)
+    rest = f"the {MOST_BARS} largest moves of each" if max(counts, default=0) > MOST_BARS else ""
+    if text := style.join([labels.caption(ds, with_start=False), rest]):
+        size = fig.look.title
+        fig.suptitle(style.folded(text, frame.width_in - 0.3, size), fontsize=size, x=0.01, ha="left")
     style.finish(fig)
     return fig
 
@@ -85,13 +92,13 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
 def _draw_bars(ax: Axes, one: xr.Dataset) -> None:
     values = one["elasticity"].values
     there = np.flatnonzero(np.abs(values) > NO_INFLUENCE)
-    order = there[np.argsort(np.abs(values[there]), kind="stable")]
+    order = there[np.argsort(np.abs(values[there]), kind="stable")][-MOST_BARS:]
     style.style_axes(ax, minor=False)
     for y, i in enumerate(order):
         rises = bool(values[i] > 0.0)
         ax.barh(y, values[i], height=0.62, edgecolor="black", linewidth=0.6, **LOOKS[rises])
         ax.annotate(
-            f"{values[i]:+.2g}",
+            f"{values[i]:+.2g}".replace("-", "\u2212"),
             (values[i], y),
             (3.0 if rises else -3.0, 0.0),
             textcoords="offset points",
