@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.analysis import isolas_of
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
+from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
