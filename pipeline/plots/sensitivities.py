@@ -9,10 +9,10 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from pipeline.analysis.branches.bifurcations import LABELS
-from pipeline.analysis.branches.sensitivities import NO_INFLUENCE
+from pipeline.analysis.branches.kinds import LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
+from pipeline.analysis.tolerances import NO_INFLUENCE
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.plots import labels, style
 from pipeline.plots.branches import NAMES

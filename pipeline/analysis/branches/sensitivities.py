@@ -20,11 +20,12 @@ from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of, settle_branches
 from pipeline.analysis.branches.bands import digest_of_draws, draws_of
-from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, HOPF, LABELS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import BRANCHING, FOLD, HOPF, LABELS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test, parameter_units
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, values, words_of
+from pipeline.analysis.tolerances import NO_INFLUENCE
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import axis_name, frequency_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, SensitivityOptions
@@ -48,9 +49,6 @@ NEWTON_STEPS, CLOSE, NEAR = 6, 1e-9, 1e-6
 
 PERSISTS = 1e-5
 """Largest part of a parameter's derivative of the equations of a branch point that no motion of the point balances."""
-
-NO_INFLUENCE = 1e-9
-"""Elasticity below which a parameter is said to have no influence."""
 
 KNOWN, BREAKS, FAILED = range(3)
 STATUSES = ("known", "breaks", "failed")
