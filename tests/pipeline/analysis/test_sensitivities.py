@@ -175,12 +175,13 @@ def test_doubling_with_the_drive(tmp_path):
         .with_integration(n_transient=300, n_keep=8)
     )
     run = magpend.run(spec, tmp_path / "cascade", workers=0)
-    found = run.sensitivities(low=0.24, high=0.29, max_period=2)
+    found = run.sensitivities(low=0.24, high=0.29, max_period=2, deviation={"frequency_hz": 1e-3})
     by = {str(n): found["elasticity"].sel(parameter=n).values for n in found["parameter"].values}
     assert "period_doubling" in [found["kind"].attrs["flag_meanings"].split()[k] for k in found["kind"].values]
     np.testing.assert_allclose(by["cubic"], -0.5, rtol=1e-7)
     total = by["damping"] + 2.0 * (by["linear"] + by["cubic"]) + by["frequency"]
     np.testing.assert_allclose(total, 2.0, rtol=1e-7)
+    np.testing.assert_allclose(found["deviation"], 1e-3 * np.abs(found["derivative"].sel(parameter="frequency")))
     text = "\n".join(sensitivities_table(in_own_words(found)).lines)
     assert "omega" in text
     row = next(r for r in sensitivities_table(in_own_words(found)).rows if r["parameter"] == "omega")
