@@ -20,6 +20,8 @@ KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
 
 LABELS = {
     **dict(zip(KINDS, ("LP", "PD", "NS", "BP", "H", "BP", "BP"), strict=True)),
+    "homoclinic": "HOM",
+    "snic": "SNIC",
     "cusp": "CP",
     "generalised_doubling": "GPD",
     "chenciner": "CH",
