@@ -7,8 +7,8 @@ limit (Kuznetsov 2004, sections 6.2 and 7.1):
 saddle's leading eigenvalues, without signs: the unstable one if the saddle quantity, their sum, is negative. Then
 stable cycles end there. If the sum is positive, the cycles are unstable.
 
-``snic``: a saddle node on an invariant circle. The period is a + pi/sqrt(a2 b d), where x' = a2 d + b x**2 is the normal
-form of the fold of the equilibria.
+``snic``: a saddle node on an invariant circle. The period is a + pi/sqrt(a2 b d), where x' = a2 d + b x**2 is the
+normal form of the fold of the equilibria.
 
 The law's slope is fitted to the last points, and computed from the equilibrium. An end is named if both agree.
 """
@@ -118,6 +118,8 @@ def limit_of(branch: Branch, points: Sequence[Point]) -> Limit | str:
     `points` are in order to the end. Returns the reason if neither law is confirmed.
     """
     family = branch.family
+    if len(points) < WINDOWS[-1][1]:
+        return TOO_FAR
     states = last_orbit(family, points[-1])
     places, eigenvalues = saddles_near(family, points[-1], states)
     reason = "no equilibrium found at which the orbit comes to rest"
@@ -292,7 +294,8 @@ def _contradiction(limit: Limit, rest: float) -> str:
 def _snic(family: Family, points: Sequence[Point], states: np.ndarray) -> Limit | str | None:
     """Fit the law of the period near a saddle node on a circle. Return the reason if it fails, None without a fold."""
     values, seconds = _laid(points, family)
-    fold = _fold(family, values[-1], states) if len(states) else None
+    with np.errstate(all="ignore"):
+        fold = _fold(family, values[-1], states) if len(states) else None
     if fold is None:
         return None
     state, value, error, expected = fold
