@@ -14,8 +14,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.analysis import isolas_of, limits_of
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
-from pipeline.analysis.branches.following import LIMITS
+from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import axis_name

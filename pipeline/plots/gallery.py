@@ -217,9 +217,9 @@ def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     """Draw the figure ``gallery`` of a run; the motion on each attractor is integrated for it."""
     from pipeline.analysis.attractors.portraits import portraits
 
+    at, notes = values_of(run, options)
     if run.model.is_map:
         raise ValueError(f"{run.model.name} is a map, without motion between its iterations; draw its section.")
-    at, notes = values_of(run, options)
     found = run.derive("attractors")
     figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))
     return noted(figure, notes)

@@ -15,7 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, t
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
+from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
 from pipeline.analysis.run import OpenRun

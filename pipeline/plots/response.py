@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
+from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.plots import labels, style

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.analysis.branches.bands import bifurcation_data
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF
 from pipeline.analysis.branches.carrying import OrbitData, Solution, settled, solve
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF
 from pipeline.analysis.draws import LEVELS
 from pipeline.rig.identify.build import build
 from pipeline.rig.identify.local import fit_local

@@ -135,6 +135,9 @@ def test_standard_map__keeps_area_and_the_golden_circle_bounds_momentum():
     packed = np.tile(model.load(K=1.2).pack(), (16, 1))
     steps = section_map(packed, np.ones(16), some, 3, system=model.system).derivatives
     assert np.linalg.det(steps) == pytest.approx(1.0, abs=1e-11)
+    found = exponents(STANDARD, some[:2], n_transient=10, n_periods=160)
+    assert found.divergence == pytest.approx(0.0, abs=1e-12)
+    assert found.exponents.sum(axis=1) == pytest.approx(0.0, abs=1e-12)
     for k, passes in ((0.95, False), (1.2, True)):
         found = sections(model.load(K=k), None, starts, n_transient=0, n_keep=40_000)
         assert (np.abs(found.section[..., 1]).max() > 2.0 * np.pi) == passes

@@ -10,16 +10,14 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.bifurcations import BRANCHING, FOLD, KINDS, LABELS, PITCHFORK, TRANSCRITICAL
-from pipeline.analysis.branches.following import LIMITS
-from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LABELS, LIMITS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values, words_of
 from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
-from pipeline.specification.tables import FREQUENCY as FREQUENCY_HZ
+from pipeline.specification.tables import FREQUENCY
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -297,7 +295,7 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     values.
     """
     parameter = str(ds.attrs["parameter"])
-    found = {FREQUENCY: ds[FREQUENCY]} if parameter != FREQUENCY and FREQUENCY in ds else {}
+    found = {FREQUENCY_DIM: ds[FREQUENCY_DIM]} if parameter != FREQUENCY_DIM and FREQUENCY_DIM in ds else {}
     for variable in ds.data_vars.values():
         told = str(variable.attrs.get("long_name", ""))
         if variable.dims == ("branch",) and told.startswith("value of "):
@@ -336,7 +334,7 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
 
 def _at(ds: xr.Dataset, branch: int) -> str:
     found = [
-        f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
+        f"{value:g} Hz" if name == parameter_name(FREQUENCY_DIM) else f"{name} {value:g}"
         for name, value in fixed_of(ds, branch).items()
         if int(ds["orbit_period"][branch]) or name != LEVEL  # equilibria are on no section
     ]
@@ -428,7 +426,7 @@ def searched_lines(ds: xr.Dataset) -> list[str]:
     """Return text lines on the points at which all orbits were searched; none if there was no search."""
     if "searched_value" not in ds:
         return []
-    word = str(ds.attrs.get(RATE, FREQUENCY_HZ))
+    word = str(ds.attrs.get(RATE, FREQUENCY))
     dims = {n: str(n).removeprefix("searched_") for n in ds.data_vars if str(n).startswith("searched_")}
     dims["searched_value"] = str(ds.attrs["parameter"])
     names = {n: parameter_name(dims_in_own_words([dim], word)[0]) for n, dim in dims.items()}

@@ -18,7 +18,6 @@ import xarray as xr
 from magpend_core.models.model import Parameters
 from pipeline.analysis.branches.analysis import settle_branches
 from pipeline.analysis.branches.arclength import Point
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, LABELS, TORUS
 from pipeline.analysis.branches.carrying import (
     ORBIT,
     PARAMETER,
@@ -31,6 +30,7 @@ from pipeline.analysis.branches.carrying import (
     settled,
     solve,
 )
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, TORUS
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.draws import LEVELS, interval_of
 from pipeline.analysis.run import OpenRun

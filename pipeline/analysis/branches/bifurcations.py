@@ -11,34 +11,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
+from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, TORUS
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import OneParameter, Problem, doubling_test, hopf_test, torus_test
-
-FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
-HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
-KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
-
-LABELS = {
-    **dict(zip(KINDS, ("LP", "PD", "NS", "BP", "H", "BP", "BP"), strict=True)),
-    "homoclinic": "HOM",
-    "snic": "SNIC",
-    "cusp": "CP",
-    "generalised_doubling": "GPD",
-    "chenciner": "CH",
-    "r1": "R1",
-    "r2": "R2",
-    "r3": "R3",
-    "r4": "R4",
-    "fold_flip": "LPPD",
-    "fold_neimark_sacker": "LPNS",
-    "doubling_neimark_sacker": "PDNS",
-    "double_neimark_sacker": "NSNS",
-}
-"""Labels of bifurcations, and of points of codimension two, as MatCont and MatContM print them.
-
-AUTO writes HB for H and TR (torus) for NS; MatCont writes LPC for the fold of a limit cycle. A pitchfork or
-transcritical point is a branch point to both.
-"""
 
 CONTRADICTORY = "contradictory"
 """Criticality of a period doubling or pitchfork whose coefficient and whose other branch disagree."""

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from magpend_core.models.model import Model
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import HOPF, n_unstable
+from pipeline.analysis.branches.bifurcations import n_unstable
 from pipeline.analysis.branches.following import end_of_crossings, problem_of
+from pipeline.analysis.branches.kinds import HOPF
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import BifurcationProblem, Family, HopfProblem
 from pipeline.layout.vocabulary import FREQUENCY_DIM

@@ -33,7 +33,8 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, TORUS, Tested, find_root
+from pipeline.analysis.branches.bifurcations import Tested, find_root
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.normal_forms import STEPS, Case, CoefficientProblem, settled
 from pipeline.analysis.branches.problems import BifurcationProblem, Family

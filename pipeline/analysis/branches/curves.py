@@ -11,7 +11,7 @@ import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, KINDS, TORUS, multipliers_of
+from pipeline.analysis.branches.bifurcations import multipliers_of
 from pipeline.analysis.branches.codimension_two import (
     DOUBLING_TORUS,
     FOLD_FLIP,
@@ -25,6 +25,7 @@ from pipeline.analysis.branches.codimension_two import (
     merged,
 )
 from pipeline.analysis.branches.following import has_halved, opposite
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import (

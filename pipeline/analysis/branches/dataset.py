@@ -15,14 +15,13 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.bifurcations import (
     CONTRADICTORY,
-    HOPF,
-    KINDS,
     Bifurcation,
     counts_of,
     eigenvalues_of,
     multipliers_of,
 )
 from pipeline.analysis.branches.following import ENDS, Branch, Limit
+from pipeline.analysis.branches.kinds import HOPF, KINDS
 from pipeline.analysis.branches.problems import FREQUENCY, parameter_units, state_units
 from pipeline.analysis.branches.stuck import stuck_ends
 from pipeline.analysis.tolerances import BRANCH_RTOL

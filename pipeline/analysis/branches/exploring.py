@@ -19,15 +19,7 @@ import numpy as np
 from magpend_core.orbits import crossed_state, section_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import (
-    BRANCHING,
-    DOUBLING,
-    FOLD,
-    HOPF,
-    SAME_PLACE,
-    Bifurcation,
-    settle_sides,
-)
+from pipeline.analysis.branches.bifurcations import SAME_PLACE, Bifurcation, settle_sides
 from pipeline.analysis.branches.following import (
     Branch,
     Half,
@@ -40,6 +32,7 @@ from pipeline.analysis.branches.following import (
     opposite,
     problem_of,
 )
+from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF
 from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others
 from pipeline.analysis.branches.limits import settle_limits
 from pipeline.analysis.branches.lockstep import Steps, run_together

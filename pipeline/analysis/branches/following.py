@@ -10,12 +10,10 @@ import numpy as np
 from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch, settle_sides
+from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, settle_sides
+from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem
-
-LIMITS = ("homoclinic", "snic")
-"""Kinds of ends at which the period of a flow's cycles grows without bound (see `limits`)."""
 
 ENDS = (
     *("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section"),

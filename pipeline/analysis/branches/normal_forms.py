@@ -29,17 +29,8 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.pointwise import jacobian_at
-from pipeline.analysis.branches.bifurcations import (
-    BRANCHING,
-    CONTRADICTORY,
-    DOUBLING,
-    FOLD,
-    HOPF,
-    PITCHFORK,
-    TORUS,
-    TRANSCRITICAL,
-    Bifurcation,
-)
+from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
+from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import Ends, Family, Rows, Value
 

@@ -339,7 +339,8 @@ def backbone_table(ds: xr.Dataset) -> Table:
     rows = _rows(ds)
     left_out = str(ds.attrs["left_out"]).splitlines()
     if not rows:
-        return Table(rows, left_out, f"no backbone: {'; '.join(left_out) or 'no linear mode'}")
+        why = f"no backbone: {'; '.join(left_out) or 'no linear mode'}"
+        return Table(rows, [why], why)
     channel, force = str(ds.attrs["of_channel"]), str(ds.attrs["force"])
     unit = str(ds["unit"].sel(channel=channel).values)
     head = f"amplitude of {channel}{'' if unit in ('', '1') else f' [{unit}]'} along its backbone curves"

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.bifurcations import KINDS as BIFURCATIONS
-from pipeline.analysis.branches.bifurcations import LABELS
 from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.branches.kinds import KINDS as BIFURCATIONS
+from pipeline.analysis.branches.kinds import LABELS
 from pipeline.analysis.outcomes import share_interval
 from pipeline.analysis.ragged import dense, isel
 from pipeline.analysis.resilience.analysis import end_of

@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
+from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays

@@ -28,6 +28,7 @@ from pipeline.layout.vocabulary import (
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError
+from pipeline.specification.tables import RATES
 from pipeline.store.run import RunDirectory
 
 FORMAT = 1
@@ -170,9 +171,14 @@ def _drawing(run: ExploredRun) -> dict[str, Any] | None:
 
 
 def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
+    factor = 1.0  # by which the page multiplies what it shows
     if axis.name == FREQUENCY_DIM:
         label = meaning = "strobe frequency" if run.model.autonomous else run.spec.motion.frequency_meaning
         unit = "Hz"
+        if run.spec.rate == "omega":
+            rate = RATES["omega"]
+            label, meaning, factor = "ω", rate.meaning, rate.factor
+            unit = "1" if all(state.unit == "1" for state in run.model.states) else rate.unit
     else:
         parameter = run.model.parameter(axis.parameter)
         label, unit = plain(parameter.symbol, parameter.name), parameter.unit
@@ -185,6 +191,7 @@ def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
         "meaning": meaning,
         "unit": unit,
         "values": axis.values.tolist(),
+        "factor": factor,
         "path": path,
     }
 

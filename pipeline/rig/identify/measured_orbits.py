@@ -15,8 +15,8 @@ import xarray as xr
 from magpend_core.crossing import Crossing
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, KINDS, TORUS
 from pipeline.analysis.branches.carrying import ORBIT, PARAMETER, Along, Array, Datum, OrbitData, Solution, settled
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, KINDS, TORUS
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
 from pipeline.layout.writing import json_value

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.branches.analysis import branches_table, curves_table
-from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
 from pipeline.analysis.ragged import dense
 from pipeline.cli.console import Exit

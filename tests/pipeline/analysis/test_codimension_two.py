@@ -8,9 +8,9 @@ import pytest
 from magpend_core.models import load_model
 from pipeline.analysis.branches import codimension_two
 from pipeline.analysis.branches.analysis import curves_table
-from pipeline.analysis.branches.bifurcations import KINDS, LABELS
 from pipeline.analysis.branches.curves import continue_curves, curves_dataset
 from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from tests.core.flows import table

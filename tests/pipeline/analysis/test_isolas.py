@@ -11,8 +11,8 @@ from scipy.optimize import fsolve
 import magpend
 from pipeline.analysis.branches import searching
 from pipeline.analysis.branches.analysis import branches_table, cut_of, isolas_of
-from pipeline.analysis.branches.bifurcations import KINDS, PITCHFORK
 from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.kinds import KINDS, PITCHFORK
 from pipeline.analysis.branches.searching import VERDICTS, places_of
 from pipeline.analysis.response.analysis import response_table
 from pipeline.layout.vocabulary import parameters_of

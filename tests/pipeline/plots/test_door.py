@@ -89,6 +89,8 @@ def other_value(model, name):
         "over": "other/run",
         "parameter": "q",
         "low": 2.0,
+        "drive_low": 0.1,
+        "drive_high": 0.2,
         "high": 2.5,
         "shown": 2,
         "between": ("A", "C"),

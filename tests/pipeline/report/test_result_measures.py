@@ -42,7 +42,7 @@ class Analysed:
 
 @pytest.fixture
 def analysed(monkeypatch):
-    monkeypatch.setattr(measures, "function_of", lambda name: lambda ds: Table(ROWS, []))
+    monkeypatch.setattr(measures, "shown_table", lambda name, ds: Table(ROWS, []))
     return Analysed()
 
 

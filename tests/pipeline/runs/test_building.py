@@ -52,7 +52,7 @@ equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
     ("wrong", "message"),
     [
         (lambda s: s.with_parameters(A=0.4), r"parameters\.A: .* is given by overrides=\{'A': 0\.4\}"),
-        (lambda s: s.with_parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides\?"),
+        (lambda s: s.with_parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides or"),
         (
             lambda s: s.with_integration(n_transients=4),
             r"integration\.n_transients: unknown key; did you mean n_transient",

@@ -130,18 +130,24 @@ export function placeY(box, [, , y0, y1], y) {
   return box.top + ((y1 - y) / (y1 - y0)) * box.height;
 }
 
+/** Ticks of an axis that shows its values times its factor, such as frequencies as omega. */
+function ticksAlong({ angle, factor = 1 }, low, high, most) {
+  const found = (angle ? angleTicks : ticksOf)(low * factor, high * factor, most);
+  return { ...found, ticks: found.ticks.map(({ value, text }) => ({ value: value / factor, text })) };
+}
+
 /**
  * Paint a frame with grid, ticks and labels.
  * @param {CanvasRenderingContext2D} ctx
  * @param {Object} box from `boxOf`
  * @param {number[]} bounds x0, x1, y0, y1
- * @param {{x: Object, y: Object}} axes each {label, unit, angle}; x without `label` has neither numbers nor label
+ * @param {{x: Object, y: Object}} axes each {label, unit, angle, factor}; x without `label` has neither numbers nor label
  * @param {Object} colours from `theme`
  */
 export function paintAxes(ctx, box, bounds, axes, colours) {
   const { left, top, width, height } = box;
-  const xs = (axes.x.angle ? angleTicks : ticksOf)(bounds[0], bounds[1], Math.max(2, Math.floor(width / 80)));
-  const ys = (axes.y.angle ? angleTicks : ticksOf)(bounds[2], bounds[3], Math.max(2, Math.floor(height / (height < 150 ? 22 : 44))));
+  const xs = ticksAlong(axes.x, bounds[0], bounds[1], Math.max(2, Math.floor(width / 80)));
+  const ys = ticksAlong(axes.y, bounds[2], bounds[3], Math.max(2, Math.floor(height / (height < 150 ? 22 : 44))));
   ctx.font = FONT;
   ctx.lineWidth = 1;
   ctx.strokeStyle = colours.grid;

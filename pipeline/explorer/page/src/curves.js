@@ -110,7 +110,7 @@ class Strip {
     const [x0, x1] = this.owner.diagram.window, [low, high] = this.range(x0, x1), bounds = [x0, x1, low, high];
     const unit = this.curves[0]?.unit ?? "";
     ctx.font = FONT;
-    paintAxes(ctx, box, bounds, { x: {}, y: { label: this.group === "fractions" ? "fraction" : "λ", unit } }, colours);
+    paintAxes(ctx, box, bounds, { x: { factor: this.owner.diagram.horizontal?.factor }, y: { label: this.group === "fractions" ? "fraction" : "λ", unit } }, colours);
     ctx.save();
     ctx.beginPath();
     ctx.rect(box.left, box.top, box.width, box.height);

@@ -262,8 +262,8 @@ export class Diagram {
   }
 
   axes() {
-    const { label, unit } = this.horizontal ?? { label: "", unit: "" };
-    return { x: { label, unit }, y: this.vertical };
+    const { label, unit, factor } = this.horizontal ?? { label: "", unit: "" };
+    return { x: { label, unit, factor }, y: this.vertical };
   }
 
   paintBitmaps(ctx) {
@@ -360,7 +360,7 @@ export class Diagram {
     const special = place && this.branches ? bifurcationAt(this.box, this.window, this.branches.points, ...place) : null;
     this.tip.hidden = !found && !special;
     if (this.tip.hidden) return;
-    const lines = special ? [`${special.kind}: ${this.horizontal.label} = ${told(special.x, 0)} ${this.horizontal.unit ?? ""}`] : [];
+    const lines = special ? [`${special.kind}: ${this.horizontal.label} = ${told(special.x * this.horizontal.factor, 0)} ${unitOf(this.horizontal)}`] : [];
     if (found) lines.push(...this.described(found));
     this.tip.replaceChildren(...lines.map((text) => el("div", { text })));
     const right = place[0] > this.width / 2;
@@ -376,7 +376,7 @@ export class Diagram {
   /** A point as lines of text: its place, what its cell is called, its cell. */
   described({ index, point, x, y }) {
     const [x0, x1, y0, y1] = this.window, { horizontal, vertical, data, colouring } = this;
-    const lines = [`${horizontal.label} = ${told(x, x1 - x0)} ${unitOf(horizontal)}`.trim(), `${vertical.label} = ${told(y, y1 - y0)} ${unitOf(vertical)}`.trim()];
+    const lines = [`${horizontal.label} = ${told(x * horizontal.factor, (x1 - x0) * horizontal.factor)} ${unitOf(horizontal)}`.trim(), `${vertical.label} = ${told(y, y1 - y0)} ${unitOf(vertical)}`.trim()];
     const code = data.colours[colouring?.name]?.[index];
     const category = colouring?.categories.find(({ id }) => id === code);
     if (category) lines.push(category.label);

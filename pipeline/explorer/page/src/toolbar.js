@@ -35,7 +35,7 @@ export class Toolbar {
       state.set({ x: name, at: atFor(view, name, at), window: null }));
     for (const axis of view.axes) {
       if (axis.name === x) continue;
-      const options = axis.values.map((value, index) => [String(index), `${told(value)} ${axis.unit ?? ""}`.trim()]);
+      const options = axis.values.map((value, index) => [String(index), `${told(value * axis.factor)} ${axis.unit ?? ""}`.trim()]);
       select(`at.${axis.name}`, axis.label, options, String(at[axis.name] ?? 0), (index) =>
         state.set({ at: { ...state.get().at, [axis.name]: Number(index) } }));
     }

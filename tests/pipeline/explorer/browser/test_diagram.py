@@ -15,6 +15,7 @@ import xarray as xr
 
 from pipeline.store.run import open_run
 from tests.pipeline.explorer.browser.conftest import HOSTILE, drawn, reused, served, until
+from tests.pipeline.factories import finished
 
 pytestmark = pytest.mark.slow
 
@@ -376,3 +377,29 @@ def test_fractions__are_drawn_if_their_answer_comes_before_the_diagrams(own: Any
     drawn(opened)
     until(opened.page, f"{COLOURED} > 200")
     assert opened.complaints == []
+
+
+def test_diagram__shows_the_drives_rate_as_omega(visit: Callable[..., Any], tmp_path: Path) -> None:
+    """The unit, the numbers beside the diagram and those at the pointer are those of the specification."""
+    run = finished(
+        tmp_path,
+        """
+kind = "sweep"
+model = "duffing"
+parameters.preset = "twin-well-periodic"
+axes = { omega = { values = [0.9, 1.0, 1.1] }, amplitude = { values = [0.2, 0.25] } }
+initial_conditions = { kind = "list", points = [[1.0, 0.0]] }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 100, n_keep = 4 }
+""",
+    )
+    with served(run) as address:
+        page = drawn(visit(address)).page
+        names = page.locator('select[name="x"] option').all_inner_texts()
+        assert names == ["ω [rad/s]", "amplitude [m/s2]"]
+        said = page.evaluate(
+            "window.magpend.diagram.described({ index: 0, point: 0, x: 1.1 / (2 * Math.PI), y: 0 })[0]"
+        )
+        assert said == "ω = 1.1 rad/s"
+        page.locator('select[name="x"]').select_option("amplitude")
+        shown = page.locator('select[name="at.frequency"] option').all_inner_texts()
+        assert shown == ["0.9 rad/s", "1 rad/s", "1.1 rad/s"]

@@ -1,0 +1,29 @@
+"""Name the kinds of bifurcations, with the labels of other programs. Imports nothing, for figures and tables."""
+
+FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
+HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
+KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
+
+LIMITS = ("homoclinic", "snic")
+"""Kinds of ends at which the period of a flow's cycles grows without bound (see `limits`)."""
+
+LABELS = {
+    **dict(zip(KINDS, ("LP", "PD", "NS", "BP", "H", "BP", "BP"), strict=True)),
+    **dict(zip(LIMITS, ("HOM", "SNIC"), strict=True)),
+    "cusp": "CP",
+    "generalised_doubling": "GPD",
+    "chenciner": "CH",
+    "r1": "R1",
+    "r2": "R2",
+    "r3": "R3",
+    "r4": "R4",
+    "fold_flip": "LPPD",
+    "fold_neimark_sacker": "LPNS",
+    "doubling_neimark_sacker": "PDNS",
+    "double_neimark_sacker": "NSNS",
+}
+"""Labels of bifurcations, and of points of codimension two, as MatCont and MatContM print them.
+
+AUTO writes HB for H and TR (torus) for NS; MatCont writes LPC for the fold of a limit cycle. A pitchfork or
+transcritical point is a branch point to both.
+"""
