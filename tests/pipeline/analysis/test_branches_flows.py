@@ -16,6 +16,7 @@ from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.limits import FITS, fit_law, grows_without_bound, logarithm, root
 from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.plots.branches import plot_branches
 from tests.core.cells import scipy_end
 from tests.core.flows import BAUTIN, HOPF, LORENZ, PAIR, ROSSLER, flow, table
 
@@ -105,6 +106,8 @@ def test_explore__towards_a_homoclinic_orbit():
     assert any("homoclinic to the saddle at x 0, y 0; alpha_h = 0.0000" in line for line in lines)
     assert any("saddle quantity -2 1/s: a stable cycle ends there" in line for line in lines)
     assert windows_of(ds)[0]["begins"] == "homoclinic"
+    names = {text.get_text() for text in plot_branches(ds).axes[0].texts}
+    assert "HOM" in names
     assert str(ds.attrs["stuck"]) == ""
 
 
