@@ -94,6 +94,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
+    version=2,
 )
 
 CURVES = Analysis(
