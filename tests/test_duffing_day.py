@@ -90,6 +90,7 @@ ANALYSES = {
     "events": "walk --period 1",
     "response": "walk --period 1",
     "backbone": "walk --undamped damping=0 --undamped amplitude=0",
+    "sensitivities": "walk --period 1 --deviation damping=0.01",
     "curves": "walk --period 1 --second amplitude --second-from 0.25 --second-to 0.35",
     "orbits": f"sweep {POINT} --period 1 --starts 40",
     "resilience": f"sweep {LINE} --directions 8 --confirmations 8 --phases 2 --timed 8",

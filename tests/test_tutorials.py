@@ -14,7 +14,17 @@ from tests.programs import ROOT, program
 
 tutorials = program("docs/run_tutorials.py")
 slurm = program("tests/pipeline/runs/slurm.py")
-FRESH = ("van-der-pol", "python-start", "response", "events", "spectra", "beside-other-tools", "maps", "henon")
+FRESH = (
+    "van-der-pol",
+    "python-start",
+    "response",
+    "events",
+    "spectra",
+    "beside-other-tools",
+    "maps",
+    "henon",
+    "branches",
+)
 """Pages whose pictures are compared as well."""
 PAGES = {**tutorials.PAGES, **{name: tutorials.pages()[name] for name in FRESH}, "AGENTS": ROOT / "AGENTS.md"}
 

@@ -112,5 +112,8 @@ ROUNDING = 1e-15
 PLACE_ERROR = 30.0
 """Error of a multiplier near a fold per root of the residual: twice the root of the map's curvature."""
 
+NO_INFLUENCE = 1e-9
+"""Elasticity of a bifurcation below which a parameter is said to have no influence on it."""
+
 PRESERVED_VOLUME = 1e-7
 """Largest log change of a volume over a period that counts as 0."""

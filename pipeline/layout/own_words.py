@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of
-from pipeline.specification.tables import FREQUENCY, RATES
+from pipeline.specification.tables import FREQUENCY, RATES, Rate
 
 RATE = "drive_rate"
 """Attribute with the word, if it is not ``frequency_hz``."""
@@ -20,6 +20,7 @@ _FLIPPED = ("jump_rises", "rises_before", "rises_after", "rises")
 _ERRORS = {
     "bracket": "value",
     "value_error": "value",
+    "deviation": "value",
     "special_first_error": "special_first",
     "special_second_error": "special_second",
 }
@@ -59,6 +60,8 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
             found[name] = (variable.dims, _rounded(values), about)
         elif rate.inverse and name in _FLIPPED:
             found[name] = (variable.dims, 1 - variable.values, variable.attrs)
+    if "elasticity" in ds:
+        found |= _sensitivities(ds, rate)
     coordinates = {name: value for name, value in found.items() if name in ds.coords}
     shown = ds.assign_coords(coordinates).assign({n: v for n, v in found.items() if n not in ds.coords})
     named = {FREQUENCY: rate.column, FREQUENCY_DIM: rate.column, "Hz": unit}
@@ -67,6 +70,33 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
         return shown
     shown = shown.rename({FREQUENCY_DIM: rate.column})
     return shown.sortby(rate.column) if rate.inverse and rate.column in shown.dims else shown
+
+
+def _sensitivities(ds: xr.Dataset, rate: Rate) -> dict[Any, Any]:
+    """Return derivatives of, and by, the drive's frequency as those of, and by, its rate; a period falls with it."""
+    sign = -1.0 if rate.inverse else 1.0
+    by, size = np.ones((2, ds.sizes["bifurcation"], ds.sizes["parameter"]))
+    values, deviation = ds["parameter_value"].values.copy(), ds["parameter_deviation"].values.copy()
+    names, units = ([str(v) for v in ds[n].values] for n in ("parameter", "unit"))
+    if ds.attrs["parameter"] == FREQUENCY_DIM:
+        by *= sign
+        size *= rate.slope(ds["value"].values)[:, None] if rate.inverse else rate.factor
+    if FREQUENCY_DIM in names:
+        i = names.index(FREQUENCY_DIM)
+        slope = rate.slope(values[:, i])
+        by[:, i] *= sign
+        size[:, i] /= slope
+        deviation[i] *= np.max(slope, initial=0.0)
+        values[:, i] = rate.given(values[:, i])
+        names[i], units[i] = rate.column, rate.unit
+    factors = {"derivative": by * size, "derivative_error": size, "elasticity": by}
+    found = {name: (ds[name].dims, ds[name].values * factor, ds[name].attrs) for name, factor in factors.items()}
+    return found | {
+        "parameter_value": (ds["parameter_value"].dims, values, ds["parameter_value"].attrs),
+        "parameter_deviation": ("parameter", deviation, ds["parameter_deviation"].attrs),
+        "parameter": ("parameter", names, ds["parameter"].attrs),
+        "unit": ("parameter", units, ds["unit"].attrs),
+    }
 
 
 def hertz_of(ds: xr.Dataset) -> xr.DataArray | None:

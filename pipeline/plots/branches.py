@@ -13,9 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
-from pipeline.analysis.branches.analysis import isolas_of
-from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.analysis import isolas_of, limits_of
+from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, draw_bands, with_bands, with_diagram
@@ -24,7 +25,7 @@ from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions, MultiplierOptions
 
-MARKERS = dict(zip(KINDS, "^soDpvX", strict=True))
+MARKERS = dict(zip((*KINDS, *LIMITS), "^soDpvX*P", strict=True))
 NAMES = {
     "fold": "fold",
     "period_doubling": "period doubling",
@@ -33,6 +34,8 @@ NAMES = {
     "hopf": "Hopf",
     "pitchfork": "pitchfork",
     "transcritical": "transcritical",
+    "homoclinic": "homoclinic",
+    "snic": "saddle node on a circle",
 }
 STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
 UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
@@ -191,15 +194,12 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
     """Draw markers at bifurcations. Return labels for those where a stable orbit appears or disappears."""
     names = []
     size = 3.4 if style.figure_of(ax).frame.compact else 4.5
-    for k in range(ds.sizes["bifurcation"]):
-        branch = int(ds["of_branch"][k])
+    for kind, branch, x, states, n_unstable in [*_located(ds), *_limits(ds)]:
         if branch not in chosen:
             continue
-        kind, period = KINDS[int(ds["kind"][k])], int(ds["orbit_period"][branch])
-        x = float(ds["value"][k])
-        n = max(period, 1)
-        y = measure.shown(ds["bifurcation_section"].sel(state=measure.name).values[k, :n])
-        stable = min(int(ds["n_unstable_before"][k]), int(ds["n_unstable_after"][k])) == 0
+        period = int(ds["orbit_period"][branch])
+        n, stable = max(period, 1), n_unstable == 0
+        y = measure.shown(states.sel(state=measure.name).values[:n])
         ax.plot(
             np.full(n, x),
             y,
@@ -214,9 +214,32 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
             scaley=scale,
         )
         if stable:
-            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{LABELS[kind]}{period or ''}"))
+            text = LABELS[kind] if kind in LIMITS else f"{LABELS[kind]}{period or ''}"
+            names.append(_Name(period, x, float(y.min()), float(y.max()), text))
     names += [_isola(ds, i, measure) for i in isolas_of(ds) if i in chosen]
     return sorted(names, key=lambda n: (n.period, n.x, n.low))
+
+
+_Mark = tuple[str, int, float, xr.DataArray, int]
+"""A mark in the figure: its kind, its branch, the parameter value, the section points and the unstable multipliers."""
+
+
+def _located(ds: xr.Dataset) -> Iterator[_Mark]:
+    """Yield a mark for each located bifurcation, with the smaller number of unstable multipliers beside it."""
+    for k in range(ds.sizes["bifurcation"]):
+        one = ds.isel(bifurcation=k)
+        n_unstable = min(int(one["n_unstable_before"]), int(one["n_unstable_after"]))
+        kind, branch = KINDS[int(one["kind"])], int(one["of_branch"])
+        yield kind, branch, float(one["value"]), one["bifurcation_section"], n_unstable
+
+
+def _limits(ds: xr.Dataset) -> Iterator[_Mark]:
+    """Yield a mark for each end at which the period grows without bound, at the section points of the last cycle."""
+    for branch, end in limits_of(ds):
+        name = ("first_end", "last_end")[end]
+        kind = words_of(ds[name])[int(ds[name][branch])]
+        last = ds.isel(branch=branch, point=int(ds["n_points"][branch]) - 1 if end else 0)
+        yield kind, branch, float(ds["limit_value"][branch, end]), last["section"], int(last["n_unstable"])
 
 
 def _hold_isolas(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure) -> None:
@@ -309,8 +332,7 @@ def _free(
 
 
 def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
-    own = np.isin(ds["of_branch"].values, chosen)
-    present = {KINDS[int(code)] for code in ds["kind"].values[own]}
+    present = {kind for kind, branch, *_ in [*_located(ds), *_limits(ds)] if branch in chosen}
     return [
         Line2D([], [], label="stable", **{k: v for k, v in STABLE.items() if k != "zorder"}),
         Line2D([], [], label="unstable", **{k: v for k, v in UNSTABLE.items() if k != "zorder"}),
@@ -326,7 +348,7 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
                 markeredgewidth=0.7,
                 label=f"{LABELS[kind]} {NAMES[kind]}",
             )
-            for kind in KINDS
+            for kind in (*KINDS, *LIMITS)
             if kind in present
         ),
     ]

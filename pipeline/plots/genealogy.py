@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.events.names import CASCADE, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain, words_of
@@ -134,7 +134,7 @@ def _handles(ds: xr.Dataset) -> list[Any]:
     present = {NAMES[int(code)] for code in ds["what"].values}
     handles = [
         Line2D([], [], linestyle="none", marker=MARKERS[kind], label=f"{LABELS[kind]} {IN_WORDS[kind]}", **_MARK)
-        for kind in KINDS
+        for kind in (*KINDS, *LIMITS)
         if kind in present
     ]
     if CASCADE in present:

@@ -62,6 +62,16 @@ class BandOptions(BranchOptions):
     digest: str = option("", "Digest of the file of draws; found by itself.")
 
 
+class SensitivityOptions(BranchOptions):
+    """Options for derivatives of bifurcations by the parameters."""
+
+    deviation: dict[str, float] = option(
+        {}, "Standard deviation of a parameter, such as q=0.02; in Hz of the drive's frequency_hz."
+    )
+    posterior: str = option("", "Directory of magpend identify posterior, or a file of its draws: their covariance.")
+    digest: str = option("", "Digest of the file of draws; found by itself.")
+
+
 class OrbitOptions(Options):
     """Options for searching all periodic orbits at a parameter point."""
 
@@ -84,6 +94,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
+    version=2,
 )
 
 CURVES = Analysis(
@@ -111,6 +122,22 @@ BANDS = Analysis(
     settle="pipeline.analysis.branches.bands:settle_bands",
     builds_on=("branches",),
     figure="branches",
+    # the digest says which draws
+    ignores=("posterior",),
+)
+
+SENSITIVITIES = Analysis(
+    "sensitivities",
+    """Tell how far each bifurcation moves with each parameter: derivatives, and percent per percent.
+
+    By implicit differentiation of the equations of each bifurcation that `branches` locates. With standard deviations
+    of the parameters (--deviation, --posterior) also that of the bifurcation, to first order.""",
+    SensitivityOptions,
+    compute="pipeline.analysis.branches.sensitivities:sensitivities",
+    table="pipeline.analysis.branches.sensitivities:sensitivities_table",
+    settle="pipeline.analysis.branches.sensitivities:settle_sensitivities",
+    builds_on=("branches",),
+    figure="sensitivities",
     # the digest says which draws
     ignores=("posterior",),
 )

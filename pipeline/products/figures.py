@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from pipeline.products.backbone import BackboneOptions
-from pipeline.products.branches import BranchOptions, CurveOptions, TongueOptions
+from pipeline.products.branches import BranchOptions, CurveOptions, SensitivityOptions, TongueOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.events import EventOptions
 from pipeline.products.manifolds import ManifoldOptions
@@ -120,6 +120,12 @@ class ResponseFigureOptions(ResponseOptions, FigureOptions):
     channel: str = option("", "State or quantity to draw; by default the model's first state.")
     harmonic: int = option(0, "Draw the amplitude of this harmonic; 0 draws half of peak to peak.", ge=0)
     points: str = option("", "CSV file of measured points: columns of the parameter, amplitude and, if known, phase.")
+
+
+class SensitivityFigureOptions(SensitivityOptions, FigureOptions):
+    """Options of a figure of sensitivities."""
+
+    shown: int = option(6, "Number of bifurcations that get a panel: the first by rising value.", ge=1, le=24)
 
 
 class BackboneFigureOptions(BackboneOptions, FigureOptions):
@@ -291,6 +297,14 @@ MULTIPLIERS = Figure(
     "Draw the Floquet multipliers along a branch in the complex plane, with the unit circle.",
     MultiplierOptions,
     "pipeline.plots.branches:draw_multipliers",
+)
+
+SENSITIVITIES = Figure(
+    "sensitivities",
+    "Draw how far 1 % more of each parameter moves each bifurcation: bars by size, a panel for each bifurcation.",
+    SensitivityFigureOptions,
+    "pipeline.plots.sensitivities:draw_sensitivities",
+    panels="several",
 )
 
 CURVES = Figure(

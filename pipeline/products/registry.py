@@ -71,6 +71,7 @@ ANALYSES: Registry[Analysis] = Registry(
             "response": ("response", ""),
             "backbone": ("backbone", ""),
             "bands": ("branches", "a posterior of magpend identify"),
+            "sensitivities": ("branches", ""),
             "curves": ("branches", ""),
             "orbits": ("branches", _POINT),
             "tongues": ("branches", _ROTATION),
@@ -110,6 +111,7 @@ _FIGURES = {
     "Orbits and branches, stable or not": {
         "branches": "",
         "multipliers": "",
+        "sensitivities": "",
         "curves": "",
         "genealogy": _ONE,
         "response": "",

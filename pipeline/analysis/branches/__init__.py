@@ -7,10 +7,10 @@
 An orbit of period p is a fixed point of the p-fold stroboscopic map, or of the p-fold return map of a flow seen at
 crossings (`magpend_core.orbits` has its derivative); its branch is followed by pseudo-arclength continuation, whether
 it is stable or not. `problems` has the equations of orbits and equilibria, `lockstep` evaluates many of them in one
-call of the engine, `arclength` traces, `bifurcations` notices and locates, `following` makes one branch, `exploring`
-all that hang together, `searching` finds orbits of detached ones, `curves` continues located points in two
-parameters. `connecting` says which orbits of a grid
-of parameter points lie on one branch or sheet, which `sheets` keeps. Any `magpend_core.engine.system.System` will do;
+call of the engine, `arclength` traces, `bifurcations` notices and locates, `following` makes one branch, `limits`
+names ends at which the period grows without bound, `exploring` all that hang together, `searching` finds orbits of
+detached ones, `curves` continues located points in two parameters. `connecting` says which orbits of a grid of
+parameter points lie on one branch or sheet, which `sheets` keeps. Any `magpend_core.engine.system.System` will do;
 names, units and the class of a motion are the model's.
 
 Located bifurcations
@@ -84,7 +84,15 @@ variable                          dims                     meaning
                                                            point there, as at a Hopf bifurcation), tangent
                                                            (its cycles only touch the section),
                                                            other_section (its cycles go on as a branch on
-                                                           the run's section)
+                                                           the run's section), homoclinic or snic (their period
+                                                           grows without bound, see `limits`)
+``limit_value``, ``_error``       branch, end              such an end's parameter value; absent if there is none,
+                                                           like all that follows
+``limit_state``                   branch, end, state       equilibrium at which the cycles come to rest
+``limit_eigenvalue_real``,        branch, end,             its eigenvalues [1/s]
+``_imag``                         multiplier
+``limit_slope``, ``_error``,      branch, end              slope of the law of the period, fitted, its error, and
+``_expected``                                              computed from the equilibrium
 ``frequency``                     branch                   drive frequency, NaN if that is the parameter; a
                                                            flow has none
 ``rotation``                      branch, angle            mean turns per drive period or return

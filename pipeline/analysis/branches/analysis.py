@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LABELS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LABELS, LIMITS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values, words_of
 from pipeline.layout.own_words import RATE, dims_in_own_words
@@ -158,9 +158,11 @@ def branches_table(ds: xr.Dataset) -> Table:
     if not ds.sizes["branch"]:
         lines = ["no branch: no closed orbit to begin with", *searched_lines(ds), *_left_out(ds)]
         return Table(rows, lines, _why_none(ds))
-    head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
+    head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
-    return Table(rows, [*lines, *_detached(ds), *searched_lines(ds), *_listed(ds, "stuck"), *_left_out(ds)])
+    return Table(
+        rows, [*lines, *_unbounded(ds), *_detached(ds), *searched_lines(ds), *_listed(ds, "stuck"), *_left_out(ds)]
+    )
 
 
 def _why_none(ds: xr.Dataset) -> str:
@@ -173,10 +175,12 @@ def _why_none(ds: xr.Dataset) -> str:
 
 
 def table_of(ds: xr.Dataset) -> list[Row]:
-    """Return one table row per located bifurcation, sorted by parameter value.
+    """Return one table row per located bifurcation, and per end of a branch at which the period grows without bound,
+    sorted by parameter value.
 
-    The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
-    that have other values than the run's own follow, and ``side`` where the model has words for motions.
+    At such an end ``bracket`` is the error of the value, and ``saddle_quantity`` the sum of the saddle's leading
+    eigenvalues [1/s]. The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``.
+    Parameters that have other values than the run's own follow, and ``side`` where the model has words for motions.
     """
     parameter = parameter_name(str(ds.attrs["parameter"]))
     rows = []
@@ -205,7 +209,85 @@ def table_of(ds: xr.Dataset) -> list[Row]:
                 "to_branch": int(one["to_branch"]),
             }
         )
-    return rows
+    if not (ends := limits_of(ds)):
+        return rows
+    rows = [{**row, "saddle_quantity": np.nan} for row in rows]
+    return sorted([*rows, *(_limit_row(ds, *end) for end in ends)], key=lambda row: float(row[parameter]))
+
+
+def limits_of(ds: xr.Dataset) -> list[tuple[int, int]]:
+    """Return the branch and the end, 0 or 1, of each end at which the period of cycles grows without bound."""
+    return (
+        [(int(i), int(e)) for i, e in np.argwhere(np.isfinite(ds["limit_value"].values))] if "limit_value" in ds else []
+    )
+
+
+def _limit_row(ds: xr.Dataset, branch: int, end: int) -> Row:
+    one, kind = ds.isel(branch=branch, end=end), _ends_of(ds, branch)[end]
+    point = int(one["n_points"]) - 1 if end else 0
+    value, last = float(one["limit_value"]), one.isel(point=point)
+    number, is_below = str(int(last["n_unstable"])), float(last["parameter"]) < value
+    return {
+        parameter_name(str(ds.attrs["parameter"])): value,
+        "bracket": float(one["limit_error"]),
+        "label": LABELS[kind],
+        "type": kind,
+        "criticality": "",
+        "period": int(one["orbit_period"]),
+        **({"side": values(last[["side"]], "side")["side"]} if "side" in ds else {}),
+        **dict.fromkeys(("multiplier_real", "multiplier_imag", "normal_form", "normal_form_error"), np.nan),
+        "unstable_below": number if is_below else "none",
+        "unstable_above": "none" if is_below else number,
+        "period_s": np.inf,
+        **fixed_of(ds, branch),
+        "branch": branch,
+        "to_branch": -1,
+        "saddle_quantity": _saddle_quantity(ds, branch, end),
+    }
+
+
+def _saddle_quantity(ds: xr.Dataset, branch: int, end: int) -> float:
+    """Return the sum of the leading unstable and stable eigenvalue of the saddle at an end [1/s]; NaN for a saddle
+    node.
+    """
+    if _ends_of(ds, branch)[end] != "homoclinic":
+        return np.nan
+    real = ds["limit_eigenvalue_real"].values[branch, end]
+    return float(real[real > 0.0].min() + real[real < 0.0].max())
+
+
+def _to_error(value: float, error: float) -> str:
+    """Format a value with an error that may be small, to one digit of the error."""
+    decimals = int(np.clip(np.ceil(-np.log10(error)), 0, 12))
+    return f"{round(value, decimals) + 0.0:.{decimals}f} +- {error:.1g}"
+
+
+def _unbounded(ds: xr.Dataset) -> list[str]:
+    """Return text lines on the ends of branches at which the period grows without bound; none if there are none."""
+    lines = []
+    for branch, end in limits_of(ds):
+        one, name = ds.isel(branch=branch, end=end), parameter_name(str(ds.attrs["parameter"]))
+        states = zip(ds["state"].values.tolist(), one["limit_state"].values.round(12), strict=True)
+        place = ", ".join(f"{state} {value + 0.0:.6g}" for state, value in states)
+        own = (one["limit_eigenvalue_real"].values + 1j * one["limit_eigenvalue_imag"].values).round(12) + 0.0
+        eigenvalues = ", ".join(f"{v.real:.5g}{v.imag:+.5g}i" if v.imag else f"{v.real:.5g}" for v in own)
+        fitted, error, expected = (float(one[f"limit_slope{part}"]) for part in ("", "_error", "_expected"))
+        at = f"{name}_h = {_to_error(float(one['limit_value']), float(one['limit_error']))}"
+        quantity = _saddle_quantity(ds, branch, end)
+        if np.isfinite(quantity):
+            n_unstable = int((own.real > 0.0).sum())
+            cycle = "a stable cycle" if quantity < 0.0 and n_unstable == 1 else "an unstable cycle"
+            what, law = f"homoclinic to the saddle at {place}", f"-ln|{name} - {name}_h|"
+            told = f"saddle quantity {quantity:.5g} 1/s: {cycle} ends there"
+        else:
+            what, law = f"saddle node on an invariant circle, at {place}", f"1/sqrt|{name} - {name}_h|"
+            told = "the cycle goes on as a saddle and a node"
+        lines += [
+            f"  branch {branch}{_at(ds, branch)}: {what}; {at}",
+            f"    eigenvalues {eigenvalues} [1/s]; {told}",
+            f"    slope of the period over {law}: {fitted:.5g} +- {error:.1g} fitted, {expected:.5g} computed",
+        ]
+    return ["", "the period grows without bound", *lines] if lines else []
 
 
 def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
@@ -239,7 +321,7 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
         "label": row["label"],
         "type": row["type"],
         "criticality": row["criticality"],
-        "normal_form": _with_error(row["normal_form"], row["normal_form_error"]),
+        "normal_form": "" if row["type"] in LIMITS else _with_error(row["normal_form"], row["normal_form_error"]),
         "period": str(row["period"] or "equilibrium"),
         # the period in drive periods says the same
         "seconds": f"{row['period_s']:.6g}" if model_of(ds).crossing is not None else None,
@@ -270,6 +352,8 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _number(z: complex, period: int) -> str:
+    if np.isnan(z):
+        return ""
     return (f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i") + ("" if period else " 1/s")
 
 
@@ -436,6 +520,8 @@ def _bound(ds: xr.Dataset, branch: int, point: int, end: int) -> tuple[float, st
         at, kind = _named(ds, int(nearest))
         own = parent == int(ds["orbit_period"][branch])
         return at, kind if own else f"{kind} of {f'period {parent}' if parent else 'an equilibrium'}"
+    if name in LIMITS:
+        return float(ds["limit_value"][branch, end]), name
     return value, name
 
 

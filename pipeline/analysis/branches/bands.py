@@ -155,15 +155,19 @@ def place_variables(data: list[Datum], places: list[Place], share: np.ndarray) -
 
 def settle_bands(run: OpenRun, options: BandOptions) -> BandOptions:
     """Complete the interval of the branches, and the digest of the draws; raise SpecError if there are none."""
-    path = _path(options.posterior)
-    try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        raise SpecError(
-            [f"--posterior {options.posterior}: has no {DRAWS_FILE}; make it: magpend identify posterior DIR."]
-        ) from None
+    digest = digest_of_draws(options.posterior)
     settled = settle_branches(run, options)
     return options.model_copy(update={**settled.part(BranchOptions), "digest": digest})
+
+
+def digest_of_draws(posterior: str) -> str:
+    """Return the digest of a file of draws; raise SpecError if there is none."""
+    try:
+        return hashlib.sha256(_path(posterior).read_bytes()).hexdigest()
+    except OSError:
+        raise SpecError(
+            [f"--posterior {posterior}: has no {DRAWS_FILE}; make it: magpend identify posterior DIR."]
+        ) from None
 
 
 def _path(posterior: str) -> Path:
@@ -187,7 +191,7 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     SpecError
         If the draws are of another model, or the run sweeps more than one parameter.
     """
-    drawn = _draws(run, options)
+    drawn = draws_of(run, options.posterior, options.parameter).isel(draw=slice(options.draws or None))
     located = run.derive("branches", **options.part(BranchOptions))
     base = parameters_of(run.cube())
     along = _along(options, base, located)
@@ -216,21 +220,22 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     )
 
 
-def _draws(run: OpenRun, options: BandOptions) -> xr.Dataset:
-    with xr.open_dataset(_path(options.posterior), engine="scipy") as ds:
+def draws_of(run: OpenRun, posterior: str, parameter: str) -> xr.Dataset:
+    """Read draws of a model's parameters for branches along a parameter; raise SpecError if they do not suit them."""
+    with xr.open_dataset(_path(posterior), engine="scipy") as ds:
         drawn = ds.load()
     names = [str(name) for name in drawn["parameter"].values]
     own = [name for name in run.model.parameter_names if name in names]
     identified = str(drawn.attrs["identified"]).split()
-    swept = parameter_name(options.parameter)
+    swept = parameter_name(parameter)
     problems = []
     if len(own) != len(names):
-        problems.append(f"--posterior {options.posterior}: has the parameters {', '.join(names)}: another model's.")
+        problems.append(f"--posterior {posterior}: has the parameters {', '.join(names)}: another model's.")
     if swept in identified:
-        problems.append(f"--posterior {options.posterior}: {swept} was identified, and the branches run along it.")
+        problems.append(f"--posterior {posterior}: {swept} was identified, and the branches run along it.")
     if problems:
         raise SpecError(problems)
-    return drawn.isel(draw=slice(options.draws or None))
+    return drawn
 
 
 def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along:

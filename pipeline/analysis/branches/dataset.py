@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from pipeline.analysis.branches.bifurcations import (
     eigenvalues_of,
     multipliers_of,
 )
-from pipeline.analysis.branches.following import ENDS, Branch
+from pipeline.analysis.branches.following import ENDS, Branch, Limit
 from pipeline.analysis.branches.kinds import HOPF, KINDS
 from pipeline.analysis.branches.problems import FREQUENCY, parameter_units, state_units
 from pipeline.analysis.branches.stuck import stuck_ends
@@ -74,6 +74,7 @@ def dataset_of(
     for name in ("value", "bracket"):
         variables[name][2]["units"] = parameter_units(parameter, model)
     variables |= _fixed(branches, parameter, parameters)
+    variables |= _limits(branches, parameter_units(parameter, model), states)
     if words:
         variables |= _side_variables(arrays.side, events, words)
     angle_dim = "angle" if model is None else model.angle_dim
@@ -89,6 +90,42 @@ def dataset_of(
         left_out="\n".join(left_out),
         stuck="\n".join(stuck_ends(branches)),
     )
+
+
+def _limits(branches: Sequence[Branch], units: str, states: str) -> dict[str, Any]:
+    """Return dataset variables for the ends at which periods grow without bound; none if there is no such end."""
+    found = [(i, end, one) for i, b in enumerate(branches) for end, one in enumerate(b.limits) if one is not None]
+    if not found:
+        return {}
+    n, dims = branches[0].family.system.n_states, ("branch", "end")
+
+    def laid(about: str, unit: str, get: Callable[[Limit], Any], *dim: str) -> tuple[tuple[str, ...], Any, Any]:
+        values = np.full((len(branches), 2, *([n] if dim else [])), np.nan)
+        for i, end, one in found:
+            values[i, end] = get(one)
+        return ((*dims, *dim), values, {"units": unit, "long_name": about})
+
+    per_root = "s, or s times the root of the parameter's unit"
+    slope = "slope of the period over -ln|p - p_h|, or over 1/sqrt|p - p_h| at a saddle node on a circle"
+    at = "equilibrium where the period is infinite"
+    return {
+        "limit_value": laid("parameter value where the period is infinite", units, lambda one: one.value),
+        "limit_error": laid("error of this value", units, lambda one: one.error),
+        "limit_state": laid(at, states, lambda one: one.state, "state"),
+        "limit_eigenvalue_real": laid(f"eigenvalues of the {at}, real part", "1/s", _real, "multiplier"),
+        "limit_eigenvalue_imag": laid(f"eigenvalues of the {at}, imaginary part", "1/s", _imag, "multiplier"),
+        "limit_slope": laid(f"{slope}: fitted", per_root, lambda one: one.slope),
+        "limit_slope_error": laid("error of the fitted slope", per_root, lambda one: one.slope_error),
+        "limit_slope_expected": laid("the same slope, from the equilibrium", per_root, lambda one: one.expected),
+    }
+
+
+def _real(one: Limit) -> np.ndarray:
+    return np.asarray(one.eigenvalues.real)
+
+
+def _imag(one: Limit) -> np.ndarray:
+    return np.asarray(one.eigenvalues.imag)
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:

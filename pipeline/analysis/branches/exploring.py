@@ -34,6 +34,7 @@ from pipeline.analysis.branches.following import (
 )
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF
 from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others
+from pipeline.analysis.branches.limits import settle_limits
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import Family, OrbitProblem
@@ -95,6 +96,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
     _adopt(branches)
     _adopt_cycles(branches)
     settle_crossings(branches)
+    settle_limits(branches)
     judge([(branch.family, one) for branch in branches for one in branch.bifurcations])
     return branches
 

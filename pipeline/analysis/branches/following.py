@@ -11,13 +11,16 @@ from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, settle_sides
-from pipeline.analysis.branches.kinds import FOLD
+from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem
 
-ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section")
+ENDS = (
+    *("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section"),
+    *LIMITS,
+)
 """Reasons why a branch ends: ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as
-a branch on another section."""
+a branch on another section, ``homoclinic`` and ``snic`` where their period grows without bound."""
 
 TANGENT = 0.01
 """A branch of cycles ends where the crossing speed times the period is below this distance [scales of the state
@@ -32,6 +35,27 @@ def problem_of(family: Family) -> OneParameter:
     return OrbitProblem(family) if family.period else EquilibriumProblem(family)
 
 
+def leading_of(eigenvalues: np.ndarray) -> tuple[complex, complex]:
+    """Return the unstable and the stable eigenvalue of a saddle that are nearest to the imaginary axis."""
+    unstable, stable = (eigenvalues[sign * eigenvalues.real > 0.0] for sign in (1.0, -1.0))
+    return complex(unstable[np.argmin(unstable.real)]), complex(stable[np.argmax(stable.real)])
+
+
+@dataclass(frozen=True, eq=False)
+class Limit:
+    """End of a branch of limit cycles whose period grows without bound, at an equilibrium."""
+
+    kind: str  # of `LIMITS`
+    value: float  # limit of the parameter
+    error: float  # of this value
+    state: np.ndarray  # equilibrium at which the cycles come to rest
+    eigenvalues: np.ndarray  # of this equilibrium [1/s], by falling real part
+    # slope of the period over -ln|p - p_h| [s], or over 1/sqrt|p - p_h| at a saddle node on a circle
+    slope: float  # fitted to the periods of the branch
+    slope_error: float
+    expected: float  # computed from the equilibrium
+
+
 @dataclass(eq=False)
 class Branch:
     """A branch: orbits of one period, or equilibria, along one parameter."""
@@ -42,6 +66,7 @@ class Branch:
     # reasons for the first and the last end, of `ENDS`; ``start`` stands for the bifurcation at its origin
     ends: tuple[str, str]
     origin: Bifurcation | None = None  # bifurcation from which it branches
+    limits: tuple[Limit | None, Limit | None] = (None, None)  # of the ends named in `LIMITS`
 
     def __post_init__(self) -> None:
         settle_sides(self.points, self.bifurcations)

@@ -4,8 +4,12 @@ FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", 
 HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
 KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
 
+LIMITS = ("homoclinic", "snic")
+"""Kinds of ends at which the period of a flow's cycles grows without bound (see `limits`)."""
+
 LABELS = {
     **dict(zip(KINDS, ("LP", "PD", "NS", "BP", "H", "BP", "BP"), strict=True)),
+    **dict(zip(LIMITS, ("HOM", "SNIC"), strict=True)),
     "cusp": "CP",
     "generalised_doubling": "GPD",
     "chenciner": "CH",

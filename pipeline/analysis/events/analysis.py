@@ -242,6 +242,8 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     event = Event(one, rises, fate, to=to, n_cells=n_cells)
     if fate.is_bound:
         return replace(event, what=LIVES_ON)
+    if fate.limit:
+        return replace(event, what=fate.limit, error=max(fate.error, LOCATED * scene.scale))
     if fate.bifurcation < 0:
         return event
     ds, k = scene.located, fate.bifurcation

@@ -12,7 +12,7 @@ from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.exploring import BESIDE
-from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LIMITS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.known import GUESS, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
@@ -52,6 +52,8 @@ class Fate:
     bifurcation: int = -1
     why: str = ""  # evidence, or why there is no bifurcation
     is_bound: bool = False
+    limit: str = ""  # kind of an end at which the period grows without bound, of `LIMITS`
+    error: float = np.nan  # of its value
 
 
 def lines_of(ds: xr.Dataset, others: Mapping[str, float], geometry: Geometry) -> list[Line]:
@@ -201,6 +203,10 @@ def _at_end(ds: xr.Dataset, line: Line, node: int, seen: str) -> Fate:
     if end == "bound":
         why = f"{seen} and is stable up to the bound of the branches"
         return Fate(x, line.branch, node, why=why, is_bound=True)
+    if end in LIMITS:
+        value, error = (float(ds[f"limit_{name}"].values[line.branch, 1 if node else 0]) for name in ("value", "error"))
+        why = f"{seen}, is stable, and its period grows without bound"
+        return Fate(value, line.branch, node, why=why, limit=end, error=error)
     k = _sprung_from(ds, line, node, end) if end in SPRUNG else -1
     if k >= 0:
         why = f"{seen}, is stable, and springs from the bifurcation"

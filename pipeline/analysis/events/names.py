@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pipeline.analysis.branches.kinds import KINDS
+from pipeline.analysis.branches.kinds import KINDS, LIMITS
 
 UNDECIDED, RANGE_END, LIVES_ON, CASCADE = "not_decided", "range_end", "lives_on", "cascade"
 
-NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, CASCADE)
+NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE)
 """Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""

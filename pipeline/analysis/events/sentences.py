@@ -17,6 +17,8 @@ _NAMES = (
     *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "evidence"),
 )
 
+_LIMITS = {"homoclinic": "homoclinic end (HOM) at a saddle", "snic": "saddle node on a circle (SNIC)"}
+
 
 def events_table(ds: xr.Dataset) -> Table:
     """Return the table of events: a row for each, with its sentence and evidence.
@@ -77,6 +79,8 @@ def _reason(row: Row, doublings: list[float]) -> str:
     if what == CASCADE:
         listed = ", ".join(f"{x:.7g}" for x in doublings)
         return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    if what in _LIMITS:
+        return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
     spelt = {TORUS: "Neimark-Sacker", HOPF: "Hopf"}.get(what, plain(what))
     head = f"{degree}{spelt} ({LABELS[what]})"

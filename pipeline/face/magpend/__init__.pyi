@@ -92,6 +92,7 @@ dimension = Run.dimension
 spectrum = Run.spectrum
 branches = Run.branches
 bands = Run.bands
+sensitivities = Run.sensitivities
 curves = Run.curves
 orbits = Run.orbits
 events = Run.events

@@ -37,6 +37,7 @@ class Plots:
     waterfall = OnePanel(options.WaterfallOptions)
     branches = OnePanel(options.BranchFigureOptions)
     multipliers = OnePanel(options.MultiplierOptions)
+    sensitivities = SeveralPanels(options.SensitivityFigureOptions)
     curves = OnePanel(options.CurveFigureOptions)
     genealogy = OnePanel(options.GenealogyOptions)
     rotation = OnePanel(FigureOptions)

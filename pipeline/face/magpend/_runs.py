@@ -10,7 +10,14 @@ from magpend._methods import AnalysisMethod
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.backbone import BackboneOptions
 from pipeline.products.basins import BasinOptions
-from pipeline.products.branches import BandOptions, BranchOptions, CurveOptions, OrbitOptions, TongueOptions
+from pipeline.products.branches import (
+    BandOptions,
+    BranchOptions,
+    CurveOptions,
+    OrbitOptions,
+    SensitivityOptions,
+    TongueOptions,
+)
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.events import EventOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
@@ -74,6 +81,7 @@ class Run(RunDirectory):
     spectrum = AnalysisMethod(SpectrumOptions)
     branches = AnalysisMethod(BranchOptions)
     bands = AnalysisMethod(BandOptions)
+    sensitivities = AnalysisMethod(SensitivityOptions)
     curves = AnalysisMethod(CurveOptions)
     orbits = AnalysisMethod(OrbitOptions)
     tongues = AnalysisMethod(TongueOptions)

@@ -1,8 +1,11 @@
 """Branches of limit cycles of flows, against what is known of them and an independent shooting method."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from scipy.optimize import fsolve
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, fsolve
 
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
@@ -11,17 +14,18 @@ from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.limits import FITS, fit_law, grows_without_bound, logarithm, root
 from pipeline.analysis.branches.starting_orbits import family_of
-from pipeline.analysis.branches.stuck import grows_without_bound
+from pipeline.plots.branches import plot_branches
 from tests.core.cells import scipy_end
-from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow, table
+from tests.core.flows import BAUTIN, HOPF, LORENZ, PAIR, ROSSLER, flow, table
 
 pytestmark = pytest.mark.slow
 
 
-def followed(equations, of, state, parameter, low, high, *, max_period=1, level=0.0, **values):
+def followed(equations, of, state, parameter, low, high, *, max_period=1, level=0.0, longest=50.0, **values):
     """Branches from a limit cycle near a state."""
-    parameters = sectioned(flow(equations), Crossing(of, level, longest=50.0)).load(**values)
+    parameters = sectioned(flow(equations), Crossing(of, level, longest=longest)).load(**values)
     model = parameters.model
     family = family_of(model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low)
     start = Start(family, np.array(state, float), parameters[parameter])
@@ -88,12 +92,141 @@ def test_explore__towards_a_homoclinic_orbit():
     assert ds["section"].values[0, np.nanargmin(alpha), 0, 1] ** 2 == pytest.approx(0.5**2 - 0.5**3, abs=1e-6)
     slope, _ = np.polyfit(-np.log(alpha[near]), seconds[near], 1)
     assert slope == pytest.approx(1.0, abs=0.01)
+    (row,) = table_of(ds)
+    assert (row["label"], row["type"], row["unstable_above"], row["unstable_below"]) == (
+        "HOM",
+        "homoclinic",
+        "0",
+        "none",
+    )
+    assert abs(row["alpha"]) < 2.0 * row["bracket"] < 1e-8
+    assert row["saddle_quantity"] == pytest.approx(1.0 - 3.0, abs=1e-8)
+    assert np.nanmax(ds["limit_slope"].values) == pytest.approx(1.0, abs=0.005)
+    lines = branches_table(ds).lines
+    assert any("homoclinic to the saddle at x 0, y 0; alpha_h = 0.0000" in line for line in lines)
+    assert any("saddle quantity -2 1/s: a stable cycle ends there" in line for line in lines)
+    assert windows_of(ds)[0]["begins"] == "homoclinic"
+    names = {text.get_text() for text in plot_branches(ds).axes[0].texts}
+    assert "HOM" in names
+    assert str(ds.attrs["stuck"]) == ""
+
+
+MORRIS_LECAR = table(
+    "morris_lecar",
+    {"v": "y - 0.5*(v + 0.5) - 2*w*(v + 0.7) - m*(v - 1)", "w": "1.15*(winf - w)*tau"},
+    {"y": 0.075},
+    define={
+        "m": "(1 + tanh((v + 0.01)/0.15))/2",
+        "winf": "(1 + tanh((v - 0.1)/0.145))/2",
+        "tau": "cosh((v - 0.1)/0.29)",
+    },
+)
+
+
+def split(y):
+    """Distance on v = 0.0365 between the saddle's unstable and stable manifold, by another integrator."""
+
+    def rates(_, state):
+        v, w = state
+        m, inf = (0.5 * (1.0 + np.tanh(x)) for x in ((v + 0.01) / 0.15, (v - 0.1) / 0.145))
+        drift = y - 0.5 * (v + 0.5) - 2.0 * w * (v + 0.7) - m * (v - 1.0)
+        return np.array([drift, 1.15 * (inf - w) * np.cosh((v - 0.1) / 0.29)])
+
+    saddle = fsolve(lambda u: rates(0.0, u), [-0.185, 0.019], xtol=1e-13)
+    jacobian = np.array([rates(0.0, saddle + h) - rates(0.0, saddle - h) for h in 1e-6 * np.eye(2)]).T / 2e-6
+    values, vectors = np.linalg.eig(jacobian)
+    ends = []
+    for sign in (1.0, -1.0):
+        own = vectors[:, np.argmax(sign * values)]
+
+        def level(_, state):
+            return state[0] - 0.0365
+
+        # forwards the flow crosses the level downwards where both manifolds do
+        level.direction, level.terminal = -sign, True
+        start = saddle + 1e-6 * own * np.sign(own[0 if sign > 0.0 else 1])
+        flow_of = partial(lambda s, t, u: s * rates(t, u), sign)
+        found = solve_ivp(flow_of, (0.0, 200.0), start, "DOP853", events=level, rtol=1e-11, atol=1e-13)
+        ends.append(found.y_events[0][0, 1])
+    return ends[0] - ends[1]
+
+
+def test_explore__morris_lecar():
+    """The stable cycle ends at the saddle where the saddle's manifolds meet."""
+    ds = followed(MORRIS_LECAR, "v", [0.0365, 0.1], "y", 0.06, 0.09, level=0.0365, y=0.075)
+    (row,) = [row for row in table_of(ds) if row["type"] == "homoclinic"]
+    known = brentq(split, 0.0725, 0.0735, xtol=1e-11)
+    assert row["y"] == pytest.approx(known, abs=1e-9)
+    assert row["bracket"] < 1e-9
+    assert row["saddle_quantity"] < 0.0
+
+
+def lorenz_loop(low, high):
+    """Bracket rho at which the origin's unstable manifold comes back to it: beyond, its first turn crosses x = 0."""
+
+    def crossing(_, state):
+        return state[0]
+
+    crossing.terminal = True
+    for _ in range(30):
+        rho = 0.5 * (low + high)
+        own = 0.5 * (-11.0 + np.sqrt(121.0 + 40.0 * (rho - 1.0)))
+        start = 1e-7 * np.array([1.0, 1.0 + own / 10.0, 0.0])
+
+        def rates(_, u, rho=rho):
+            return [10.0 * (u[1] - u[0]), u[0] * (rho - u[2]) - u[1], u[0] * u[1] - 8.0 / 3.0 * u[2]]
+
+        found = solve_ivp(rates, (0.0, 15.0), start, "DOP853", events=crossing, rtol=1e-11, atol=1e-13)
+        low, high = (low, rho) if len(found.t_events[0]) else (rho, high)
+    return 0.5 * (low + high)
+
+
+def test_explore__unstable_cycle_of_lorenz():
+    """The cycles end at the origin, at rho = 13.926 (Sparrow 1982). They are unstable, so that the period grows as
+    -ln(d) over the smaller eigenvalue, 8/3, which is the stable one.
+    """
+    ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 13.0, 16.5, level=10.0, rho=15.9959022)
+    (row,) = [row for row in table_of(ds) if row["type"] == "homoclinic"]
+    known = lorenz_loop(13.5, 14.5)
+    assert known == pytest.approx(13.926, abs=1e-3)
+    assert abs(row["rho"] - known) < row["bracket"] < 2e-4
+    assert row["saddle_quantity"] == pytest.approx(
+        0.5 * (-11.0 + np.sqrt(121.0 + 40.0 * (known - 1.0))) - 8.0 / 3.0, abs=1e-3
+    )
+    assert (row["unstable_above"], row["unstable_below"]) == ("1", "none")
+    assert np.nanmax(ds["limit_slope_expected"].values) == pytest.approx(3.0 / 8.0)
+    assert any("saddle quantity 4.4" in line and "an unstable cycle" in line for line in branches_table(ds).lines)
+
+
+CIRCLE = table(
+    "circle",
+    {"x": "x*(1 - s) - y*rate", "y": "y*(1 - s) + x*rate"},
+    {"omega": 1.3},
+    define={"s": "x**2 + y**2", "rate": "omega - y/sqrt(s)"},
+)
+"""The angle on the circle has the rate omega - sin: the period is 2 pi/sqrt(omega**2 - 1)."""
+
+
+def test_explore__saddle_node_on_a_circle():
+    ds = followed(CIRCLE, "y", [1.0, 0.0], "omega", 0.5, 1.5, omega=1.3)
+    (row,) = table_of(ds)
+    assert (row["label"], row["type"]) == ("SNIC", "snic")
+    assert row["omega"] == pytest.approx(1.0, abs=1e-10)
+    (end,) = np.flatnonzero(ds["limit_value"].notnull().values[0])
+    np.testing.assert_allclose(ds["limit_state"].values[0, end], [0.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(ds["limit_eigenvalue_real"].values[0, end], [0.0, -2.0], atol=1e-6)
+    assert ds["limit_slope_expected"].values[0, end] == pytest.approx(np.sqrt(2.0) * np.pi, rel=1e-6)
+    assert ds["limit_slope"].values[0, end] == pytest.approx(np.sqrt(2.0) * np.pi, rel=0.01)
+    assert any("saddle node on an invariant circle, at x 0, y 1" in line for line in branches_table(ds).lines)
+
+
+def test_explore__period_without_bound_by_another_law():
+    """The period 2 pi/omega grows without bound, but at omega = 0 the cycle is a circle of equilibria."""
+    ds = followed(HOPF, "y", [0.5, 0.0], "omega", -1.0, 2.0, longest=2000.0, omega=1.0)
+    assert not table_of(ds)
     (line,) = str(ds.attrs["stuck"]).splitlines()
     assert "the period grows faster and faster" in line
-    own = np.linalg.eigvals([[-1.0, 2.0], [2.0, -1.0]])
-    assert f"a saddle at x 0, y 0 with eigenvalues {own.max():.5g}, {own.min():.5g} [1/s]" in line
-    assert line.endswith("this suggests a homoclinic bifurcation")
-    assert f"  {line}" in branches_table(ds).lines
+    assert "not decided: " in line
 
 
 @pytest.mark.parametrize("ratio", [0.3, 0.6, 0.8])
@@ -113,6 +246,29 @@ def test_grows_without_bound__by_the_law_of_the_period(period, grows, ratio):
     unknowns = np.stack([1.0 + 0.3 * away, away], axis=1)
     assert grows_without_bound(unknowns, period(away)) == grows
     assert not grows_without_bound(unknowns[:2], period(away)[:2])
+
+
+@pytest.mark.parametrize(
+    ("period", "follows_logarithm", "follows_root"),
+    [
+        (lambda d: 5.0 - 2.0 * np.log(d), True, False),
+        (lambda d: 5.0 + 2.0 / np.sqrt(d), False, True),
+        (lambda d: 5.0 + 2.0 / d, False, False),
+    ],
+)
+def test_fit_law__tells_the_laws_apart(period, follows_logarithm, follows_root):
+    away = 0.1 * 0.6 ** np.arange(25)
+    seconds = period(away)
+    for law, follows, reach in (
+        (logarithm, follows_logarithm, seconds[-1] - 2.0 * np.array([3.0, 4.5])),
+        (root, follows_root, seconds[-1] * np.exp([-1.5, -2.25])),
+    ):
+        value, error, slope, _, rest = fit_law(law, 0.7 + away, seconds, reach)
+        assert (rest < FITS) == follows
+        if follows:
+            assert value == pytest.approx(0.7, abs=1e-9)
+            assert error < 1e-9
+            assert slope == pytest.approx(2.0, rel=1e-6)
 
 
 def shot(c, guess):

@@ -21,6 +21,9 @@ SOFT = magpend.model("x'' = mu*x' - x**2*x' - x", name="soft", mu=0.1)
 HARD = magpend.model(
     "x' = mu*x - y + x*R - x*R**2\ny' = x + mu*y + y*R - y*R**2\nR = x**2 + y**2", name="hard", mu=-0.1
 )
+CIRCLE = magpend.model(
+    "x' = x*(1 - R) - y*(mu + x)\ny' = y*(1 - R) + x*(mu + x)\nR = x**2 + y**2", name="circle", mu=1.1
+)
 DUFFING = magpend.model("x'' = F*cos(omega*t) - c*x' - x - x**3", name="duffing", F=0.1, c=0.1)
 
 SUPER, SUB = "supercritical", "subcritical"
@@ -45,6 +48,8 @@ KNOWN = {
     "soft": [("A", 0, "rises", "hopf", SUPER, 0.0), ("B", 1, "falls", "hopf", SUPER, 0.0)],
     # cycles of the radius R with mu + R - R**2 = 0
     "hard": [("A", 0, "rises", "hopf", SUB, 0.0), ("B", 1, "falls", "fold", "unknown", -0.25)],
+    # on the circle theta' = mu + cos theta
+    "circle": [("A", 0, "rises", "fold", "unknown", 1.0), ("B", 1, "falls", "snic", "unknown", 1.0)],
     # sigma (sigma + b + 3)/(sigma - b - 1)
     "lorenz": [("A", 0, "rises", "hopf", SUB, 10.0 * (10.0 + 8.0 / 3.0 + 3.0) / (10.0 - 8.0 / 3.0 - 1.0))],
 }
@@ -78,6 +83,10 @@ RUNS = {
         HARD, d, {"x": (-1.5, 1.5), "y": (-1.5, 1.5)}, section={"of": "y", "value": 0.0, "direction": "up"},
         mu=np.linspace(-0.41, 0.19, 7),
     ),
+    "circle": lambda d: sweep(
+        CIRCLE, d, {"x": (-1.5, 1.5), "y": (-1.5, 1.5)}, section={"of": "y", "value": 0.0, "direction": "up"},
+        mu=[0.7, 0.9, 1.1, 1.3],
+    ),
     "lorenz": lambda d: sweep(
         magpend.load_model("lorenz"), d, {"x": (7, 9), "y": (7, 9), "z": (20, 26)}, {"n_transient": 200, "n_keep": 60},
         section={"of": "x", "value": 7.5, "direction": "up"}, rho=[20.0, 22.0, 24.0, 26.0],
@@ -95,6 +104,8 @@ def told(table):
 
 
 @pytest.mark.slow
+# matching tries orbits that do not return
+@pytest.mark.filterwarnings("ignore:invalid value encountered in det:RuntimeWarning")
 @pytest.mark.parametrize("name", RUNS)
 def test_events__closed_forms(name, tmp_path):
     table = RUNS[name](tmp_path).table("events")

@@ -1,0 +1,358 @@
+"""Name the ends of branches of limit cycles whose period grows without bound, and fit the law of the period.
+
+A cycle whose period grows without bound comes to rest at an equilibrium. With d the distance of the parameter from its
+limit (Kuznetsov 2004, sections 6.2 and 7.1):
+
+``homoclinic``: the equilibrium is a saddle. The period is a - ln(d)/rate, where the rate is the smaller one of the
+saddle's leading eigenvalues, without signs: the unstable one if the saddle quantity, their sum, is negative. Then
+stable cycles end there. If the sum is positive, the cycles are unstable.
+
+``snic``: a saddle node on an invariant circle. The period is a + pi/sqrt(a2 b d), where x' = a2 d + b x**2 is the
+normal form of the fold of the equilibria.
+
+The law's slope is fitted to the last points, and computed from the equilibrium. An end is named if both agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from magpend_core.equilibria import find_equilibria
+from magpend_core.orbits import crossed_state, scaled_distance
+from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.sampling import Drive, sample
+from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.following import Branch, Limit, leading_of, opposite
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.tolerances import BRANCH_RTOL
+
+STEEPER = 6.0
+"""Natural logarithm of the factor by which the period's slope along the branch rises, if the period grows."""
+
+KEEPS_GROWING = 0.6
+"""Least growth of the period over the second half of this rise, in units of that over the first half.
+
+Towards a homoclinic orbit both are equal, since the period grows by the same time whenever the distance in the
+parameter halves. Towards an end with a finite period, as at a square root, the second is many times less.
+"""
+
+NEAR = 0.05
+"""Largest distance of an equilibrium that is near to an orbit, in units of the orbit's size."""
+
+SAMPLES, GUESSES = 4000, 8
+"""Points on an orbit, and most of its slow places from which equilibria are looked for."""
+
+AGREES = 0.05
+"""Largest relative difference between the fitted and the computed slope of the period's law."""
+
+FITS = 0.003
+"""Largest deviation of a period from its law, in units of the range of the fitted periods."""
+
+WINDOWS = ((3.0, 8), (4.5, 12))
+"""Natural logarithms of the ranges of distances that are fitted, each with the least number of points. The first gives
+the numbers; the change from one to the other is part of their errors."""
+
+LEAST_RANGE = 2.5
+"""Least natural logarithm of the first range of distances, if it is to confirm a law."""
+
+TOO_FAR = "the last points are too few, or too far from a limit, to confirm a law of the period"
+
+
+def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
+    """Return whether the period grows towards the end of a branch as it does towards infinity.
+
+    The slope of the period along the branch must rise towards the end, by the factor exp(`STEEPER`) at least, and
+    the growth that this takes must not fade (`KEEPS_GROWING`).
+
+    Parameters
+    ----------
+    unknowns
+        Section points and parameter values, scaled, shape (point, unknown), in order to the end.
+    seconds
+        Period at the points, shape (point,) [s].
+    """
+    growth, middle = np.diff(seconds), 0.5 * (seconds[1:] + seconds[:-1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steepness = np.log(growth / np.linalg.norm(np.diff(unknowns, axis=0), axis=1))
+    rises = np.isfinite(steepness) & (growth > 0.0)
+    rises[:-1] &= steepness[1:] > steepness[:-1]
+    first = len(rises) - int(np.argmin(np.append(rises[::-1], False)))
+    steepness, middle = steepness[first:], middle[first:]
+    far = np.flatnonzero(steepness[-1:] - steepness >= STEEPER)
+    if len(steepness) < 3 or not len(far):
+        return False
+    begin = min(int(far[-1]), len(steepness) - 3)
+    ends = np.array([steepness[begin], 0.5 * (steepness[begin] + steepness[-1]), steepness[-1]])
+    first_half, second_half = np.diff(np.interp(ends, steepness, middle))
+    return bool(second_half >= KEEPS_GROWING * first_half)
+
+
+def towards(branch: Branch, end: int) -> list[Point]:
+    """Return the points of a branch in order to its first (0) or last (1) end."""
+    return list(branch.points) if end else [opposite(p) for p in reversed(branch.points)]
+
+
+def settle_limits(branches: Sequence[Branch]) -> None:
+    """Name the ends of branches, stuck or with too many points, at which the period grows without bound by a law."""
+    for branch in branches:
+        for end in (0, 1):
+            if branch.ends[end] in ("stuck", "max_points") and has_cycles(branch):
+                found = limit_of(branch, towards(branch, end))
+                if isinstance(found, Limit):
+                    one, other = found, branch.limits[1 - end]
+                    branch.limits = (other, one) if end else (one, other)
+                    branch.ends = (branch.ends[0], one.kind) if end else (one.kind, branch.ends[1])
+
+
+def has_cycles(branch: Branch) -> bool:
+    """Return whether the orbits of a branch are limit cycles of a flow."""
+    return bool(branch.family.period) and crossed_state(branch.family.system) is not None
+
+
+def limit_of(branch: Branch, points: Sequence[Point]) -> Limit | str:
+    """Find the equilibrium at which the cycles of a branch come to rest, and fit the law of their period.
+
+    `points` are in order to the end. Returns the reason if neither law is confirmed.
+    """
+    family = branch.family
+    if len(points) < WINDOWS[-1][1]:
+        return TOO_FAR
+    states = last_orbit(family, points[-1])
+    places, eigenvalues = saddles_near(family, points[-1], states)
+    reason = "no equilibrium found at which the orbit comes to rest"
+    if len(places) == 1:
+        found = _homoclinic(family, points, places[0], eigenvalues[0])
+        if isinstance(found, Limit):
+            return found
+        reason = found
+    elif len(places) > 1:
+        reason = f"{len(places)} saddles are near"
+    fold = _snic(family, points, states)
+    return fold if fold is not None and (isinstance(fold, Limit) or not len(places)) else reason
+
+
+def last_orbit(family: Family, end: Point) -> np.ndarray:
+    """Return states at equal intervals of time on the last orbit of a branch of a flow, shape (instant, state)."""
+    rows, seconds = family.rows(end.u[None]), end.value.seconds
+    times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
+    packed = rows.parameters[:1]
+    orbit = sample(family.system, packed, rows.states, [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
+    return np.asarray(orbit.states[0][np.isfinite(orbit.states[0]).all(axis=1)])
+
+
+def saddles_near(family: Family, end: Point, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the saddles near an orbit, shape (saddle, state), and their eigenvalues by falling real part [1/s]."""
+    system = family.system
+    none = np.empty((0, system.n_states))
+    if not len(states):
+        return none, none
+    packed, size = family.rows(end.u[None]).parameters[0], _size(family, states)
+    found = find_equilibria(system, states[_slow(family, packed, states)], packed)
+    places, eigenvalues = none, none
+    for place, own in zip(found.states[found.converged], found.eigenvalues[found.converged], strict=True):
+        is_near = scaled_distance(states, place, system).min() <= NEAR * size
+        is_known = bool((scaled_distance(places, place, system) < NEAR * size).any())
+        if is_near and not is_known and own.real.min() < 0.0 < own.real.max():
+            places, eigenvalues = np.vstack([places, place]), np.vstack([eigenvalues, own])
+    return places, eigenvalues
+
+
+def _size(family: Family, states: np.ndarray) -> float:
+    return float((np.ptp(states, axis=0) / np.asarray(family.system.scales)).max())
+
+
+def _slow(family: Family, packed: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Return the indices of the slow places of an orbit, the slowest first."""
+    speed = np.linalg.norm(rates_at(family.system, states, packed) / np.asarray(family.system.scales), axis=1)
+    slow = np.flatnonzero((speed <= np.roll(speed, 1)) & (speed <= np.roll(speed, -1)))
+    return np.asarray(slow[np.argsort(speed[slow])][:GUESSES])
+
+
+# ---- the laws ----------------------------------------------------------------------------------
+
+Law = Callable[[np.ndarray], np.ndarray]
+"""Terms of a law of the period: the term whose coefficient is the slope, and others, from distances d > 0."""
+
+
+def logarithm(d: np.ndarray) -> np.ndarray:
+    """Return the terms of the law at a homoclinic orbit."""
+    return np.stack([-np.log(d), np.ones_like(d)])
+
+
+def root(d: np.ndarray) -> np.ndarray:
+    """Return the terms of the law at a saddle node on a circle, with the next order of 1/sqrt(d)."""
+    return np.stack([1.0 / np.sqrt(d), np.ones_like(d), np.sqrt(d)])
+
+
+def fit_law(
+    law: Law, values: np.ndarray, seconds: np.ndarray, floors: Sequence[float]
+) -> tuple[float, float, float, float, float] | None:
+    """Fit a law of the period to the last points of a branch.
+
+    Parameters
+    ----------
+    law
+        Terms of the law.
+    values
+        Parameter values, in order to the end, shape (point,).
+    seconds
+        Periods, shape (point,) [s].
+    floors
+        Least periods of the points that are fitted, one for each of `WINDOWS` [s].
+
+    Returns
+    -------
+    tuple or None
+        The limit of the parameter, its error, the slope, its error, and the largest deviation in units of the range of
+        the periods; None if there are too few points, or their distances from the limit range over less than
+        `LEAST_RANGE`.
+    """
+    way = np.sign(values[-1] - values[-2])
+    turns = np.flatnonzero(np.diff(values) * way <= 0.0)
+    first = int(turns[-1]) + 1 if len(turns) else 0
+    if len(values) - first < WINDOWS[-1][1]:
+        return None
+    fits = []
+    for floor, (_, least) in zip(floors, WINDOWS, strict=True):
+        chosen = seconds >= floor
+        chosen[-least:] = True
+        chosen[:first] = False
+        away = np.abs(values - values[-1])[chosen]
+        fits.append(_fit(law, away, seconds[chosen]))
+        if np.log1p(away.max() / fits[0][0]) < LEAST_RANGE:
+            return None
+    (gap, gap_error, slope, slope_error, rest), (other_gap, _, other_slope, _, _) = fits
+    error = float(np.hypot(gap_error, gap - other_gap))
+    return float(values[-1] + way * gap), error, slope, float(np.hypot(slope_error, slope - other_slope)), rest
+
+
+def _fit(law: Law, away: np.ndarray, seconds: np.ndarray) -> tuple[float, float, float, float, float]:
+    """Fit a law to the distances from the last point. Return the last point's distance from the limit, its error, the
+    slope, its error, and the largest relative deviation.
+    """
+
+    def started(log_gap: float) -> np.ndarray:
+        return np.append(log_gap, np.linalg.lstsq(law(away + np.exp(log_gap)).T, seconds, rcond=None)[0])
+
+    def rest(x: np.ndarray) -> np.ndarray:
+        return np.asarray(x[1:] @ law(away + np.exp(x[0])) - seconds)
+
+    low, high = np.log(away[-2]) - 8.0, np.log(away.max()) + 4.0
+    best = min(map(started, np.linspace(low, high, 60)[1:-1]), key=lambda x: float(np.abs(rest(x)).max()))
+    free = np.full(len(best) - 1, np.inf)
+    bounds = (np.append(low, -free), np.append(high, free))
+    found = least_squares(rest, best, bounds=bounds, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    variance = np.linalg.pinv(found.jac.T @ found.jac) * float(found.fun @ found.fun) / (len(away) - len(best))
+    errors, gap = np.sqrt(np.diag(variance)), float(np.exp(found.x[0]))
+    deviation = float(np.abs(found.fun).max() / np.ptp(seconds))
+    return gap, gap * float(errors[0]), float(found.x[1]), float(errors[1]), deviation
+
+
+def _laid(branch_points: Sequence[Point], family: Family) -> tuple[np.ndarray, np.ndarray]:
+    values = np.array([family.values(p.u)[0] for p in branch_points])
+    return values, np.array([p.value.seconds for p in branch_points])
+
+
+def _packed(family: Family, value: float) -> np.ndarray:
+    """Return the packed parameters at a value of the free one."""
+    unknowns = family.unknowns(np.zeros(family.system.n_states), [value])
+    return np.asarray(family.rows(unknowns[None]).parameters[0])
+
+
+def _homoclinic(family: Family, points: Sequence[Point], saddle: np.ndarray, eigenvalues: np.ndarray) -> Limit | str:
+    """Fit the law of the period near a saddle, given at the last point; return the reason if it fails."""
+    values, seconds = _laid(points, family)
+    rate = min(abs(v.real) for v in leading_of(eigenvalues))
+    fitted = fit_law(logarithm, values, seconds, [seconds[-1] - reach / rate for reach, _ in WINDOWS])
+    if fitted is None:
+        return TOO_FAR
+    value, error, slope, slope_error, rest = fitted
+    at = find_equilibria(family.system, saddle[None], _packed(family, value))
+    own = at.eigenvalues[0]
+    if not (at.converged[0] and own.real.min() < 0.0 < own.real.max()):
+        return "the saddle does not go on to the end that the law of the period gives"
+    slowest = min(leading_of(own), key=lambda v: abs(v.real))
+    if slowest.imag:
+        return "the period oscillates about its law near a saddle focus whose leading eigenvalues are complex"
+    limit = Limit("homoclinic", value, error, at.states[0], own, slope, slope_error, 1.0 / abs(slowest.real))
+    return limit if (why := _contradiction(limit, rest)) == "" else why
+
+
+def _contradiction(limit: Limit, rest: float) -> str:
+    """Return why a fitted law is not confirmed by the computed slope; an empty text if it is."""
+    law = "-ln|p - p_h|" if limit.kind == "homoclinic" else "1/sqrt|p - p_h|"
+    if rest > FITS:
+        return f"the period does not follow {law}: it deviates by {rest:.1%} of its range"
+    if not abs(limit.slope / limit.expected - 1.0) <= AGREES:
+        return f"the period's slope over {law} is {limit.slope:.4g}; from the equilibrium follows {limit.expected:.4g}"
+    return ""
+
+
+def _snic(family: Family, points: Sequence[Point], states: np.ndarray) -> Limit | str | None:
+    """Fit the law of the period near a saddle node on a circle. Return the reason if it fails, None without a fold."""
+    values, seconds = _laid(points, family)
+    with np.errstate(all="ignore"):
+        fold = _fold(family, values[-1], states) if len(states) else None
+    if fold is None:
+        return None
+    state, value, error, expected = fold
+    size = _size(family, states)
+    if scaled_distance(states, state, family.system).min() > NEAR * size:
+        return None
+    fitted = fit_law(root, values, seconds, [seconds[-1] * np.exp(-0.5 * reach) for reach, _ in WINDOWS])
+    if fitted is None:
+        return TOO_FAR
+    by_law, law_error, slope, slope_error, rest = fitted
+    eigenvalues = np.linalg.eigvals(jacobian_at(family.system, state[None], _packed(family, value))[0])
+    eigenvalues = eigenvalues[np.lexsort((eigenvalues.imag, -eigenvalues.real))]
+    limit = Limit("snic", value, error, state, eigenvalues, slope, slope_error, expected)
+    if why := _contradiction(limit, rest):
+        return why
+    if abs(by_law - value) > max(3.0 * law_error, AGREES * abs(values[-1] - value)):
+        return f"the law of the period ends at {by_law:.7g}, and the fold of the equilibria is at {value:.7g}"
+    return limit
+
+
+def _fold(family: Family, value: float, states: np.ndarray) -> tuple[np.ndarray, float, float, float] | None:
+    """Find the fold of equilibria near the slowest state of an orbit by Newton's method.
+
+    Returns the state, the parameter value, its error (the last step), and the slope of the period over 1/sqrt(d) [s
+    times the root of the parameter's unit], pi over the root of the normal form's coefficients; None without a fold.
+    """
+    system, n = family.system, family.system.n_states
+    scales, unit = np.asarray(system.scales), family.scales[0]
+
+    def rates(z: np.ndarray) -> np.ndarray:
+        return np.asarray(rates_at(system, z[None, :n] * scales, _packed(family, z[-1] * unit))[0] / scales)
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        return family.scaled(jacobian_at(system, z[None, :n] * scales, _packed(family, z[-1] * unit))[0])
+
+    def equations(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([rates(z), jacobian(z) @ z[n : 2 * n], [start @ z[n : 2 * n] - 1.0]])
+
+    slowest = states[_slow(family, _packed(family, value), states)[0]] / scales
+    start = np.linalg.svd(jacobian(np.append(slowest, value / unit)))[2][-1]
+    z, steps = np.concatenate([slowest, start, [value / unit]]), 1e-6 * np.eye(2 * n + 1)
+    for _ in range(20):
+        slopes = np.array([equations(z + h) - equations(z - h) for h in steps]).T / 2e-6
+        if not np.isfinite(slopes).all() or np.linalg.cond(slopes) > 1e12:
+            return None
+        step = np.linalg.solve(slopes, -equations(z))
+        z = z + step * min(1.0, 0.5 / np.abs(step).max(initial=1e-300))
+        if np.abs(step).max() < 1e-10:
+            break
+    else:
+        return None
+    left, _, right = np.linalg.svd(jacobian(z))
+    w, v = left[:, -1] / (left[:, -1] @ right[-1]), right[-1]
+    along, by = np.zeros((2, 2 * n + 1))
+    along[:n], by[-1] = 1e-4 * v, 1e-6
+    curvature = w @ (jacobian(z + along) - jacobian(z - along)) @ v / 4e-4
+    drift = w @ (rates(z + by) - rates(z - by)) / (2e-6 * unit)
+    product = abs(float(curvature * drift))
+    expected = np.pi / np.sqrt(product) if product > 0.0 else np.inf
+    return z[:n] * scales, float(z[-1] * unit), max(abs(float(step[-1])), 1e-14) * unit, float(expected)
