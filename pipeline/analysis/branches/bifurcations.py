@@ -219,7 +219,13 @@ def find_root(
         away = 0.4 * least if abs(root - last) < 0.3 * least else 0.0
         last, at = root, root - away if root - low[0] > least else root + away
         at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
-        middle = yield from correct(problem, _between(first, last_point, at), chord / length, settings, first.tangent)
+        inward = least if at - low[0] < high[0] - at else -least
+        for shift in (0.0, 1e-3 * inward, 0.3 * inward):  # at a branch point itself no tangent is unique
+            guess = _between(first, last_point, at + shift)
+            middle = yield from correct(problem, guess, chord / length, settings, first.tangent)
+            if middle is not None:
+                at += shift
+                break
         if middle is None:
             return None
         value = yield from test(middle)

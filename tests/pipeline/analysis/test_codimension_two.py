@@ -10,7 +10,7 @@ from pipeline.analysis.branches import codimension_two
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.curves import continue_curves, curves_dataset
 from pipeline.analysis.branches.exploring import Scope, explore
-from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from tests.core.flows import table
@@ -206,4 +206,4 @@ def test_two_bifurcations_at_once(kind, free, bifurcations):
 
 
 def test_labels__each_kind_has_one():
-    assert set(LABELS) == {*KINDS, *codimension_two.POINT_KINDS}
+    assert set(LABELS) == {*KINDS, *LIMITS, *codimension_two.POINT_KINDS}

@@ -79,6 +79,15 @@ def test_equilibria__lorenz():
 
 
 @pytest.mark.slow
+def test_equilibria__pitchfork_that_the_first_guess_hits_exactly():
+    """x' = (p - 1/2) x - x^3: at x = 0 the test function is p - 1/2, and no tangent is unique where it vanishes."""
+    model = model_of({"x": "(p - 0.5)*x - x^3"}, {"p": 0.0})
+    (branch, *_), _ = branches_of(model, "p", (0.0, 1.0), [0.0], 0.25, step=0.05)
+    _, value = only(branch, "pitchfork")
+    assert value == pytest.approx(0.5, abs=1e-9)
+
+
+@pytest.mark.slow
 def test_equilibria__pitchfork_of_lorenz():
     """At rho = 1 the branches of both wings cross that of rest, whose stability changes."""
     found, _ = branches_of(load_model("lorenz"), "rho", (0.5, 3.0), [0.0, 0.0, 0.0], 0.7, step=0.02)
