@@ -29,6 +29,9 @@ SAME_PLACE = 1e-4
 """Largest scaled distance between two locations of one branch point: there Newton's method is as exact as the root of
 its residual."""
 
+BESIDE = (0.0, 1e-3, 0.3)
+"""Shifts, in units of `WIDTH`, of a guess that may be a branch point itself, where no tangent is unique."""
+
 Test = Callable[[Point], float]
 
 
@@ -155,6 +158,8 @@ class Watch:
             one = yield from locate(self.problem, a, b, kind, self.settings)
             if one is None and long:
                 return False
+            if one is None:
+                one = yield from locate(self.problem, a, b, kind, self.settings, BESIDE)
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
@@ -175,9 +180,11 @@ def _explains(kinds: list[str], change: int) -> bool:
     return change in reachable
 
 
-def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
+def locate(
+    problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings, shifts: Sequence[float] = (0.0,)
+) -> Steps[Bifurcation | None]:
     """Locate the bifurcation between two points of a branch where its test function vanishes; None if Newton's method
-    fails.
+    fails, also at the `shifts` of its guesses.
     """
     test = TESTS[kind]
 
@@ -185,7 +192,7 @@ def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Setti
         return test(point)
         yield  # type: ignore[unreachable]  # a computation that asks for nothing
 
-    found = yield from find_root(problem, (a, test(a)), (b, test(b)), tested, settings)
+    found = yield from find_root(problem, (a, test(a)), (b, test(b)), tested, settings, shifts)
     if found is None:
         return None
     (low, at_low), (high, at_high) = found
@@ -200,7 +207,12 @@ Tested = tuple[Point, float]
 
 
 def find_root(
-    problem: Problem, a: Tested, b: Tested, test: Callable[[Point], Steps[float]], settings: Settings
+    problem: Problem,
+    a: Tested,
+    b: Tested,
+    test: Callable[[Point], Steps[float]],
+    settings: Settings,
+    shifts: Sequence[float] = (0.0,),
 ) -> Steps[tuple[Tested, Tested] | None]:
     """Bracket a zero of a test function between two points of a curve within `WIDTH`; None if Newton's method fails."""
     (first, at_first), (last_point, at_last) = a, b
@@ -220,11 +232,11 @@ def find_root(
         last, at = root, root - away if root - low[0] > least else root + away
         at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
         inward = least if at - low[0] < high[0] - at else -least
-        for shift in (0.0, 1e-3 * inward, 0.3 * inward):  # at a branch point itself no tangent is unique
-            guess = _between(first, last_point, at + shift)
+        for shift in shifts:
+            guess = _between(first, last_point, at + shift * inward)
             middle = yield from correct(problem, guess, chord / length, settings, first.tangent)
             if middle is not None:
-                at += shift
+                at += shift * inward
                 break
         if middle is None:
             return None
