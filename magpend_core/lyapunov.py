@@ -62,7 +62,7 @@ class LyapunovExponents:
         Mean growth rate in each block of drive periods [1/s].
     divergence : ndarray, (cell,)
         Time average of the trace of the Jacobian over the same periods [1/s], to which the exponents
-        of a full spectrum add up; of a map the mean of log |det J|, NaN for one with more than three states.
+        of a full spectrum add up; of a map the mean of log ``|det J|``, NaN for one with more than three states.
     loss : ndarray, (cell,)
         Largest factor by which an orthonormalisation shortened a vector. Beyond `MOST_LOSS` the later
         exponents are not resolved.
