@@ -108,6 +108,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     tables = {name: None if name in wrong else _table(data, name, table, problems) for name, table in TABLES.items()}
     axes, drift = _axes(data, word, problems), moving.drift_tables(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
+    data = {**data, "parameters": _with_frequency(data.get("parameters", {}))}
     if model is None:  # the remaining checks need the model's states and parameters
         model = stand_in(data.get("model"), folder, forced="section" not in data)
     if model is None:
@@ -257,6 +258,17 @@ def _in_hertz(data: Mapping[str, Any], own: tuple[str, ...], problems: list[str]
     return {**data, "axes": found}, word
 
 
+def _with_frequency(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table ``[parameters]`` with the drive's rate, whatever its word, as ``frequency_hz``."""
+    words = [word for word in RATES if word in parameters]
+    found = {key: value for key, value in parameters.items() if key not in words}
+    for word in words:
+        value = parameters[word]
+        is_rate = isinstance(value, float | int) and not isinstance(value, bool) and value > 0
+        found[FREQUENCY] = RATES[word].hertz(value) if is_rate else value
+    return found
+
+
 def _axes(data: Mapping[str, Any], word: str, problems: list[str]) -> dict[str, Range]:
     axes = {
         name: checked(RANGES[word] if name == FREQUENCY else Range, value, f"axes.{name}", problems)
@@ -329,9 +341,9 @@ def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
     """Return the problems of tables and keys that a map, which has no time and no steps, cannot have."""
     what = f"{model.name} is a map"
     problems = [f"{name}: {what}, {why}; drop the table." for name, why in _NOT_OF_MAPS.items() if name in data]
-    rates = [f"parameters.{word}" for word in RATES if word in data.get("parameters", {})]
-    rates += [f"axes.{FREQUENCY}"] if FREQUENCY in data.get("axes", {}) else []
-    problems += [f"{key}: {what}, which has no drive; drop the key." for key in rates]
+    for table in ("parameters", "axes"):
+        if FREQUENCY in data.get(table, {}):
+            problems.append(f"{table}.{FREQUENCY}: {what}, which has no drive; drop the key.")
     given = data.get("integration", {})
     # a stored specification has all keys, with their defaults
     fields = Integration.model_fields

@@ -119,6 +119,21 @@ def test_specification__says_what_is_wrong_with_a_rate(change, words):
     assert words in str(caught.value)
 
 
+FLOW = {"name": "free", "states": {"x": "1", "y": "1"}, "equations": {"x": "y", "y": "-x"}}
+SECTION = {"of": "x", "value": 0.0, "direction": "up"}
+
+
+@pytest.mark.parametrize("word", ["omega", "period"])
+def test_specification__of_a_system_without_a_drive(word):
+    """A rate beside a section by crossing is refused like a frequency; without one it is that of even times."""
+    tables = {"kind": "sweep", "model": FLOW, "initial_conditions": {"kind": "list", "points": [[1.0, 0.0]]}}
+    for rate in ({"parameters": {word: 2.0}}, {"axes": {word: {"values": [1.0, 2.0]}}}):
+        with pytest.raises(magpend.SpecError, match=rf"{next(iter(rate))}\.{word}: a section by crossing needs no"):
+            magpend.Spec.parse({**tables, **rate, "section": SECTION})
+    even = magpend.Spec.parse({**tables, "parameters": {word: 2.0}})
+    assert even.frequency_hz == (1.0 / pi if word == "omega" else 0.5)
+
+
 def test_omega__of_a_text_is_the_drives():
     """The name omega in a text that uses time is 2 pi f: scipy's trajectory at this angular frequency."""
     ds = simulate(None, [1.0, 0.5], model=magpend.model(SPRING), overrides={"omega": 1.3}, n_periods=4, rtol=1e-11)
