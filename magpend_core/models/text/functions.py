@@ -52,7 +52,7 @@ SAME = 1e-8
 
 @dataclass(frozen=True)
 class Drive:
-    """What a parameter of a function says of its drive: the text of the parameter, and the period that it gives [s]."""
+    """How a parameter gives the rate of the drive: its text, and the function from its value to the period [s]."""
 
     text: str
     meaning: str
@@ -169,7 +169,7 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Way:
-    """What a function does on one path: its rates, the decisions that lead there, and its variables at the end."""
+    """One path through a function: the rates that it returns, the decisions on the way, and its variables at the end."""
 
     rates: list[Traced]
     decisions: list[tuple[Traced, bool]]

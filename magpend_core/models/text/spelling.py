@@ -107,7 +107,7 @@ def _names(
 
 
 def _labels(variables: Mapping[str, Any]) -> dict[str, tuple[Traced, bool]]:
-    """Return the traced numbers among variables by name, and whether each is a variable of its own.
+    """Return the traced numbers among variables by name, and whether each is a variable or an element of one.
 
     The elements of a vector ``F`` are ``F1``, ``F2``, ..., those of a matrix ``M`` are ``M1_1``, ``M1_2``, ...
     """

@@ -388,7 +388,7 @@ _EVIDENCE_OF_TORI = ("first_hz", "second_hz", "explained")
 
 
 def spectrum_table(ds: xr.Dataset) -> Table:
-    """Return the table of spectra, also of those that `magpend.spectrum_of` returns.
+    """Return the table of spectra, of a run or from `magpend.spectrum_of`.
 
     Rows are bins: swept parameters (``at_NAME``, and the drive's rate), ``attractor_id``, ``kind``, ``stability``,
     ``estimate``, ``frequency_hz``, ``order`` (with a drive), ``amplitude``, ``power``, and the evidence of the whole

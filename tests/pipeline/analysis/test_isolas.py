@@ -16,6 +16,7 @@ from pipeline.analysis.branches.kinds import KINDS, PITCHFORK
 from pipeline.analysis.branches.searching import VERDICTS, places_of
 from pipeline.analysis.response.analysis import response_table
 from pipeline.layout.vocabulary import parameters_of
+from tests.pipeline.analysis.test_response import cycles_run
 
 OMEGA = 2.0 * np.pi
 EPS, XI, LAM, K = 0.05, 0.4, 0.2, 4.0 / 3.0
@@ -227,17 +228,7 @@ def test_index_sums__per_row_of_a_run(tmp_path):
 @pytest.mark.slow
 def test_flow__cycles_but_no_equilibria(tmp_path):
     """r' = r (mu + r^2 - r^4): two cycles from mu = -1/4 to 0, one beyond; the equilibrium lies on the section too."""
-    model = magpend.model(
-        "x' = x*g - 2*y\ny' = y*g + 2*x\ng = mu + x**2 + y**2 - (x**2 + y**2)**2", name="cycles", mu=0.1
-    )
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_axis("mu", -0.3, 0.2, 6)
-        .with_start_list(points=[(1.0, 0.0)])
-        .with_section(of="y", value=0.0, direction="up")
-        .with_integration(n_transient=200, n_keep=4)
-    )
-    ds = magpend.run(spec, tmp_path / "run", workers=0).branches(isolas=3)
+    ds = cycles_run(tmp_path).branches(isolas=3)
     assert ds["n_orbits"].values[:, 0].tolist() == [2, 2, 1]
     assert {VERDICTS[code] for code in ds["index_verdict"].values.ravel()} == {"flow"}
     assert sorted(ds["orbit_period"].values.tolist()) == [0, 1]

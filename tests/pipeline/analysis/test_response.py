@@ -225,9 +225,8 @@ def test_flow__has_the_harmonics_of_its_orbit():
     np.testing.assert_allclose(found.harmonics[0, 0], (2.0 * np.fft.rfft(x) / len(x))[1:4], atol=1e-8)
 
 
-@pytest.mark.slow
-def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
-    """r' = r (mu + r^2 - r^4): stable cycles of r^2 = (1 + sqrt(1 + 4 mu)) / 2, which fold at mu = -1/4."""
+def cycles_run(folder):
+    """A run along mu of r' = r (mu + r^2 - r^4): cycles of r^2 = (1 +- sqrt(1 + 4 mu)) / 2, which fold at -1/4."""
     model = magpend.model(
         "x' = x*g - 2*y\ny' = y*g + 2*x\ng = mu + x**2 + y**2 - (x**2 + y**2)**2", name="cycles", mu=0.1
     )
@@ -238,7 +237,12 @@ def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
         .with_section(of="y", value=0.0, direction="up")
         .with_integration(n_transient=200, n_keep=4)
     )
-    ds = magpend.run(spec, tmp_path / "run", workers=0).response(parameter="mu")
+    return magpend.run(spec, folder / "run", workers=0)
+
+
+@pytest.mark.slow
+def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
+    ds = cycles_run(tmp_path).response(parameter="mu")
     cycle = ds["orbit_period"].values.tolist().index(1)
     one = ds.isel(branch=cycle, point=slice(0, int(ds["n_points"][cycle])))
     stable = one["n_unstable"].values == 0

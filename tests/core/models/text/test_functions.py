@@ -289,7 +289,7 @@ def test_model__follows_vectors(what):
 
 
 def test_model__text_has_the_rules_of_numpy():
-    """Each rule against numpy's own function."""
+    """Each rule against numpy's own function: a text whose rates differ from the function's is refused."""
     binary = {name for name in RULES if getattr(getattr(np, name), "nin", 3) == 2}
     skipped = {"equal", "not_equal", "remainder", "fmod", *(n for n in RULES if n.startswith(("logical", "bitwise")))}
     for name in RULES.keys() - skipped - {"invert"}:
