@@ -169,7 +169,7 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Way:
-    """One path through a function: the rates that it returns, the decisions on the way, and its variables at the end."""
+    """One path through a function: the rates returned, the decisions on the way, and its variables at the end."""
 
     rates: list[Traced]
     decisions: list[tuple[Traced, bool]]

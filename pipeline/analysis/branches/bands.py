@@ -255,7 +255,7 @@ def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along
 
 
 def _packed(base: Parameters, drawn: xr.Dataset) -> np.ndarray:
-    """Return the parameters of each draw: those of the run, with the drawn values in place of the identified ones."""
+    """Return the parameters of each draw: those of the run, with the drawn values of the identified ones."""
     names = [str(name) for name in drawn["parameter"].values]
     values = drawn["value"].values
     packed = np.tile(base.pack(), (len(values), 1))
