@@ -47,10 +47,11 @@ def named(run: RunDirectory, options: Options) -> Options:
                 problems += error.problems
     model = run.model
     if {"parameter", "second", "state"} & fields.keys():
+        is_left_out = {role: given.get(role) == "" for role in _BOUNDS}
         if given.get("parameter") == "":
             given["parameter"] = _swept(run, [given.get("second", ""), *given.get("at", {})])
         for role in {"parameter", "second"} & fields.keys():
-            word = _rate(run, given[role], options)
+            word = run.spec.rate if is_left_out[role] and given[role] == FREQUENCY else _rate(run, given[role])
             changes[role] = FREQUENCY if word else parameter_name(given[role])
             changes |= _bounds(role, given, RATES[word], RATES[word].hertz) if word else {}
             problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
@@ -66,10 +67,8 @@ _BOUNDS = {"parameter": ("low", "high", "before", "after"), "second": ("second_l
 """Options with values of a parameter, by the option that names it."""
 
 
-def _rate(run: RunDirectory, name: str, options: Options) -> str:
-    """Return the word for the drive's rate that an option's name is; that of the run if no name was given."""
-    if name == FREQUENCY and getattr(options, "parameter", name) == "":
-        return run.spec.rate
+def _rate(run: RunDirectory, name: str) -> str:
+    """Return the word for the drive's rate that an option's name is; empty if it is none."""
     return "" if name in run.model.parameter_names else word_named(name)
 
 

@@ -13,6 +13,8 @@ import magpend
 from pipeline.compute.simulate import simulate
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.own_words import in_own_words
+from pipeline.products.branches import CurveOptions
+from pipeline.runs.naming import named
 from pipeline.specification.tables import RATES
 
 SPRING = "x'' = F*cos(omega*t) - 0.1*x' - x - x**3\nF = 0.3"
@@ -67,6 +69,17 @@ def test_options__take_values_in_the_word_that_they_name(runs):
     np.testing.assert_allclose(own["value"], part["value"], rtol=1e-7)
     cell = runs["frequency_hz"].cube().magpend.sel_cell(omega=1.3)
     np.testing.assert_allclose(float(cell.frequency), 1.3 / (2 * pi), rtol=1e-15)
+
+
+def test_options__second_parameter_has_the_unit_of_its_own_name(tmp_path):
+    spec = spring().with_parameters(omega=1.3).with_axis("F", 0.1, 0.3, 2)
+    run = magpend.run(spec, tmp_path / "run", workers=0, echo=lambda _: None)
+    ranges = {"frequency_hz": (0.1, 0.3), "omega": (0.2 * pi, 0.6 * pi), "period": (1.0 / 0.3, 10.0)}
+    for word, bounds in ranges.items():
+        found = named(run, CurveOptions(second=word, second_low=bounds[0], second_high=bounds[1], low=0.1, high=0.3))
+        assert (found.parameter, found.second) == ("F", "frequency_hz")
+        assert (found.low, found.high) == (0.1, 0.3)
+        assert (found.second_low, found.second_high) == pytest.approx((0.1, 0.3), rel=1e-12)
 
 
 def test_figures__are_labelled_as_the_user_wrote(runs):
