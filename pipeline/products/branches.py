@@ -112,7 +112,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=2,
+    version=3,
 )
 
 CURVES = Analysis(

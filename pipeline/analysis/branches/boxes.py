@@ -179,8 +179,9 @@ class _Search:
         inside = (self.box.is_full | ((self.box.low <= low) & (high <= self.box.high))).all()
         if not inside:
             beside = ~self.box.is_full & ((high < self.box.low) | (low > self.box.high))
-            if not beside.any():
-                self.found.on_border.append(0.5 * (low + high))
+            middle, others = 0.5 * (low + high), self.found.on_border
+            if not beside.any() and not any((np.abs(middle - one) < SMALLEST * self.box.width).all() for one in others):
+                others.append(middle)
             return
         self.found.low.append(low)
         self.found.high.append(high)
