@@ -23,7 +23,7 @@ from pipeline.analysis.branches.searching import family_at, rows_of
 from pipeline.analysis.branches.starting_orbits import family_of
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import parameter_name, parameters_of
+from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions
 from pipeline.specification.problems import SpecError, unknown_name
 
@@ -92,7 +92,7 @@ def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, fl
     """
     if not options.start:
         return [], []
-    cube, base, name = run.cube(), parameters_of(run.cube()), options.parameter
+    cube, base, name = run.cube(), parameters_of(run.cube()), axis_name(options.parameter)
     own = base[name] if name in base.names else interval[0]
     default = own if interval[0] <= own <= interval[1] and name not in cube.dims else interval[0]
     value = options.start.get(parameter_name(name), default)
@@ -170,7 +170,7 @@ def count_equilibria(run: OpenRun, options: BranchOptions, interval: tuple[float
         return []
     base, box = parameters_of(run.cube()), _box_of(run.model, options.within)
     values = (low + (high - low) * (np.arange(n) + 0.5) / n).tolist()
-    rows = list(rows_of(run.cube(), base, options.parameter, high - low))
+    rows = list(rows_of(run.cube(), base, axis_name(options.parameter), high - low))
     return [_count(family_at(family, value), value, where, base, box) for _, where, family in rows for value in values]
 
 
