@@ -155,7 +155,8 @@ HOOP = "th' = v\nv' = sin(th)*(w**2*cos(th) - 1) - d*v"
 def hoop(tmp_path_factory):
     """A bead on a rotating hoop: th = 0 and pi, and beyond w = 1 also cos th = 1/w^2; its cells end below alone."""
     model = magpend.model(HOOP, states={"th": {"on_circle": True}, "v": "1"}, name="hoop", w=0.5, d=0.4)
-    spec = magpend.Spec("sweep", model).with_axis("w", 0.4, 0.6, 2).with_start_list(points=[(0.1, 0.0)])
+    spec = magpend.Spec("sweep", model).with_parameters(frequency_hz=0.2).with_axis("w", 0.4, 0.6, 2)
+    spec = spec.with_start_list(points=[(0.1, 0.0)])
     return magpend.run(spec, tmp_path_factory.mktemp("runs") / "hoop", workers=0)
 
 
