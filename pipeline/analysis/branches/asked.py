@@ -50,7 +50,7 @@ def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, flo
 
 def has_equilibria(model: Model) -> bool:
     """Return whether a model is a flow without a drive."""
-    return model.clock_hz is not None and not model.is_map
+    return model.autonomous and not model.is_map
 
 
 def _check_start(model: Model, options: BranchOptions, interval: tuple[float, float]) -> None:
