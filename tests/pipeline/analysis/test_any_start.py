@@ -201,7 +201,7 @@ def test_branches__start_at_an_unstable_state(hoop):
         ({"start": {"th": 0.1, "v": 0.0, "w": 7.0}}, "w = 7 is outside of 0.4 to 0.6"),
         ({"within": {"v": (-1.0, 1.0)}}, "give that, too"),
         ({"all_equilibria": 1}, "add v=LOW:HIGH"),
-        ({"all_equilibria": 1, "within": {"v": (3.0, -3.0)}}, "v=3:-3 is empty"),
+        ({"all_equilibria": 1, "within": {"v": (3.0, -3.0)}}, "is empty; give the lesser number first"),
         ({"all_equilibria": 1, "within": {"v": (-1.0, 1.0), "x": (0.0, 1.0)}}, "unknown state 'x'"),
     ],
 )
