@@ -160,9 +160,7 @@ class _Search:
 
     def _record(self, wide_low: np.ndarray, wide_high: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
         """Record the equilibrium of a region, unless it is known."""
-        self.regions = tuple(
-            np.vstack([old, new]) for old, new in zip(self.regions, (wide_low, wide_high), strict=True)
-        )  # type: ignore[assignment]
+        self.regions = np.vstack([self.regions[0], wide_low]), np.vstack([self.regions[1], wide_high])
         for _ in range(20):
             first, last = krawczyk(self.rates, low[None], high[None])
             closer = np.maximum(low, first[0]), np.minimum(high, last[0])
