@@ -81,26 +81,24 @@ def _divergence(ax: Axes, ds: xr.Dataset) -> None:
     else:
         _nothing(ax)
     style.label_axes(ax, labels.with_unit("time", "s"), "mean log distance")
-    _title(ax, f"exponent {_told(ds, 'exponent', '.3g')}")
+    _title(ax, f"exponent {_told(ds, 'exponent', '.2g')}")
 
 
 def _slopes(ax: Axes, ds: xr.Dataset) -> None:
-    if "log_radius" in ds:
-        for k, colour in zip(range(ds.sizes["embedding"]), style.colours(), strict=False):
-            one = ds.isel(embedding=k)
-            x, y = one["log_radius"].values, one["log_correlation_sum"].values
-            # over an octave, as four radii are in one
-            slope, middle = (y[4:] - y[:-4]) / (x[4:] - x[:-4]), np.exp(0.5 * (x[4:] + x[:-4]))
-            label = f"{int(one['embedding'])} delays"
-            ax.plot(middle, slope, color=colour, linewidth=0.9, label=label, gid=f"slope-{k}")
-        ends = [float(v) for v in (ds["fit_low"][1], ds["fit_high"][1])]
-        if np.isfinite(ends).all():
-            ax.axvspan(*ends, color="0.9", linewidth=0.0, zorder=0)
-        ax.set_xscale("log")
-        ax.set_ylim(0.0, float(ds["embedding"].max()) + 0.5)
-        ax.legend(fontsize=style.look_of(ax).legend, frameon=False)
-    else:
-        _nothing(ax)
+    radius = ds["radius"].values
+    for k, colour in zip(range(ds.sizes["embedding"]), style.colours(), strict=False):
+        one = ds.isel(embedding=k)
+        share = one["correlation_sum"].values
+        # over an octave, as four radii are in one, where there are pairs to count
+        there = share[:-4] > 1e-6
+        slope = np.log2(share[4:][there] / share[:-4][there])
+        middle = np.sqrt(radius[4:] * radius[:-4])[there]
+        ax.plot(middle, slope, color=colour, linewidth=0.9, label=f"{int(one['embedding'])} delays", gid=f"slope-{k}")
+    if np.isfinite(float(ds["fit_low"])):
+        ax.axvspan(float(ds["fit_low"]), float(ds["fit_high"]), color="0.9", linewidth=0.0, zorder=0)
+    ax.set_xscale("log")
+    ax.set_ylim(0.0, float(ds["embedding"].max()) + 1.5)
+    ax.legend(fontsize=style.look_of(ax).legend, frameon=False)
     style.label_axes(ax, "radius [standard deviations]", "slope")
     _title(ax, f"dimension {_told(ds, 'correlation_dimension', '.3g')}")
 

@@ -43,7 +43,7 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
         ``determinism``, ``laminarity``, ``mean_line``, ``line_entropy`` (recurrences) and ``surrogate_rank`` (share
         of surrogates that are predicted no worse). Attributes: ``motion`` (a word of `MOTIONS`) and ``motion_reason``.
         Curves: ``mutual_information`` over ``lag``, ``false_neighbours`` over ``dimension``, ``divergence`` over
-        ``elapsed`` with ``fit_line``, ``log_correlation_sum`` over ``embedding`` and ``radius``, ``recurrent`` over
+        ``elapsed`` with ``fit_line``, ``correlation_sum`` over ``embedding`` and ``radius``, ``recurrent`` over
         ``row`` and ``column``, ``maximum`` and ``next_maximum`` over ``return``, ``vector`` over ``delayed`` and
         ``coordinate``, and ``power`` over ``bin``.
 
@@ -96,19 +96,19 @@ def _dataset(found: Measured) -> xr.Dataset:
     variables["prediction_error"] = ((), found.surrogates[0], {"units": "1"})
     if found.recurrence is not None:
         variables["recurrent"] = (("row", "column"), found.recurrence.matrix)
-    if found.sums is not None:
-        kept = found.sums[["log_radius", "log_correlation_sum", "fit_low", "fit_high"]]
-        variables |= {str(name): (array.dims, array.values) for name, array in kept.data_vars.items()}
+    sums = found.sums
+    variables["correlation_sum"] = (("embedding", "radius"), sums.share, {"units": "1"})
+    variables |= {"fit_low": ((), sums.fit[0]), "fit_high": ((), sums.fit[1])}
     coords: dict[str, Any] = {
         over: [r.name for r in found.results],
         "lag": ("lag", np.arange(len(found.information)) * found.step, seconds),
         "dimension": np.arange(1, len(found.false) + 1),
         "elapsed": ("elapsed", parted.time, seconds),
+        "embedding": list(sums.dimensions),
+        "radius": ("radius", sums.radius, {"units": "standard deviations"}),
     }
     if found.recurrence is not None:
         coords |= {name: (name, found.recurrence.time, seconds) for name in ("row", "column")}
-    if found.sums is not None:
-        coords["embedding"] = found.sums["embedding"].values
     return xr.Dataset(variables, coords)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from pipeline.analysis.chaos.dimensions import correlation_dimension
 from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
+from pipeline.analysis.series.correlation import Sums, correlation_sums
 from pipeline.analysis.series.divergence import Divergence, divergence
 from pipeline.analysis.series.embedding import (
     FEW_FALSE,
@@ -42,12 +42,6 @@ DRIFT = 0.002
 
 ORDERLY, DISORDERLY = 0.15, 0.85
 """Results of the 0-1 test up to which a motion is regular, and from which on it is not."""
-
-PLATEAU = 0.12
-"""Largest relative change of the slope of correlation sums, along the radii and with the embedding."""
-
-N_POINTS = 4000
-"""Most vectors in correlation sums."""
 
 MOTIONS = ("not decided", "periodic", "regular", "chaotic")
 
@@ -85,7 +79,7 @@ class Measured:
     returns: Returns
     embedding: Embedding
     divergence: Divergence
-    sums: xr.Dataset | None
+    sums: Sums
     recurrence: Recurrence | None
     surrogates: tuple[float, Floats]
     results: list[Result]
@@ -107,14 +101,14 @@ def measure(series: Series, seed: int) -> Measured:
     longest = max(coarse.pieces(), key=len)
     noise = against_noise(longest, delay, embedding.dimension, period, np.random.default_rng(seed))
     drift = _drift(coarse)
-    sums = _sums(embedding) if not drift else None
+    sums = correlation_sums(embedding, parted.grows)
     own = recurrence(embedding)
     results = [
         _delay_result(series, *rough),
         _dimension_result(coarse, embedding, false),
         *_period_results(returns),
         _exponent_result(parted, noise, drift),
-        _dimension_of(sums, embedding, drift),
+        _dimension_of(sums, drift),
         _zero_one_result(longest, delay, drift),
         *_recurrence_results(own),
         _surrogate_result(noise),
@@ -180,44 +174,11 @@ def _exponent_result(parted: Divergence, noise: tuple[float, Floats], drift: str
     return Result("exponent", parted.value, parted.low, parted.high, "1/s")
 
 
-def _sums(embedding: Embedding) -> xr.Dataset | None:
-    """Return the correlation sums for three embedding dimensions, of evenly chosen vectors."""
-    found = []
-    for dimension in range(embedding.dimension, embedding.dimension + 3):
-        wider = Embedding(embedding.series, embedding.delay, dimension, embedding.theiler)
-        starts = wider.series.starts(wider.span)
-        stride = max(1, -(-len(starts) // N_POINTS))
-        points = wider.vectors(starts[::stride])
-        if len(points) < 10 * embedding.theiler // stride + 100:
-            return None
-        ds = xr.Dataset({"section": (("period_index", "state"), points)})
-        geometry = Geometry((False,) * dimension, (float(embedding.series.values.std()),) * dimension)
-        theiler = -(-embedding.theiler // stride)
-        found.append(correlation_dimension(ds, theiler=theiler, n_max=N_POINTS, geometry=geometry))
-    dimensions = np.arange(embedding.dimension, embedding.dimension + 3)
-    return xr.concat(found, "embedding").assign_coords(embedding=dimensions)
-
-
-def _dimension_of(sums: xr.Dataset | None, embedding: Embedding, drift: str) -> Result:
-    """Return the correlation dimension where slopes agree along the radii and for three embedding dimensions."""
-    name = "correlation_dimension"
-    if drift:
-        return Result.undecided(name, "1", drift)
-    if sums is None:
-        return Result.undecided(name, "1", "too few vectors")
-    slopes = sums["correlation_dimension"].values
-    if not np.isfinite(slopes).all():
-        return Result.undecided(name, "1", "no two octaves of radii with enough neighbours")
-    value = float(slopes[1:].mean())
-    spread = float(np.abs(sums["correlation_dimension_spread"].values[1:]).max())
-    if spread > PLATEAU * value or np.ptp(slopes) > PLATEAU * value:
-        return Result.undecided(
-            name, "1", f"no plateau: slopes {slopes[0]:.2f} to {slopes[-1]:.2f}, and {spread:.2f} apart along the radii"
-        )
-    if value > 0.8 * float(sums["largest_resolved"].min()):
-        return Result.undecided(name, "1", "as many dimensions as so few vectors can show")
-    half = 2.0 * float(sums["correlation_dimension_stderr"].max()) + np.ptp(slopes) + 0.5 * spread
-    return Result(name, value, value - half, value + half, "1")
+def _dimension_of(sums: Sums, drift: str) -> Result:
+    reason = drift or sums.reason
+    if reason:
+        return Result.undecided("correlation_dimension", "1", reason)
+    return Result("correlation_dimension", sums.value, sums.low, sums.high, "1")
 
 
 def _zero_one_result(values: Floats, delay: int, drift: str) -> Result:
