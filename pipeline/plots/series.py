@@ -40,14 +40,14 @@ def plot_series(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
 
 
 def _told(ds: xr.Dataset, name: str, form: str) -> str:
-    """Return a result with its interval for a title; why it is not decided is in the table."""
+    """Return a result with half of its interval for a title; why it is not decided is in the table."""
     if name not in ds["quantity"].values:
         return ""
     one = ds.sel(quantity=name)
     if str(one["reason"].item()):
         return "not decided"
     unit = str(one["unit"].item())
-    text = f"{float(one['value']):{form}} ({float(one['low']):{form}} to {float(one['high']):{form}})"
+    text = f"{float(one['value']):{form}} ± {0.5 * float(one['high'] - one['low']):.1g}"
     return text if unit == "1" else f"{text} {unit}"
 
 

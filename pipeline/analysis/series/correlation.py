@@ -60,8 +60,8 @@ def correlation_sums(embedding: Embedding, mixes: bool) -> Sums:
     Grassberger and Procaccia (Physica D 9, 189, 1983), with the largest difference of a coordinate as distance and
     without pairs close in time (Theiler, Phys. Rev. A 34, 2427, 1986). The range of the fit is the longest in which the
     slopes of both halves, and those for the embedding and two delays more, agree within `FLAT`. It lies between the
-    radius below which pairs are too few, and that beyond which the edges of the set bend the curve. The interval is that of Student from slopes of
-    `N_BLOCKS` stretches, widened by these differences.
+    radius below which pairs are too few and the one beyond which the edges of the set bend the curve. The interval is
+    that of Student from slopes of `N_BLOCKS` stretches, widened by these differences.
 
     Parameters
     ----------

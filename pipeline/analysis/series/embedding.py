@@ -127,10 +127,10 @@ def mutual_information(series: Series, n_lags: int) -> Floats:
 def first_minimum(information: Floats) -> int | None:
     """Return the lag of the first minimum of mutual information; None if it only falls, to nothing or to the end.
 
-    A minimum is the least value from lag 0 to a third beyond its own lag, and at least two beyond.
+    A minimum is the least value from lag 0 to a third beyond its own lag, and at least four beyond.
     """
     for lag in range(1, len(information)):
-        beyond = lag + max(2, lag // 3)
+        beyond = lag + max(4, lag // 3)
         if information[lag] < 0.02 or beyond >= len(information):
             return None
         if information[lag] == information[: beyond + 1].min():
@@ -141,7 +141,7 @@ def first_minimum(information: Floats) -> int | None:
 def false_neighbours(series: Series, delay: int, theiler: int, n_references: int = 1000) -> Floats:
     """Return the share of false nearest neighbours for the dimensions 1, 2, ..., `MOST_DIMENSIONS`.
 
-    By both criteria of Kennel, Brown and Abarbanel (Phys. Rev. A 45, 3403, 1992, eqs. 4 and 6).
+    Dimensions after the first two that suffice are NaN. By both criteria of Kennel, Brown and Abarbanel (Phys. Rev. A 45, 3403, 1992, eqs. 4 and 6).
     """
     size = float(series.values.std())
     found = np.full(MOST_DIMENSIONS, np.nan)
@@ -156,4 +156,6 @@ def false_neighbours(series: Series, delay: int, theiler: int, n_references: int
         false = (more > FALSE_RATIO * near) | (np.hypot(more, near) > FALSE_SIZE * size)
         # below a thousandth of the size a ratio compares rounding or noise
         found[dimension - 1] = false[(near > 1e-3 * size) | (more > 1e-2 * size)].sum() / len(false)
+        if dimension > 1 and (found[dimension - 2 : dimension] < FEW_FALSE).all():
+            break
     return found

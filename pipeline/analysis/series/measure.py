@@ -7,7 +7,7 @@ and no name of its motion.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -202,7 +202,12 @@ def _recurrence_results(found: Recurrence | None) -> list[Result]:
     units = {"determinism": "1", "laminarity": "1", "mean_line": "s", "line_entropy": "nats"}
     if found is None:
         return [Result.undecided(name, unit, "too few vectors") for name, unit in units.items()]
-    return [Result.of_parts(name, found.measures[name], found.parts[name], unit) for name, unit in units.items()]
+    results = [Result.of_parts(name, found.measures[name], found.parts[name], unit) for name, unit in units.items()]
+    # shares lie in 0 to 1, the others above 0
+    return [
+        replace(r, low=max(r.low, 0.0), high=min(r.high, 1.0) if r.name in ("determinism", "laminarity") else r.high)
+        for r in results
+    ]
 
 
 def _surrogate_result(noise: tuple[float, Floats]) -> Result:
