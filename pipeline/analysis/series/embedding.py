@@ -141,7 +141,8 @@ def first_minimum(information: Floats) -> int | None:
 def false_neighbours(series: Series, delay: int, theiler: int, n_references: int = 1000) -> Floats:
     """Return the share of false nearest neighbours for the dimensions 1, 2, ..., `MOST_DIMENSIONS`.
 
-    Dimensions after the first two that suffice are NaN. By both criteria of Kennel, Brown and Abarbanel (Phys. Rev. A 45, 3403, 1992, eqs. 4 and 6).
+    By both criteria of Kennel, Brown and Abarbanel (Phys. Rev. A 45, 3403, 1992, eqs. 4 and 6). Dimensions after the
+    first two that suffice are NaN.
     """
     size = float(series.values.std())
     found = np.full(MOST_DIMENSIONS, np.nan)
