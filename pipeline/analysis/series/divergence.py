@@ -30,13 +30,13 @@ LEAST_PERIODS = 1.5
 STRAIGHT = 0.3
 """Largest difference of the slopes of two halves of a range, relative to the slope of the whole."""
 
-NO_GROWTH = 0.3
+NO_GROWTH = 0.15
 """Largest growth over all `PERIODS` that counts as none [nats]."""
 
 REPEATED = -1.5
 """Scatter of passes about a closed orbit, below random pairs, from which on passes coincide [nats]."""
 
-CLOSER = 0.8
+CLOSER = 1.3
 """How much closer neighbours stay than passes at the same phase where a motion is regular [nats]."""
 
 FLOOR = 1e-9

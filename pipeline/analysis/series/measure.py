@@ -40,6 +40,9 @@ N_SEGMENTS = 8
 DRIFT = 0.002
 """Probability by chance below which a trend over the stretches counts as drift."""
 
+LEAST_DRIFT = 0.1
+"""Least range of level or size over the stretches that counts as drift, relative to the standard deviation."""
+
 ORDERLY, DISORDERLY = 0.15, 0.85
 """Results of the 0-1 test up to which a motion is regular, and from which on it is not."""
 
@@ -229,7 +232,7 @@ def _drift(series: Series) -> str:
     parts = pieces if len(pieces) >= N_SEGMENTS else np.array_split(series.values, N_SEGMENTS)
     for name, values in (("level", [p.mean() for p in parts]), ("size", [p.std() for p in parts])):
         relative = np.ptp(values) / series.values.std()
-        if relative > 0.01 and stats.kendalltau(np.arange(len(parts)), values).pvalue < DRIFT:
+        if relative > LEAST_DRIFT and stats.kendalltau(np.arange(len(parts)), values).pvalue < DRIFT:
             return f"not stationary: its {name} drifts by {relative:.0%}"
     return ""
 
