@@ -33,8 +33,8 @@ STRAIGHT = 0.3
 NO_GROWTH = 0.15
 """Largest growth over all `PERIODS` that counts as none [nats]."""
 
-REPEATED = -1.5
-"""Scatter of passes about a closed orbit, below random pairs, from which on passes coincide [nats]."""
+REPEATED = -1.0
+"""Distance of passes at the same phase of a closed orbit, below random pairs, from which on they coincide [nats]."""
 
 CLOSER = 1.3
 """How much closer neighbours stay than passes at the same phase where a motion is regular [nats]."""
@@ -63,7 +63,7 @@ class Divergence:
         return self.low > 0.0 and not self.reason
 
 
-def divergence(embedding: Embedding, period: int) -> Divergence:
+def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence:
     """Follow nearest neighbours, and fit the rate at which they part.
 
     As Rosenstein, Collins and De Luca (Physica D 65, 117, 1993): the mean over pairs of the logarithm of their
@@ -81,6 +81,8 @@ def divergence(embedding: Embedding, period: int) -> Divergence:
         Delay vectors of the series.
     period
         Mean period [samples].
+    is_closed
+        Whether the maxima repeat but for noise. Then neighbours may be as far apart as other passes.
     """
     horizon = min(PERIODS * period, len(embedding.series.values) // 6)
     side = max(1, embedding.delay // 3)
@@ -110,7 +112,7 @@ def divergence(embedding: Embedding, period: int) -> Divergence:
     if abs(growth) >= NO_GROWTH:
         return _with(plain, f"no straight range of {LEAST_GROWTH} nats below the size of the set")
     is_closer = curve[-1] < min(at_phase, -0.5) - CLOSER
-    if not is_closer and at_phase > REPEATED:
+    if not is_closer and not (is_closed and at_phase < REPEATED):
         return _with(plain, "neighbours are no closer than other passes: noise, or too few vectors")
     return _fitted(plain, smooth, start, len(time) - 1)
 

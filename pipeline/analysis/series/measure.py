@@ -100,7 +100,7 @@ def measure(series: Series, seed: int) -> Measured:
     false = false_neighbours(coarse, delay, period)
     enough = np.flatnonzero(false < FEW_FALSE)
     embedding = Embedding(coarse, delay, int(enough[0]) + 1 if len(enough) else 5, period)
-    parted = divergence(embedding, period)
+    parted = divergence(embedding, period, returns.in_cycle > 0)
     longest = max(coarse.pieces(), key=len)
     noise = against_noise(longest, delay, embedding.dimension, period, np.random.default_rng(seed))
     drift = _drift(coarse)
