@@ -33,8 +33,9 @@ STRAIGHT = 0.3
 NO_GROWTH = 0.15
 """Largest growth over all `PERIODS` that counts as none [nats]."""
 
-REPEATED = -1.0
-"""Distance of passes at the same phase of a closed orbit, below random pairs, from which on they coincide [nats]."""
+REPEATED, THIN = -1.0, -2.5
+"""Distance of passes at the same phase, below random pairs, from which on they coincide [nats]: of a closed orbit, and
+of any motion."""
 
 CLOSER = 1.3
 """How much closer neighbours stay than passes at the same phase where a motion is regular [nats]."""
@@ -112,7 +113,7 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
     if abs(growth) >= NO_GROWTH:
         return _with(plain, f"no straight range of {LEAST_GROWTH} nats below the size of the set")
     is_closer = curve[-1] < min(at_phase, -0.5) - CLOSER
-    if not is_closer and not (is_closed and at_phase < REPEATED):
+    if not is_closer and at_phase > (REPEATED if is_closed else THIN):
         return _with(plain, "neighbours are no closer than other passes: noise, or too few vectors")
     return _fitted(plain, smooth, start, len(time) - 1)
 

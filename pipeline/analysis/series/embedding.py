@@ -84,7 +84,7 @@ class Embedding:
             few vectors.
         """
         starts = self.series.starts(self.span + ahead)
-        if len(starts) < 2 * self.theiler + 10 * n_nearest + 2:
+        if len(starts) < 2 * self.theiler + 4 * n_nearest + 2:
             return np.empty(0, np.int64), np.empty((0, n_nearest), np.int64), np.empty((0, n_nearest))
         references = starts[np.unique(np.linspace(0, len(starts) - 1, n_references).round().astype(int))]
         points = self.vectors(starts)
