@@ -109,9 +109,9 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
     width = period // stride
     kernel = np.full(width, 1.0 / width)
     smooth = np.stack([np.convolve(block, kernel, "valid") for block in blocks])
-    time = (lags[: smooth.shape[1]] + 0.5 * stride * (width - 1)) * embedding.series.step
+    time: Floats = (lags[: smooth.shape[1]] + 0.5 * stride * (width - 1)).astype(np.float64) * embedding.series.step
     seconds = period * embedding.series.step
-    curve = smooth.mean(axis=0)
+    curve: Floats = np.asarray(smooth.mean(axis=0), np.float64)
     plain = Divergence(time, curve, at_phase)
     start = min(int(np.ceil(max(embedding.span - 0.5 * period, 0) / stride)), len(time) // 4)
     chosen = _range(time, curve, start, seconds, min(at_phase, 0.0) - SATURATED)

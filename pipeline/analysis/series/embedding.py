@@ -70,7 +70,7 @@ class Embedding:
 
     def vectors(self, starts: Ints) -> Floats:
         """Return the vectors that begin at some samples, shape (vector, coordinate)."""
-        return self.series.values[starts[:, None] + self.delay * np.arange(self.dimension)]
+        return np.asarray(self.series.values[starts[:, None] + self.delay * np.arange(self.dimension)])
 
     def neighbours(self, n_references: int, ahead: int, n_nearest: int = 1) -> tuple[Ints, Ints, Floats]:
         """Return vectors, evenly spread over the series, with their nearest neighbours.

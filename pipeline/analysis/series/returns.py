@@ -110,7 +110,7 @@ def _in_cycle(returns: Returns, series: Series) -> int:
     exact = np.flatnonzero(scatter < EXACT)
     if len(exact):
         return int(exact[0])
-    k = int(np.flatnonzero(scatter <= 1.3 * scatter.min())[0])
+    k = int(np.flatnonzero(scatter <= 1.5 * scatter.min() + EXACT)[0])
     if not np.isfinite(scatter[k]) or scatter[k] > CLOSE or np.ptp(returns.piece) > 0:
         return 0
     rest = returns.height.copy()
