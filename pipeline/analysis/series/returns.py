@@ -22,8 +22,11 @@ IRREGULAR = 0.4
 MOST_IN_CYCLE = 8
 """Most maxima in a cycle."""
 
-EXACT, CLOSE = 0.01, 0.3
+EXACT, CLOSE = 0.01, 0.12
 """Scatter of the maxima of a closed orbit in standard deviations: without noise, and with noise."""
+
+FEWEST_CYCLES = 20
+"""Fewest cycles of a closed orbit with noise: chaos may stay near an unstable orbit for as long as that."""
 
 N_SEGMENTS = 8
 """Stretches over which intervals are taken."""
@@ -111,7 +114,7 @@ def _in_cycle(returns: Returns, series: Series) -> int:
     if len(exact):
         return int(exact[0])
     k = int(np.flatnonzero(scatter <= 1.5 * scatter.min() + EXACT)[0])
-    if not np.isfinite(scatter[k]) or scatter[k] > CLOSE or np.ptp(returns.piece) > 0:
+    if not scatter[k] <= CLOSE or len(returns.height) < FEWEST_CYCLES * k or np.ptp(returns.piece) > 0:
         return 0
     rest = returns.height.copy()
     for phase in range(k):
