@@ -10,7 +10,16 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LABELS, LIMITS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import (
+    BRANCHING,
+    FOLD,
+    HOMOCLINIC,
+    KINDS,
+    LABELS,
+    LIMITS,
+    PITCHFORK,
+    TRANSCRITICAL,
+)
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values, words_of
 from pipeline.layout.own_words import RATE, dims_in_own_words
@@ -579,4 +588,7 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
     ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
     what = f"{LABELS[told['kind']]} {told['kind']}, period {told['orbit_period']}"
+    if told["kind"] == HOMOCLINIC:
+        quantity = one["saddle_quantity"].values[:n]
+        what = f"{LABELS[HOMOCLINIC]} homoclinic, saddle quantity {quantity.min():.4g} to {quantity.max():.4g} 1/s"
     return f"  {number}: {what}: {spans}" + (f"; ends: {ends}" if ends else "")

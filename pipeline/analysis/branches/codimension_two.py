@@ -43,7 +43,11 @@ CUSP, GENERALISED, CHENCINER = "cusp", "generalised_doubling", "chenciner"
 R1, R2, R3, R4 = "r1", "r2", "r3", "r4"
 FOLD_FLIP, FOLD_TORUS = "fold_flip", "fold_neimark_sacker"
 DOUBLING_TORUS, DOUBLE_TORUS = "doubling_neimark_sacker", "double_neimark_sacker"
-POINT_KINDS = (CUSP, GENERALISED, CHENCINER, R1, R2, R3, R4, FOLD_FLIP, FOLD_TORUS, DOUBLING_TORUS, DOUBLE_TORUS)
+BT, NEUTRAL, NONCENTRAL = "bogdanov_takens", "neutral_saddle", "saddle_node_homoclinic"
+POINT_KINDS = (
+    *(CUSP, GENERALISED, CHENCINER, R1, R2, R3, R4, FOLD_FLIP, FOLD_TORUS, DOUBLING_TORUS, DOUBLE_TORUS),
+    *(BT, NEUTRAL, NONCENTRAL),
+)
 
 TURN = "turn"
 """Test function of a pair that passes 1 or -1 and stays on the circle; the point is an R1 or R2."""

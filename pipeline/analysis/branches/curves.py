@@ -13,10 +13,12 @@ from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import multipliers_of
 from pipeline.analysis.branches.codimension_two import (
+    BT,
     DOUBLING_TORUS,
     FOLD_FLIP,
     FOLD_TORUS,
     GENERALISED,
+    NONCENTRAL,
     POINT_KINDS,
     R1,
     R2,
@@ -25,7 +27,14 @@ from pipeline.analysis.branches.codimension_two import (
     merged,
 )
 from pipeline.analysis.branches.following import has_halved, opposite
-from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
+from pipeline.analysis.branches.homoclinic_curves import (
+    HETEROCLINIC,
+    Bounds,
+    homoclinic_curves,
+    loops_of,
+    saddle_quantity,
+)
+from pipeline.analysis.branches.kinds import CURVE_KINDS, DOUBLING, FOLD, HOMOCLINIC, KINDS, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import (
@@ -46,7 +55,10 @@ test function, and is limited by finite differences of monodromy matrices."""
 LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 """Settings for locating points of codimension two, in both parameters to 1e-8."""
 
-CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck", "period_halving")
+CURVE_ENDS = (
+    *("bound", "closed", "resonance", "max_points", "stuck", "period_halving"),
+    *(BT, NONCENTRAL, HETEROCLINIC),
+)
 
 GENERATIONS = 3
 """Number of generations of curves that spring from points of codimension two."""
@@ -73,7 +85,9 @@ class Curve:
     kind: str  # kind of bifurcation
     points: list[Point]  # orbits in order
     ends: tuple[str, str]  # reasons for both ends, of `CURVE_ENDS`
-    start: int  # number of the located bifurcation it started from; -1 if it springs from a point of codimension two
+    # number of the located bifurcation it started from; -1 if it springs from a point of codimension two, or from an
+    # end of a branch (homoclinic orbits)
+    start: int
     special: list[SpecialPoint] = field(default_factory=list)  # points of codimension two on it
     n_missed: int = 0  # sign changes of their test functions that could not be located
 
@@ -111,18 +125,19 @@ def curves_from(
     Returns
     -------
     list of Curve
-        Curves in the order of the located points they start from, none twice.
+        Curves in the order of the located points they start from, none twice; then those of homoclinic orbits.
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     starts = _starts(branches, parameters, second, bounds, longest)
-    return continue_curves(starts, bounds, CURVE, longest, generations)
+    loops = homoclinic_curves(loops_of(branches, parameters, second, bounds, longest), bounds)
+    return [
+        *continue_curves(starts, bounds, CURVE, longest, generations),
+        *(Curve(c.family, HOMOCLINIC, c.points, c.ends, -1, c.special, c.n_missed) for c in loops),
+    ]
 
 
 CurveStart = tuple[int, Family, str, np.ndarray]
 """Number of a located point, its family with two free parameters, its kind, its unknowns."""
-
-Bounds = tuple[tuple[float, float], tuple[float, float]]
-"""Intervals of both parameters."""
 
 
 def continue_curves(
@@ -310,15 +325,20 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     values = np.full((len(curves), n, 2), np.nan)
     section = np.full((len(curves), n, len(names)), np.nan)
     residual = np.full((len(curves), n), np.nan)
+    quantity = np.full((len(curves), n), np.nan)
     for i, curve in enumerate(curves):
         values[i, : len(curve.points)] = curve.values
         section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
         residual[i, : len(curve.points)] = [p.residual for p in curve.points]
+        if curve.kind == HOMOCLINIC:
+            quantity[i, : len(curve.points)] = [saddle_quantity(p.value.monodromy) for p in curve.points]
     dims = ("curve", "point")
     one, units = {"units": "1"}, state_units(model)
 
     def codes(i: int) -> np.ndarray:
         return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
+
+    kinds = np.array([CURVE_KINDS.index(c.kind) for c in curves], np.int8)
 
     def numbers(values: list[int]) -> np.ndarray:
         return np.array(values, np.int32)
@@ -328,9 +348,18 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
         {
             "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
             "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
-            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point"}),
+            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point, or the saddle"}),
             "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
-            "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **code_flags(KINDS)}),
+            "saddle_quantity": (
+                dims,
+                quantity,
+                {"units": "1/s", "long_name": "sum of the leading eigenvalues of the saddle of a homoclinic orbit"},
+            ),
+            "kind": (
+                "curve",
+                np.array([CURVE_KINDS.index(c.kind) for c in curves], np.int8),
+                {**one, **code_flags(CURVE_KINDS)},
+            ),
             "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
             "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
             "n_missed": (

@@ -4,8 +4,11 @@ FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", 
 HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
 KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
 
-LIMITS = ("homoclinic", "snic")
+HOMOCLINIC, SNIC = LIMITS = ("homoclinic", "snic")
 """Kinds of ends at which the period of a flow's cycles grows without bound (see `limits`)."""
+
+CURVE_KINDS = (*KINDS, *LIMITS)
+"""Kinds of curves in two parameters, in the order of their codes."""
 
 LABELS = {
     **dict(zip(KINDS, ("LP", "PD", "NS", "BP", "H", "BP", "BP"), strict=True)),
@@ -21,6 +24,9 @@ LABELS = {
     "fold_neimark_sacker": "LPNS",
     "doubling_neimark_sacker": "PDNS",
     "double_neimark_sacker": "NSNS",
+    "bogdanov_takens": "BT",
+    "neutral_saddle": "NSS",
+    "saddle_node_homoclinic": "NCH",
 }
 """Labels of bifurcations, and of points of codimension two, as MatCont and MatContM print them.
 
