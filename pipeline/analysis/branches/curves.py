@@ -13,6 +13,8 @@ from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import multipliers_of
 from pipeline.analysis.branches.codimension_two import (
+    BT,
+    DOUBLE_HOPF,
     DOUBLING_TORUS,
     FOLD_FLIP,
     FOLD_TORUS,
@@ -20,12 +22,20 @@ from pipeline.analysis.branches.codimension_two import (
     POINT_KINDS,
     R1,
     R2,
+    ZERO_HOPF,
     Detector,
     SpecialPoint,
     merged,
 )
+from pipeline.analysis.branches.equilibrium_curves import (
+    BRANCH_POINTS,
+    EQUILIBRIUM_KINDS,
+    PERSISTS,
+    EquilibriumCurve,
+    EquilibriumDetector,
+)
 from pipeline.analysis.branches.following import has_halved, opposite
-from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, KINDS, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import (
@@ -46,7 +56,7 @@ test function, and is limited by finite differences of monodromy matrices."""
 LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 """Settings for locating points of codimension two, in both parameters to 1e-8."""
 
-CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck", "period_halving")
+CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck", "period_halving", BT)
 
 GENERATIONS = 3
 """Number of generations of curves that spring from points of codimension two."""
@@ -58,8 +68,14 @@ SPRINGING = {
     FOLD_FLIP: ((FOLD, 1), (DOUBLING, 1)),
     FOLD_TORUS: ((FOLD, 1), (TORUS, 1)),
     DOUBLING_TORUS: ((DOUBLING, 1), (TORUS, 1)),
+    BT: ((FOLD, 1), (HOPF, 1)),
+    ZERO_HOPF: ((FOLD, 1), (HOPF, 1)),
+    DOUBLE_HOPF: ((HOPF, 1),),
 }
 """Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit."""
+
+SAME_PERIOD = 0.1
+"""Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
 
 AMPLITUDES = (0.02, 0.05, 0.1)
 """Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
@@ -136,7 +152,7 @@ def continue_curves(
 
     Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
     """
-    problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
+    problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
     firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     curves: list[Curve] = []
@@ -147,7 +163,7 @@ def continue_curves(
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
         sprung = [
-            _sprung(BifurcationProblem(replace(one.family, period=times * one.family.period), kind), one)
+            _sprung(_problem_of(replace(one.family, period=times * one.family.period), kind), one)
             for one in fresh
             for kind, times in SPRINGING.get(one.kind, ())
             if times == 1 or times * one.family.period <= max_period
@@ -158,30 +174,41 @@ def continue_curves(
     return curves
 
 
-Ready = tuple[int, BifurcationProblem, Point]
+CurveProblem = BifurcationProblem | EquilibriumCurve
+"""The problems with two free parameters, whose solutions are curves of bifurcations."""
+
+
+def _problem_of(family: Family, kind: str) -> CurveProblem:
+    return BifurcationProblem(family, kind) if family.period else EquilibriumCurve(family, kind)
+
+
+Ready = tuple[int, CurveProblem, Point]
 """Number of a located point (-1: none), the problem of its curve, and the curve's first point."""
 
 
 def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
     """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
-    ready = [r for r in ready if not any(_passes(curve, r[1].kind, r[1].family, r[2]) for curve in curves)]
+    ready = [r for r in ready if not any(_passes(curve, r[1], r[2]) for curve in curves)]
     traces = run_together(
         [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
     )
     for i, (number, problem, first) in enumerate(ready):
         (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
-        is_known = any(_passes(curve, problem.kind, problem.family, first) for curve in curves)
+        is_known = any(_passes(curve, problem, first) for curve in curves)
         if not is_known and (number >= 0 or len(points) > 2):
             ends = back.end, ahead.end
             n_missed = missed_before + missed_after
             curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after, n_missed))
 
 
-def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
+def _sprung(problem: CurveProblem, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first orbit on a bifurcation curve that starts at a point of codimension two; None if there is no such
     curve.
     """
+    if isinstance(problem, EquilibriumCurve):
+        found = yield from _first(problem, problem.start(at.point.u, _frequency_at(at)), CURVE)
+        return None if found is None else (problem, found)
     if problem.family.period == at.family.period:
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
@@ -194,6 +221,18 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[Bifurc
     return None
 
 
+def _frequency_at(at: SpecialPoint) -> float:
+    """Return the angular frequency [rad/s] of the Hopf points that spring from a point of codimension two; at a double
+    Hopf point that of the other pair.
+    """
+    if at.kind == BT:
+        return 0.0
+    values = np.linalg.eigvals(at.point.value.monodromy)
+    upper = values[values.imag > 0.0]
+    near = np.sort(upper[np.argsort(np.abs(upper.real))][: 2 if at.kind == DOUBLE_HOPF else 1].imag)
+    return float(near[np.argmax(np.abs(near - 2.0 * np.pi / at.point.value.seconds))] if len(near) > 1 else near[0])
+
+
 def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
     """Select the located bifurcations to continue. Each comes with its family of orbits and its start in scaled
     unknowns.
@@ -204,32 +243,39 @@ def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds,
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
-        if not 0 < period <= max_period or kind not in TESTS:
+        if period > max_period or kind not in (TESTS if period else EQUILIBRIUM_KINDS):
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
         family = Family(parameters.model.system, period, frequency, own.pack(), (first, second), (scales[0], scales[1]))
         here = frequency if second == FREQUENCY else own[second]
         state = np.asarray(ds["bifurcation_section"].values[k, 0])
-        found.append((k, family, kind, family.unknowns(state, [float(ds["value"][k]), here])))
+        u = family.unknowns(state, [float(ds["value"][k]), here])
+        found.append((k, family, kind, u if period else EquilibriumCurve(family, kind).start(u)))
     return found
 
 
-def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     value = yield Query(problem, u)
     found = (yield from correct(problem, u, kernel_of(value), settings)) if value.is_finite else None
-    if found is None:
+    if found is None or not _persists(problem, found):
         return None
     tangent = kernel_of(found.value)
     return replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))
 
 
+def _persists(problem: CurveProblem, point: Point) -> bool:
+    """Return False at an imperfect branch point: one that a change of the second parameter has broken up."""
+    return problem.kind not in BRANCH_POINTS or abs(float(point.u[problem.family.system.n_states])) < PERSISTS
+
+
 def _follow(
-    problem: BifurcationProblem, start: Point, bounds: Bounds, settings: Settings
+    problem: CurveProblem, start: Point, bounds: Bounds, settings: Settings
 ) -> Steps[tuple[Trace, list[SpecialPoint], int]]:
     """Follow a bifurcation curve in one direction, and locate its points of codimension two; stay within the bounds.
 
-    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real.
+    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real, and a Hopf curve
+    at the Bogdanov-Takens point where its pair of eigenvalues does.
     """
 
     def is_inside(u: np.ndarray) -> bool:
@@ -242,6 +288,10 @@ def _follow(
             return "bound"
         if problem.kind == TORUS and not _has_torus(here):
             return "resonance"
+        if problem.kind == HOPF and not np.isfinite(here.value.seconds):
+            return BT
+        if not _persists(problem, here):
+            return "stuck"
         if has_halved(problem.family, points):
             return "period_halving"
         step = np.linalg.norm(here.u - points[-2].u)
@@ -249,16 +299,17 @@ def _follow(
             return "closed"
         return ""
 
-    detector = Detector(problem, (LOCATE, CURVE))
+    tries = LOCATE, CURVE
+    detector = Detector(problem, tries) if problem.family.period else EquilibriumDetector(problem, tries)
     found = yield from trace(problem, start, settings, stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
         last, before = (p.u for p in found.points[:-3:-1])
         special = [one for one in special if np.linalg.norm(one.point.u - last) > np.linalg.norm(before - last)]
-    if found.end in ("bound", "resonance"):
+    if found.end in ("bound", "resonance", BT):
         found.points.pop()
-    if found.end == "resonance":
-        found.points += [one.point for one in special if one.kind in (R1, R2)][-1:]
+    if found.end in ("resonance", BT):
+        found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
 
 
@@ -268,15 +319,22 @@ def _has_torus(point: Point) -> bool:
     return bool(len(pairs)) and bool(np.abs(np.abs(pairs) - 1.0).min() < 1e-4)
 
 
-def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points."""
-    is_alike = curve.kind == kind and curve.family.period == family.period
-    return is_alike and lies_on(curve.points, family, start)
+def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
+    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points.
+
+    Two curves of Hopf points that cross at a double Hopf point differ in the period of their cycles.
+    """
+    family, points, seconds = problem.family, curve.points, start.value.seconds
+    if problem.kind == HOPF and np.isfinite(seconds):
+        points = [point for point in points if abs(point.value.seconds / seconds - 1.0) < SAME_PERIOD]
+    is_alike = curve.kind == problem.kind and curve.family.period == family.period
+    return is_alike and lies_on(points, family, start)
 
 
 def lies_on(points: Sequence[Point], family: Family, start: Point) -> bool:
     """Return whether a curve in two parameters passes through an orbit, at any of the orbit's section points."""
-    for a, b in pairwise(np.array([p.u for p in points])):
+    n = family.system.n_states  # of a Hopf point an unknown stands between the states and the parameters
+    for a, b in pairwise([np.concatenate([p.u[:n], p.u[-2:]]) for p in points]):
         chord = b - a
         length = float(np.linalg.norm(chord))
         if not length:

@@ -21,6 +21,10 @@ LABELS = {
     "fold_neimark_sacker": "LPNS",
     "doubling_neimark_sacker": "PDNS",
     "double_neimark_sacker": "NSNS",
+    "bogdanov_takens": "BT",
+    "generalised_hopf": "GH",
+    "zero_hopf": "ZH",
+    "double_hopf": "HH",
 }
 """Labels of bifurcations, and of points of codimension two, as MatCont and MatContM print them.
 
