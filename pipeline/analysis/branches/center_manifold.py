@@ -149,7 +149,7 @@ def bogdanov_takens(rest: Rest) -> dict[str, float]:
     square = rest.second(q0, q0).real
     a = float(0.5 * p1 @ square)
     b = float(p0 @ square + p1 @ rest.second(q0, q1).real)
-    return {"a": abs(a), "b": b * np.copysign(1.0, a)}
+    return {"a": abs(a), "b": float(b * np.copysign(1.0, a))}
 
 
 def lyapunov(rest: Rest, omega: float, order: int = 3) -> list[float]:

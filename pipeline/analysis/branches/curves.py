@@ -28,14 +28,13 @@ from pipeline.analysis.branches.codimension_two import (
     merged,
 )
 from pipeline.analysis.branches.equilibrium_curves import (
-    BRANCH_POINTS,
     EQUILIBRIUM_KINDS,
     PERSISTS,
     EquilibriumCurve,
     EquilibriumDetector,
 )
 from pipeline.analysis.branches.following import has_halved, opposite
-from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, KINDS, TORUS
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, COEFFICIENTS, DOUBLING, FOLD, HOPF, KINDS, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import (
@@ -52,6 +51,9 @@ from pipeline.layout.vocabulary import frequency_of, model_attribute, section_at
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Settings with longer steps than on a branch, since nothing is located in between. The residual includes the
 test function, and is limited by finite differences of monodromy matrices."""
+
+REST_CURVE = replace(CURVE, longest_step=0.05, max_points=2000, tolerance=1e-11)
+"""Settings of curves of equilibria, which need no integration, and whose states may move far."""
 
 LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 """Settings for locating points of codimension two, in both parameters to 1e-8."""
@@ -255,9 +257,13 @@ def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds,
     return found
 
 
+def _own(settings: Settings, problem: CurveProblem) -> Settings:
+    return settings if problem.family.period else REST_CURVE
+
+
 def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     value = yield Query(problem, u)
-    found = (yield from correct(problem, u, kernel_of(value), settings)) if value.is_finite else None
+    found = (yield from correct(problem, u, kernel_of(value), _own(settings, problem))) if value.is_finite else None
     if found is None or not _persists(problem, found):
         return None
     tangent = kernel_of(found.value)
@@ -301,7 +307,7 @@ def _follow(
 
     tries = LOCATE, CURVE
     detector = Detector(problem, tries) if problem.family.period else EquilibriumDetector(problem, tries)
-    found = yield from trace(problem, start, settings, stop, detector.between)
+    found = yield from trace(problem, start, _own(settings, problem), stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
         last, before = (p.u for p in found.points[:-3:-1])
@@ -352,7 +358,8 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     codimension two).
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
-    with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found.
+    with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found;
+    of equilibria also the coefficients of the normal forms, such as ``special_l2`` (see `center_manifold`).
 
     Parameters
     ----------
@@ -421,6 +428,9 @@ def _special_points(
         "special_period": ("special", np.array([p.family.period for p in found], np.int32), one),
         "special_section": (("special", "state"), section, {"units": state_units(model)}),
     }
+    for name in sorted({name for p in found for name in p.coefficients}):
+        about = {"units": COEFFICIENTS[name], "long_name": f"normal form coefficient {name}"}
+        variables[f"special_{name}"] = ("special", np.array([p.coefficients.get(name, np.nan) for p in found]), about)
     for i, (role, name) in enumerate((("first", first), ("second", second))):
         units = {"units": parameter_units(name, model)}
         variables[f"special_{role}"] = ("special", values[:, i], {**units, "long_name": name})

@@ -46,7 +46,7 @@ from pipeline.analysis.branches.codimension_two import (
     Detector,
     SpecialPoint,
 )
-from pipeline.analysis.branches.kinds import BRANCHING, FOLD, HOPF, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import (
     PARAMETER_STEP,
@@ -59,7 +59,6 @@ from pipeline.analysis.branches.problems import (
     hopf_test,
 )
 
-BRANCH_POINTS = (BRANCHING, PITCHFORK, TRANSCRITICAL)
 EQUILIBRIUM_KINDS = (FOLD, HOPF, *BRANCH_POINTS)
 """Kinds of bifurcations of equilibria that are followed in two parameters."""
 
