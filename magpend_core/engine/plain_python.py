@@ -5,7 +5,7 @@ The attribute ``py_func`` of a compiled function is plain Python, but still call
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -20,15 +20,20 @@ class _PlainModule:
         return _replaced(getattr(self._module, name), self._known)
 
 
-def plain(function: Callable[..., Any]) -> Callable[..., Any]:
+def plain(
+    function: Callable[..., Any], substitutes: Mapping[Callable[..., Any], Callable[..., Any]] | None = None
+) -> Callable[..., Any]:
     """Return the plain Python version of a compiled function, calling plain Python versions of its callees.
 
     Parameters
     ----------
     function
         Dispatcher of numba, recognised by its attribute ``py_func``; any other object is returned unchanged.
+    substitutes
+        Functions to call in place of some callees.
     """
-    found: Callable[..., Any] = _replaced(function, {})
+    known = {id(own): other for own, other in (substitutes or {}).items()}
+    found: Callable[..., Any] = _replaced(function, known)
     return found
 
 

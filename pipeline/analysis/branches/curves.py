@@ -14,6 +14,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct
 from pipeline.analysis.branches.bifurcations import multipliers_of
 from pipeline.analysis.branches.codimension_two import (
     BT,
+    DOUBLE_HOPF,
     DOUBLING_TORUS,
     FOLD_FLIP,
     FOLD_TORUS,
@@ -22,9 +23,16 @@ from pipeline.analysis.branches.codimension_two import (
     POINT_KINDS,
     R1,
     R2,
+    ZERO_HOPF,
     Detector,
     SpecialPoint,
     merged,
+)
+from pipeline.analysis.branches.equilibrium_curves import (
+    EQUILIBRIUM_KINDS,
+    PERSISTS,
+    EquilibriumCurve,
+    EquilibriumDetector,
 )
 from pipeline.analysis.branches.following import has_halved, opposite
 from pipeline.analysis.branches.homoclinic_curves import (
@@ -32,9 +40,20 @@ from pipeline.analysis.branches.homoclinic_curves import (
     Bounds,
     homoclinic_curves,
     loops_of,
+    saddle_nodes_of,
     saddle_quantity,
 )
-from pipeline.analysis.branches.kinds import CURVE_KINDS, DOUBLING, FOLD, HOMOCLINIC, KINDS, TORUS
+from pipeline.analysis.branches.kinds import (
+    BRANCH_POINTS,
+    COEFFICIENTS,
+    CURVE_KINDS,
+    DOUBLING,
+    FOLD,
+    HOMOCLINIC,
+    HOPF,
+    KINDS,
+    TORUS,
+)
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import (
@@ -51,6 +70,9 @@ from pipeline.layout.vocabulary import frequency_of, model_attribute, section_at
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Settings with longer steps than on a branch, since nothing is located in between. The residual includes the
 test function, and is limited by finite differences of monodromy matrices."""
+
+REST_CURVE = replace(CURVE, longest_step=0.05, max_points=2000, tolerance=1e-11)
+"""Settings of curves of equilibria, which need no integration, and whose states may move far."""
 
 LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 """Settings for locating points of codimension two, in both parameters to 1e-8."""
@@ -70,8 +92,14 @@ SPRINGING = {
     FOLD_FLIP: ((FOLD, 1), (DOUBLING, 1)),
     FOLD_TORUS: ((FOLD, 1), (TORUS, 1)),
     DOUBLING_TORUS: ((DOUBLING, 1), (TORUS, 1)),
+    BT: ((FOLD, 1), (HOPF, 1)),
+    ZERO_HOPF: ((FOLD, 1), (HOPF, 1)),
+    DOUBLE_HOPF: ((HOPF, 1),),
 }
 """Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit."""
+
+SAME_PERIOD = 0.1
+"""Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
 
 AMPLITUDES = (0.02, 0.05, 0.1)
 """Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
@@ -86,7 +114,7 @@ class Curve:
     points: list[Point]  # orbits in order
     ends: tuple[str, str]  # reasons for both ends, of `CURVE_ENDS`
     # number of the located bifurcation it started from; -1 if it springs from a point of codimension two, or from an
-    # end of a branch (homoclinic orbits)
+    # end of a branch (homoclinic orbits, saddle nodes on a circle)
     start: int
     special: list[SpecialPoint] = field(default_factory=list)  # points of codimension two on it
     n_missed: int = 0  # sign changes of their test functions that could not be located
@@ -129,6 +157,8 @@ def curves_from(
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     starts = _starts(branches, parameters, second, bounds, longest)
+    nodes = saddle_nodes_of(branches, parameters, second, bounds, longest)
+    starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
     loops = homoclinic_curves(loops_of(branches, parameters, second, bounds, longest), bounds)
     return [
         *continue_curves(starts, bounds, CURVE, longest, generations),
@@ -151,7 +181,7 @@ def continue_curves(
 
     Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
     """
-    problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
+    problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
     firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     curves: list[Curve] = []
@@ -162,7 +192,7 @@ def continue_curves(
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
         sprung = [
-            _sprung(BifurcationProblem(replace(one.family, period=times * one.family.period), kind), one)
+            _sprung(_problem_of(replace(one.family, period=times * one.family.period), kind), one)
             for one in fresh
             for kind, times in SPRINGING.get(one.kind, ())
             if times == 1 or times * one.family.period <= max_period
@@ -173,30 +203,41 @@ def continue_curves(
     return curves
 
 
-Ready = tuple[int, BifurcationProblem, Point]
+CurveProblem = BifurcationProblem | EquilibriumCurve
+"""The problems with two free parameters, whose solutions are curves of bifurcations."""
+
+
+def _problem_of(family: Family, kind: str) -> CurveProblem:
+    return BifurcationProblem(family, kind) if family.period else EquilibriumCurve(family, kind)
+
+
+Ready = tuple[int, CurveProblem, Point]
 """Number of a located point (-1: none), the problem of its curve, and the curve's first point."""
 
 
 def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
     """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
-    ready = [r for r in ready if not any(_passes(curve, r[1].kind, r[1].family, r[2]) for curve in curves)]
+    ready = [r for r in ready if not any(_passes(curve, r[1], r[2]) for curve in curves)]
     traces = run_together(
         [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
     )
     for i, (number, problem, first) in enumerate(ready):
         (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
-        is_known = any(_passes(curve, problem.kind, problem.family, first) for curve in curves)
+        is_known = any(_passes(curve, problem, first) for curve in curves)
         if not is_known and (number >= 0 or len(points) > 2):
             ends = back.end, ahead.end
             n_missed = missed_before + missed_after
             curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after, n_missed))
 
 
-def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
+def _sprung(problem: CurveProblem, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first orbit on a bifurcation curve that starts at a point of codimension two; None if there is no such
     curve.
     """
+    if isinstance(problem, EquilibriumCurve):
+        found = yield from _first(problem, problem.start(at.point.u, _frequency_at(at)), CURVE)
+        return None if found is None else (problem, found)
     if problem.family.period == at.family.period:
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
@@ -209,6 +250,18 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[Bifurc
     return None
 
 
+def _frequency_at(at: SpecialPoint) -> float:
+    """Return the angular frequency [rad/s] of the Hopf points that spring from a point of codimension two; at a double
+    Hopf point that of the other pair.
+    """
+    if at.kind == BT:
+        return 0.0
+    values = np.linalg.eigvals(at.point.value.monodromy)
+    upper = values[values.imag > 0.0]
+    near = np.sort(upper[np.argsort(np.abs(upper.real))][: 2 if at.kind == DOUBLE_HOPF else 1].imag)
+    return float(near[np.argmax(np.abs(near - 2.0 * np.pi / at.point.value.seconds))] if len(near) > 1 else near[0])
+
+
 def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
     """Select the located bifurcations to continue. Each comes with its family of orbits and its start in scaled
     unknowns.
@@ -219,32 +272,43 @@ def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds,
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
-        if not 0 < period <= max_period or kind not in TESTS:
+        if period > max_period or kind not in (TESTS if period else EQUILIBRIUM_KINDS):
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
         family = Family(parameters.model.system, period, frequency, own.pack(), (first, second), (scales[0], scales[1]))
         here = frequency if second == FREQUENCY else own[second]
         state = np.asarray(ds["bifurcation_section"].values[k, 0])
-        found.append((k, family, kind, family.unknowns(state, [float(ds["value"][k]), here])))
+        u = family.unknowns(state, [float(ds["value"][k]), here])
+        found.append((k, family, kind, u if period else EquilibriumCurve(family, kind).start(u)))
     return found
 
 
-def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+def _own(settings: Settings, problem: CurveProblem) -> Settings:
+    return settings if problem.family.period else REST_CURVE
+
+
+def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     value = yield Query(problem, u)
-    found = (yield from correct(problem, u, kernel_of(value), settings)) if value.is_finite else None
-    if found is None:
+    found = (yield from correct(problem, u, kernel_of(value), _own(settings, problem))) if value.is_finite else None
+    if found is None or not _persists(problem, found):
         return None
     tangent = kernel_of(found.value)
     return replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))
 
 
+def _persists(problem: CurveProblem, point: Point) -> bool:
+    """Return False at an imperfect branch point: one that a change of the second parameter has broken up."""
+    return problem.kind not in BRANCH_POINTS or abs(float(point.u[problem.family.system.n_states])) < PERSISTS
+
+
 def _follow(
-    problem: BifurcationProblem, start: Point, bounds: Bounds, settings: Settings
+    problem: CurveProblem, start: Point, bounds: Bounds, settings: Settings
 ) -> Steps[tuple[Trace, list[SpecialPoint], int]]:
     """Follow a bifurcation curve in one direction, and locate its points of codimension two; stay within the bounds.
 
-    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real.
+    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real, and a Hopf curve
+    at the Bogdanov-Takens point where its pair of eigenvalues does.
     """
 
     def is_inside(u: np.ndarray) -> bool:
@@ -257,6 +321,10 @@ def _follow(
             return "bound"
         if problem.kind == TORUS and not _has_torus(here):
             return "resonance"
+        if problem.kind == HOPF and not np.isfinite(here.value.seconds):
+            return BT
+        if not _persists(problem, here):
+            return "stuck"
         if has_halved(problem.family, points):
             return "period_halving"
         step = np.linalg.norm(here.u - points[-2].u)
@@ -264,16 +332,17 @@ def _follow(
             return "closed"
         return ""
 
-    detector = Detector(problem, (LOCATE, CURVE))
-    found = yield from trace(problem, start, settings, stop, detector.between)
+    tries = LOCATE, CURVE
+    detector = Detector(problem, tries) if problem.family.period else EquilibriumDetector(problem, tries)
+    found = yield from trace(problem, start, _own(settings, problem), stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
         last, before = (p.u for p in found.points[:-3:-1])
         special = [one for one in special if np.linalg.norm(one.point.u - last) > np.linalg.norm(before - last)]
-    if found.end in ("bound", "resonance"):
+    if found.end in ("bound", "resonance", BT):
         found.points.pop()
-    if found.end == "resonance":
-        found.points += [one.point for one in special if one.kind in (R1, R2)][-1:]
+    if found.end in ("resonance", BT):
+        found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
 
 
@@ -283,15 +352,22 @@ def _has_torus(point: Point) -> bool:
     return bool(len(pairs)) and bool(np.abs(np.abs(pairs) - 1.0).min() < 1e-4)
 
 
-def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points."""
-    is_alike = curve.kind == kind and curve.family.period == family.period
-    return is_alike and lies_on(curve.points, family, start)
+def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
+    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points.
+
+    Two curves of Hopf points that cross at a double Hopf point differ in the period of their cycles.
+    """
+    family, points, seconds = problem.family, curve.points, start.value.seconds
+    if problem.kind == HOPF and np.isfinite(seconds):
+        points = [point for point in points if abs(point.value.seconds / seconds - 1.0) < SAME_PERIOD]
+    is_alike = curve.kind == problem.kind and curve.family.period == family.period
+    return is_alike and lies_on(points, family, start)
 
 
 def lies_on(points: Sequence[Point], family: Family, start: Point) -> bool:
     """Return whether a curve in two parameters passes through an orbit, at any of the orbit's section points."""
-    for a, b in pairwise(np.array([p.u for p in points])):
+    n = family.system.n_states  # of a Hopf point an unknown stands between the states and the parameters
+    for a, b in pairwise([np.concatenate([p.u[:n], p.u[-2:]]) for p in points]):
         chord = b - a
         length = float(np.linalg.norm(chord))
         if not length:
@@ -309,7 +385,8 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     codimension two).
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
-    with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found.
+    with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found;
+    of equilibria also the coefficients of the normal forms, such as ``special_l2`` (see `center_manifold`).
 
     Parameters
     ----------
@@ -388,6 +465,9 @@ def _special_points(
         "special_period": ("special", np.array([p.family.period for p in found], np.int32), one),
         "special_section": (("special", "state"), section, {"units": state_units(model)}),
     }
+    for name in sorted({name for p in found for name in p.coefficients}):
+        about = {"units": COEFFICIENTS[name], "long_name": f"normal form coefficient {name}"}
+        variables[f"special_{name}"] = ("special", np.array([p.coefficients.get(name, np.nan) for p in found]), about)
     for i, (role, name) in enumerate((("first", first), ("second", second))):
         units = {"units": parameter_units(name, model)}
         variables[f"special_{role}"] = ("special", values[:, i], {**units, "long_name": name})

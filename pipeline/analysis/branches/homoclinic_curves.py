@@ -18,7 +18,7 @@ ends where the orbit comes near another equilibrium: ``heteroclinic``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -43,7 +43,7 @@ from pipeline.analysis.branches.homoclinic import (
     lay_nodes,
     loop_of,
 )
-from pipeline.analysis.branches.kinds import HOMOCLINIC
+from pipeline.analysis.branches.kinds import HOMOCLINIC, SNIC
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.tabular import words_of
@@ -300,23 +300,45 @@ def loops_of(branches: xr.Dataset, parameters: Parameters, second: str, bounds: 
     max_period
         Longest period of the cycles [returns].
     """
-    if "limit_value" not in branches or second not in parameters.names:
-        return []
-    found, names = [], (str(branches.attrs["parameter"]), second)
-    scales = tuple(high - low for low, high in bounds)
-    for branch, end in np.argwhere(np.isfinite(branches["limit_value"].values)):
-        one = branches.isel(branch=int(branch))
-        kind = words_of(one[("first_end", "last_end")[end]])[int(one[("first_end", "last_end")[end]])]
-        if kind != HOMOCLINIC or int(one["orbit_period"]) > max_period:
-            continue
-        own = parameters.replace(**{n: float(one[n]) for n in parameters.names if n in one})
-        family = Family(parameters.model.system, 0, 1.0, own.pack(), names, (scales[0], scales[1]))
-        last = one.isel(point=(int(one["n_points"]) - 1) * int(end), phase=0)
-        values = np.array([float(last["parameter"]), own[second]])
-        limit = np.array([float(one["limit_value"][end]), own[second]])
+    found = []
+    for one, end, family in _ends_of(branches, HOMOCLINIC, parameters, second, bounds, max_period):
+        last = one.isel(point=(int(one["n_points"]) - 1) * end, phase=0)
+        here = float(parameters[second])
+        values, limit = np.array([[float(last["parameter"]), here], [float(one["limit_value"][end]), here]])
         saddle = one["limit_state"].values[end]
         found.append(_cycle(family, last["section"].values, values, float(last["period_s"]), saddle, limit))
     return found
+
+
+def saddle_nodes_of(
+    branches: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int
+) -> list[tuple[Family, np.ndarray]]:
+    """Return the saddle nodes at which branches end as ``snic``: families of equilibria and their unknowns.
+
+    They are folds of equilibria, whose curve goes on also where the saddle node is on no circle. The parameters are
+    those of `loops_of`.
+    """
+    return [
+        (family, family.unknowns(one["limit_state"].values[end], [float(one["limit_value"][end]), parameters[second]]))
+        for one, end, family in _ends_of(branches, SNIC, parameters, second, bounds, max_period)
+    ]
+
+
+def _ends_of(
+    branches: xr.Dataset, kind: str, parameters: Parameters, second: str, bounds: Bounds, max_period: int
+) -> Iterator[tuple[xr.Dataset, int, Family]]:
+    """Yield the branches that have an end of a kind, the number of this end, and the family of its equilibria."""
+    if "limit_value" not in branches or second not in parameters.names:
+        return
+    names = (str(branches.attrs["parameter"]), second)
+    (low, high), (second_low, second_high) = bounds
+    for branch, end in np.argwhere(np.isfinite(branches["limit_value"].values)).tolist():
+        one = branches.isel(branch=branch)
+        code = one[("first_end", "last_end")[end]]
+        if words_of(code)[int(code)] == kind and int(one["orbit_period"]) <= max_period:
+            own = parameters.replace(**{n: float(one[n]) for n in parameters.names if n in one})
+            scales = (high - low, second_high - second_low)
+            yield one, end, Family(parameters.model.system, 0, 1.0, own.pack(), names, scales)
 
 
 def _cycle(
