@@ -31,7 +31,7 @@ from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.problems import PARAMETER_STEP, STATE_STEP, Ends, Family, Rows, Value
+from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Rows, Value
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
 SETTINGS = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-9, max_iterations=8)
@@ -103,6 +103,16 @@ class HomoclinicProblem:
         """Weight of the nodes in the arclength, which makes it their root mean square."""
         return 1.0 / float(np.sqrt(self.n_segments + 1))
 
+    @property
+    def atol(self) -> float:
+        """Absolute tolerance of the integrations."""
+        return BRANCH_RTOL * min(1.0, self.extent)
+
+    @property
+    def _step(self) -> float:
+        """Step of central differences, shorter for small orbits, which respond to small changes."""
+        return PARAMETER_STEP * min(1.0, self.extent)
+
     def packed_up(self, parts: Parts) -> np.ndarray:
         """Return the vector of unknowns."""
         time = TIME_UNIT * np.log(parts.seconds)
@@ -136,10 +146,10 @@ class HomoclinicProblem:
     def _joins(self, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
         """Return the gaps between the segments of the orbit, and their derivatives."""
         m, n, scales = self.n_segments, self.system.n_states, np.asarray(self.system.scales)
-        shifts = PARAMETER_STEP * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+        shifts = self._step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         unknowns = [np.column_stack([parts.nodes[:-1], np.tile(parts.values + s, (m, 1))]) for s in shifts]
         rows = self.family.rows(np.concatenate(unknowns))
-        images, tangents = flown(self.family, rows.states, rows.parameters, parts.seconds / m)
+        images, tangents = flown(self.family, rows, parts.seconds / m, self.atol)
         images = (images / scales).reshape(5, m, n)
         here = self.family.rows(np.append(parts.nodes[0], parts.values)[None]).parameters[0]
         speeds = rates_at(self.system, images[0] * scales, here) / scales
@@ -149,8 +159,8 @@ class HomoclinicProblem:
             by[k, :, own] = self.family.scaled(tangents[k]) / self._weight
             by[k, :, n * (k + 1) : n * (k + 2)] = -np.eye(n) / self._weight
         by[:, :, -3] = speeds * (parts.seconds / m / TIME_UNIT)
-        by[:, :, -2] = (images[1] - images[2]) / (2.0 * PARAMETER_STEP)
-        by[:, :, -1] = (images[3] - images[4]) / (2.0 * PARAMETER_STEP)
+        by[:, :, -2] = (images[1] - images[2]) / (2.0 * self._step)
+        by[:, :, -1] = (images[3] - images[4]) / (2.0 * self._step)
         gaps = (images[0] - parts.nodes[1:]).ravel()
         return gaps / self.extent, by.reshape(m * n, -1) / self.extent
 
@@ -160,7 +170,7 @@ class HomoclinicProblem:
         first, last = (self._away(parts.nodes[k], parts.saddle) for k in (0, -1))
         at = np.concatenate([parts.saddle, parts.values])
         onto = self._projections(at)
-        steps = np.diag([*[STATE_STEP] * n, *[PARAMETER_STEP] * 2])
+        steps = self._step * np.eye(n + 2)
         sides = [(self._projections(at + h), self._projections(at - h), 2.0 * h.max()) for h in steps]
         turns = [[(up[i] - down[i]) / width for i in (0, 1)] for up, down, width in sides]
         found = np.concatenate([onto[0].T @ first, onto[1].T @ last])
@@ -194,26 +204,27 @@ class HomoclinicProblem:
     def _rest(self, parts: Parts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the scaled rates at the saddle, their derivatives, and the Jacobian [1/s]."""
         n, scales = self.system.n_states, np.asarray(self.system.scales)
-        shifts = PARAMETER_STEP * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+        shifts = self._step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         rows = self.family.rows(np.column_stack([np.tile(parts.saddle, (5, 1)), parts.values + shifts]))
         rates = [rates_at(self.system, rows.states[:1], p)[0] / scales for p in rows.parameters]
         jacobian = jacobian_at(self.system, rows.states[:1], rows.parameters[0])[0]
         by = np.zeros((n, self.size))
         by[:, -n - 3 : -3] = self.family.scaled(jacobian)
-        by[:, -2] = (rates[1] - rates[2]) / (2.0 * PARAMETER_STEP)
-        by[:, -1] = (rates[3] - rates[4]) / (2.0 * PARAMETER_STEP)
-        return rates[0] * self.unit, by * self.unit, jacobian
+        by[:, -2] = (rates[1] - rates[2]) / (2.0 * self._step)
+        by[:, -1] = (rates[3] - rates[4]) / (2.0 * self._step)
+        return rates[0] * self.unit / self.radius, by * self.unit / self.radius, jacobian
 
 
-def flown(family: Family, states: np.ndarray, packed: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def flown(family: Family, rows: Rows, seconds: float, atol: float) -> tuple[np.ndarray, np.ndarray]:
     """Return states after a time, shape (m, n_states), and their derivatives by the start, (m, n_states, n_states)."""
+    states = rows.states
     n, sizes = family.system.n_states, np.asarray(family.system.sizes)
     system = replace(with_tangents(family.system, n), n_controlled=None)
     starts = np.concatenate([states, np.tile(np.diag(sizes).ravel(), (len(states), 1))], axis=1)
     drive = Drive(np.array([seconds]))
     which = np.zeros(len(states), np.int64)
     found = sample(
-        system, packed, starts, [np.array([seconds])], piece=which, drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL
+        system, rows.parameters, starts, [np.array([seconds])], piece=which, drives=[drive], rtol=BRANCH_RTOL, atol=atol
     )
     ends = found.states[:, 0]
     return ends[:, :n], ends[:, n:].reshape(-1, n, n).transpose(0, 2, 1) / sizes
@@ -375,7 +386,7 @@ def loop_of(problem: HomoclinicProblem, u: np.ndarray) -> Loop:
         piece=np.zeros(m, np.int64),
         drives=[Drive(np.array([step]))],
         rtol=BRANCH_RTOL,
-        atol=BRANCH_RTOL,
+        atol=problem.atol,
     )
     states = np.concatenate([found.states[:, :-1].reshape(-1, family.system.n_states), parts.nodes[-1:] * scales])
     every = np.append((step * np.arange(m)[:, None] + times[:-1]).ravel(), parts.seconds)

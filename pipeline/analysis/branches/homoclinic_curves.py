@@ -55,7 +55,7 @@ HETEROCLINIC = "heteroclinic"
 AT_ONCE = 8
 """Points that are followed before the nodes are laid anew."""
 
-VANISHED = 0.05
+VANISHED = 0.08
 """A leading eigenvalue has vanished if it is below this share of its largest value on the curve."""
 
 RANGE, FITTED = 6.0, 7
@@ -259,19 +259,20 @@ def _carry_on(family: Family, arm: Arm) -> None:
     wanted = size[-1] * np.geomspace(1.0, RANGE, FITTED)
     chosen = np.unique([int(np.abs(size - one).argmin()) for one in wanted])[::-1]
     x, u = size[chosen], np.array([arm.points[k].u for k in chosen])
-    last, shorter = _at_zero(x, u), _at_zero(x[:-1], u[:-1])
+    last = _at_zero(x, u)
+    away = np.array([_at_zero(x[:-1], u[:-1]), _at_zero(x[1:], u[1:])]) - last
     before = arm.points[-1]
     rows = family.rows(last[None])
     value = replace(
         before.value,
-        residual=np.abs(last - shorter).max(keepdims=True),
+        residual=np.abs(away).max(keepdims=True).ravel(),
         images=rows.states,
         monodromy=jacobian_at(family.system, rows.states, rows.parameters[0])[0],
         seconds=np.inf,
     )
     end = Point(last, before.tangent, value, 0)
     arm.points.append(end)
-    error = np.abs(family.values(last) - family.values(shorter))
+    error = np.abs(away).max(axis=0)[-2:] * np.asarray(family.scales)
     arm.special.append(SpecialPoint(arm.end, family, end, error))
 
 
