@@ -34,10 +34,10 @@ from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Rows, Value
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
-SETTINGS = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-9, max_iterations=8)
+SETTINGS = Settings(first_step=5e-3, longest_step=0.04, max_points=400, tolerance=1e-9, max_iterations=8)
 """Settings of the continuation; Newton's method mostly ends far below the tolerance."""
 
-RADIUS = 1e-4
+RADIUS = 1e-5
 """Distance r from the saddle at which its manifolds are replaced by their tangents, in units of the orbit's size."""
 
 STRETCH, LEAST_SEGMENTS, MOST_SEGMENTS = 1.0, 12, 120

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq, fsolve
+from scipy.optimize import brentq, fsolve, minimize_scalar
 
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
@@ -152,6 +152,12 @@ def neuron_split(y, rate):
     return ends[0] - ends[1]
 
 
+def resting_current(v):
+    """Minus the current at which the neuron rests at a voltage."""
+    w = 0.5 * (1.0 + np.tanh((v - 0.1) / 0.145))
+    return neuron_rates([v, w], 0.0, 1.0)[0]
+
+
 def test_curves_from__homoclinic_orbits_of_a_neuron():
     """From the end of a branch. The fold of the equilibria lies at one current, whatever the rate of w."""
     ds = followed(NEURON, "v", [0.0365, 0.1], "y", 0.06, 0.09, level=0.0365, y=0.075)
@@ -165,14 +171,17 @@ def test_curves_from__homoclinic_orbits_of_a_neuron():
         assert near == pytest.approx(known, abs=1e-8)
     told = curves_dataset(found, "y", "rate", parameters.model)
     lines = curves_table(told).lines
-    print("\n".join(lines))
-    print(curve.values[0], curve.values[-1], curve.ends)
+    (end,) = curve.special
+    fold = minimize_scalar(resting_current, (-0.3, -0.24, -0.2), tol=1e-12)
+    assert end.kind == curve.ends[0] == "saddle_node_homoclinic"
+    assert end.values[0] == pytest.approx(-fold.fun, abs=1e-7)
+    np.testing.assert_allclose(end.point.u[0], fold.x, atol=1e-5)
     assert any("HOM homoclinic, saddle quantity" in line for line in lines)
     plot_curves(told)
 
 
-def lorenz_loop(rho, b, sigma=10.0):
-    """Whether the first turn of the origin's unstable manifold crosses x = 0, by DOP853."""
+def lorenz(rho, beta, sigma=10.0):
+    """Return the trajectory that leaves the origin along its unstable eigenvector, until x = 0 or t = 15."""
 
     def crossing(_, state):
         return state[0]
@@ -182,25 +191,40 @@ def lorenz_loop(rho, b, sigma=10.0):
     start = 1e-7 * np.array([1.0, 1.0 + own / sigma, 0.0])
 
     def rates(_, u):
-        return [sigma * (u[1] - u[0]), u[0] * (rho - u[2]) - u[1], u[0] * u[1] - b * u[2]]
+        return [sigma * (u[1] - u[0]), u[0] * (rho - u[2]) - u[1], u[0] * u[1] - beta * u[2]]
 
-    found = solve_ivp(rates, (0.0, 15.0), start, "DOP853", events=crossing, rtol=1e-11, atol=1e-13)
-    return len(found.t_events[0]) == 0
+    return solve_ivp(rates, (0.0, 15.0), start, "DOP853", events=crossing, rtol=1e-11, atol=1e-13)
 
 
-def test_curves_from__homoclinic_orbits_of_lorenz():
+def test_homoclinic_curves__lorenz():
     """The stable manifold of the origin has two dimensions; the curve passes (13.926557407, 8/3)."""
-    ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 13.0, 16.5, level=10.0, rho=15.9959022)
-    parameters = flow(LORENZ).load(rho=15.9959022)
-    found = curves_from(ds, parameters, "beta", ((10.0, 20.0), (2.2, 3.2)), 1)
-    (curve,) = [one for one in found if one.kind == "homoclinic"]
+    first = lorenz(13.92, 8.0 / 3.0)
+    size = np.linalg.norm(first.y, axis=0)
+    after = int(size.argmax())
+    until = after + int(size[after:].argmin()) + 1
+    family = family_in(LORENZ, "rho", "beta", (10.0, 1.0))
+    guess = Loop(family, first.t[:until], first.y.T[:until], np.zeros(3), np.array([13.92, 8.0 / 3.0]))
+    (curve,) = homoclinic_curves([guess], ((10.0, 20.0), (2.55, 2.8)))
     assert curve.ends == ("bound", "bound")
-    assert at_second(curve, 8.0 / 3.0) == pytest.approx(13.926557407, abs=1e-7)
-    for b in (2.4, 3.0):
-        low, high = at_second(curve, b) - 1e-3, at_second(curve, b) + 1e-3
-        assert lorenz_loop(low, b)
-        assert not lorenz_loop(high, b)
-        while high - low > 1e-9:
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if lorenz_loop(middle, b) else (low, middle)
-        assert at_second(curve, b) == pytest.approx(low, abs=1e-7)
+    assert at_second(curve, 8.0 / 3.0) == pytest.approx(13.926557407, abs=2e-9)
+    for beta in (2.57, 2.77):
+        near = at_second(curve, beta)
+        low, high = near - 1e-7, near + 1e-7
+        assert not len(lorenz(low, beta).t_events[0])  # it comes to rest at the other equilibrium
+        assert len(lorenz(high, beta).t_events[0])
+
+
+def test_curves_from__saddle_node_on_a_circle():
+    """The angle's rate is omega - level*sin: the fold of the equilibria is at omega = level."""
+    equations = table(
+        "level_circle",
+        {"x": "x*(1 - s) - y*rate", "y": "y*(1 - s) + x*rate"},
+        {"omega": 1.3, "level": 1.0},
+        define={"s": "x**2 + y**2", "rate": "omega - level*y/sqrt(s)"},
+    )
+    ds = followed(equations, "y", [1.0, 0.0], "omega", 0.5, 1.5, omega=1.3)
+    parameters = flow(equations).load(omega=1.3)
+    (curve,) = curves_from(ds, parameters, "level", ((0.5, 1.5), (0.7, 1.3)), 1)
+    assert (curve.kind, curve.family.period, curve.start) == ("fold", 0, -1)
+    np.testing.assert_allclose(curve.values[:, 0], curve.values[:, 1], atol=1e-8)
+    assert np.ptp(curve.values[:, 1]) > 0.5
