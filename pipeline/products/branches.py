@@ -101,7 +101,8 @@ CURVES = Analysis(
     "curves",
     """Continue folds, period doublings and Neimark-Sacker points in the plane of two parameters.
 
-    Starts from the bifurcations that `branches` locates.""",
+    Starts from the bifurcations that `branches` locates. Follows also the homoclinic orbits and the saddle nodes at which
+    branches end.""",
     CurveOptions,
     compute=f"{_ROOM}:curves",
     table="pipeline.analysis.branches.analysis:curves_table",
