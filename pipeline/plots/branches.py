@@ -426,7 +426,9 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
 def line_note(ds: xr.Dataset) -> str:
     """Return a text on which line style stands for which kind of bifurcation."""
     present = {KINDS[int(kind)] for kind in ds["kind"].values}
-    return ", ".join(f"{_STYLE_NAMES[_ON_MAP[kind]]} {LABELS[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
+    return ", ".join(
+        f"{_STYLE_NAMES[_ON_MAP[kind]]} {LABELS[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present
+    )
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:

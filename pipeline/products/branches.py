@@ -99,7 +99,7 @@ BRANCHES = Analysis(
 
 CURVES = Analysis(
     "curves",
-    """Continue folds, period doublings and Neimark-Sacker points in the plane of two parameters.
+    """Continue folds, doublings, Neimark-Sacker, Hopf and branch points in the plane of two parameters.
 
     Starts from the bifurcations that `branches` locates.""",
     CurveOptions,
@@ -108,6 +108,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
+    version=2,
 )
 
 BANDS = Analysis(

@@ -121,11 +121,12 @@ def _carried(of: Monomials, states: np.ndarray, flow: np.ndarray) -> np.ndarray:
     """Return the series of H'(w) G(w)."""
     found = np.zeros_like(states)
     at = {tuple(e): k for k, e in enumerate(of.exponents.tolist())}
+    ones = np.eye(len(flow), dtype=int)
     for i, own in enumerate(flow):
         slope = np.zeros_like(states)
         for k, exponents in enumerate(of.exponents):
             if exponents[i]:
-                slope[:, at[tuple((exponents - np.eye(len(flow), dtype=int)[i]).tolist())]] = exponents[i] * states[:, k]
+                slope[:, at[tuple((exponents - ones[i]).tolist())]] = exponents[i] * states[:, k]
         found += of.times(slope, own)
     return found
 

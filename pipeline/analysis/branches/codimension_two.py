@@ -142,7 +142,6 @@ class Detector:
         """Locate and store the point of codimension two where a test function vanishes between two points of a curve;
         count failures.
         """
-
         ends = None
         for settings in self.settings:
             ends = yield from find_root(self.problem, a, b, partial(self._test, kind, frame), settings)

@@ -117,7 +117,9 @@ class EquilibriumCurve(FamilyProblem):
             return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobian, is_rest=True)
         right, left = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
         steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
-        found = np.array([self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))])
+        found = np.array(
+            [self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))]
+        )
         derivative = (found[1 : 1 + self.size] - found[1 + self.size :]).T / (2.0 * steps)
         derivative[:n, :n] = self.family.scaled(jacobian) * self._unit
         seconds = np.nan
@@ -253,7 +255,9 @@ class EquilibriumDetector(Detector):
             else:
                 omega = float(np.abs(upper[np.argmin(np.abs(upper.real))]))
                 own = _omega(point) if is_hopf else 0.0
-                found = partial(double_hopf, rest, *sorted((own, omega))) if is_hopf else partial(zero_hopf, rest, omega)
+                found = (
+                    partial(double_hopf, rest, *sorted((own, omega))) if is_hopf else partial(zero_hopf, rest, omega)
+                )
         return replace(one, coefficients=found())
 
 
@@ -267,3 +271,11 @@ def _product(values: np.ndarray) -> float:
 
 def _pairs(values: np.ndarray) -> float:
     return hopf_test(np.diag(values)) if len(values) > 1 else 1.0
+
+
+def frequencies_at(one: SpecialPoint) -> list[float]:
+    """Return the angular frequencies [rad/s] of the imaginary pairs at a point of codimension two of equilibria."""
+    n_pairs = {GENERALISED_HOPF: 1, ZERO_HOPF: 1, DOUBLE_HOPF: 2}.get(one.kind, 0)
+    values = np.linalg.eigvals(one.point.value.monodromy)
+    upper = values[values.imag > 0.0]
+    return [float(value) for value in upper[np.argsort(np.abs(upper.real))][:n_pairs].imag]
