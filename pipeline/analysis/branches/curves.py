@@ -34,6 +34,7 @@ from pipeline.analysis.branches.equilibrium_curves import (
     EquilibriumCurve,
     EquilibriumDetector,
     frequencies_at,
+    kind_of_zero,
 )
 from pipeline.analysis.branches.exploring import cycle_direction, cycle_family
 from pipeline.analysis.branches.following import end_of_crossings, has_halved, opposite
@@ -229,7 +230,12 @@ def _rest_sprung(problem: EquilibriumCurve, at: SpecialPoint) -> Steps[tuple[Cur
     omegas = frequencies_at(at) or [0.0]
     own = 2.0 * np.pi / at.point.value.seconds
     omega = omegas[0] if len(omegas) == 1 else max(omegas, key=lambda one: abs(one - own))
-    found = yield from _first(problem, problem.start(at.point.u, omega), CURVE)
+    u = problem.start(at.point.u, omega)
+    if problem.kind == FOLD:
+        value = yield Query(problem, u)
+        problem = EquilibriumCurve(problem.family, kind_of_zero(problem.family, u, value))
+        u = problem.start(u)
+    found = yield from _first(problem, u, CURVE)
     return None if found is None else (problem, found)
 
 
@@ -337,8 +343,7 @@ def _follow(
             return "closed"
         return ""
 
-    tries = LOCATE, CURVE
-    detector = Detector(problem, tries) if problem.family.period else EquilibriumDetector(problem, tries)
+    detector = (EquilibriumDetector if isinstance(problem, EquilibriumCurve) else Detector)(problem, (LOCATE, CURVE))
     found = yield from trace(problem, start, _own(settings, problem), stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
