@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
+from numba import config
+
 
 class _PlainModule:
     """Proxy of a module that gives the plain Python versions of its compiled functions."""
@@ -40,12 +42,17 @@ def plain(
 def _replaced(value: Any, known: dict[int, Any]) -> Any:
     if id(value) in known:
         return known[id(value)]
-    source = getattr(value, "py_func", None)
+    source = getattr(value, "py_func", value if _is_left_plain(value) else None)
     if isinstance(source, FunctionType):
         return _rebuilt(value, source, known)
     if isinstance(value, ModuleType):
         return _PlainModule(value, known)
     return value
+
+
+def _is_left_plain(value: Any) -> bool:
+    """Return whether a function of the engine or of a model was not compiled, as with ``NUMBA_DISABLE_JIT``."""
+    return bool(config.DISABLE_JIT) and str(getattr(value, "__module__", "")).startswith("magpend_core.")
 
 
 def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> FunctionType:

@@ -28,11 +28,19 @@ def test_rates_on__sympy(name):
     found = rates_on(model.system, model.load().pack(), of, states)
     x, y, u, v = sympy.symbols("x y u v")
     written = text.replace("^", "**").replace("where(x < 1, x**2*y, y)", "x**2*y").replace("sign(y - 3)", "(-1)")
-    written = written.replace("abs(x - 2)", "(2 - x)").replace("max(x*y, x**3 - 4)", "x*y").replace("min(x, sin(y))", "sin(y)")
+    written = (
+        written.replace("abs(x - 2)", "(2 - x)")
+        .replace("max(x*y, x**3 - 4)", "x*y")
+        .replace("min(x, sin(y))", "sin(y)")
+    )
     f = sympy.sympify(written, {"a": sympy.Float(a, 40)})
     slopes = {(i, j): complex(f.diff(x, i, y, j).evalf(40, subs=at)) for i in range(6) for j in range(6 - i)}
     series = sum(
-        d * (q[0, 0] * u + q[0, 1] * v) ** i * (q[1, 0] * u + q[1, 1] * v) ** j / sympy.factorial(i) / sympy.factorial(j)
+        d
+        * (q[0, 0] * u + q[0, 1] * v) ** i
+        * (q[1, 0] * u + q[1, 1] * v) ** j
+        / sympy.factorial(i)
+        / sympy.factorial(j)
         for (i, j), d in slopes.items()
     )
     known = sympy.Poly(sympy.expand(series), u, v)

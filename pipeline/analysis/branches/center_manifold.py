@@ -29,6 +29,9 @@ import numpy as np
 from magpend_core.jets import Monomials, monomials, rates_on
 from pipeline.analysis.branches.problems import Family
 
+NO_TERM = 1e-9
+"""Coefficient, relative to the largest one, that counts as 0: a ratio to it has no meaning."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rest:
@@ -121,11 +124,12 @@ def _carried(of: Monomials, states: np.ndarray, flow: np.ndarray) -> np.ndarray:
     """Return the series of H'(w) G(w)."""
     found = np.zeros_like(states)
     at = {tuple(e): k for k, e in enumerate(of.exponents.tolist())}
+    ones = np.eye(len(flow), dtype=int)
     for i, own in enumerate(flow):
         slope = np.zeros_like(states)
         for k, exponents in enumerate(of.exponents):
             if exponents[i]:
-                slope[:, at[tuple((exponents - np.eye(len(flow), dtype=int)[i]).tolist())]] = exponents[i] * states[:, k]
+                slope[:, at[tuple((exponents - ones[i]).tolist())]] = exponents[i] * states[:, k]
         found += of.times(slope, own)
     return found
 
@@ -164,6 +168,8 @@ def zero_hopf(rest: Rest, omega: float) -> dict[str, float]:
     b, c = g[0, (2, 0, 0)].real, g[0, (0, 1, 1)].real
     d, cubic, mixed = g[1, (1, 1, 0)], g[0, (3, 0, 0)].real, g[0, (1, 1, 1)].real
     h021, h210 = g[1, (0, 2, 1)], g[1, (2, 1, 0)]
+    if min(abs(b), abs(c)) < NO_TERM * max(abs(b), abs(c), abs(d)):  # as where the motion has a mirror image
+        return dict.fromkeys(("s", "theta", "e"), np.nan)
     e = (h210 + d * (h021.real / c - 1.5 * cubic / b + 0.5 * mixed / c) - h021 * b / c).real
     return {"s": float(np.sign(b * c)), "theta": d.real / b, "e": e}
 
@@ -173,4 +179,6 @@ def double_hopf(rest: Rest, first: float, second: float) -> dict[str, float]:
     g = normal_form(rest, [1j * first, -1j * first, 1j * second, -1j * second], 3)
     p11, p12 = g[0, (2, 1, 0, 0)].real, g[0, (1, 0, 1, 1)].real
     p21, p22 = g[2, (1, 1, 1, 0)].real, g[2, (0, 0, 2, 1)].real
-    return {"p11": p11, "p22": p22, "theta": p12 / p22, "delta": p21 / p11}
+    least = NO_TERM * max(map(abs, (p11, p12, p21, p22)))
+    theta, delta = (a / b if abs(b) > least else np.nan for a, b in ((p12, p22), (p21, p11)))
+    return {"p11": p11, "p22": p22, "theta": theta, "delta": delta}

@@ -19,6 +19,7 @@ from pipeline.analysis.branches.codimension_two import (
     FOLD_FLIP,
     FOLD_TORUS,
     GENERALISED,
+    GENERALISED_HOPF,
     NONCENTRAL,
     POINT_KINDS,
     R1,
@@ -33,8 +34,11 @@ from pipeline.analysis.branches.equilibrium_curves import (
     PERSISTS,
     EquilibriumCurve,
     EquilibriumDetector,
+    frequencies_at,
+    kind_of_zero,
 )
-from pipeline.analysis.branches.following import has_halved, opposite
+from pipeline.analysis.branches.exploring import cycle_direction, cycle_family
+from pipeline.analysis.branches.following import end_of_crossings, has_halved, opposite
 from pipeline.analysis.branches.homoclinic_curves import (
     HETEROCLINIC,
     Bounds,
@@ -79,7 +83,7 @@ LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 
 CURVE_ENDS = (
     *("bound", "closed", "resonance", "max_points", "stuck", "period_halving"),
-    *(BT, NONCENTRAL, HETEROCLINIC),
+    *(BT, "equilibrium", "tangent", NONCENTRAL, HETEROCLINIC),
 )
 
 GENERATIONS = 3
@@ -92,11 +96,13 @@ SPRINGING = {
     FOLD_FLIP: ((FOLD, 1), (DOUBLING, 1)),
     FOLD_TORUS: ((FOLD, 1), (TORUS, 1)),
     DOUBLING_TORUS: ((DOUBLING, 1), (TORUS, 1)),
-    BT: ((FOLD, 1), (HOPF, 1)),
-    ZERO_HOPF: ((FOLD, 1), (HOPF, 1)),
-    DOUBLE_HOPF: ((HOPF, 1),),
+    BT: ((FOLD, 0), (HOPF, 0)),
+    GENERALISED_HOPF: ((FOLD, 1),),
+    ZERO_HOPF: ((FOLD, 0), (HOPF, 0), (TORUS, 1)),
+    DOUBLE_HOPF: ((HOPF, 0), (TORUS, 1)),
 }
-"""Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit."""
+"""Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit; at
+equilibria 0 for equilibria, 1 for cycles."""
 
 SAME_PERIOD = 0.1
 """Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
@@ -191,12 +197,7 @@ def continue_curves(
         points = merged({i: curve.special for i, curve in enumerate(curves)})
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
-        sprung = [
-            _sprung(_problem_of(replace(one.family, period=times * one.family.period), kind), one)
-            for one in fresh
-            for kind, times in SPRINGING.get(one.kind, ())
-            if times == 1 or times * one.family.period <= max_period
-        ]
+        sprung = [steps for one in fresh for steps in _springing(one, max_period)]
         ready = [(-1, *pair) for pair in run_together(sprung) if pair is not None]
         if not ready:
             break
@@ -231,13 +232,57 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
             curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after, n_missed))
 
 
-def _sprung(problem: CurveProblem, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
+def _springing(one: SpecialPoint, max_period: int) -> list[Steps[tuple[CurveProblem, Point] | None]]:
+    """Return the searches for a first orbit on each curve that may start at a point of codimension two."""
+    family, kinds = one.family, SPRINGING.get(one.kind, ())
+    if family.period:
+        periods = [(kind, n * family.period) for kind, n in kinds if n == 1 or n * family.period <= max_period]
+        return [_sprung(BifurcationProblem(replace(family, period=p), kind), one) for kind, p in periods]
+    found = [_rest_sprung(EquilibriumCurve(family, kind), one) for kind, n in kinds if not n]
+    for kind in (kind for kind, n in kinds if n):
+        for omega in frequencies_at(one):
+            cycles = cycle_family(family, one.point, omega)
+            if cycles is not None:
+                found.append(_cycles_sprung(BifurcationProblem(cycles, kind), one, omega))
+    return found
+
+
+def _rest_sprung(problem: EquilibriumCurve, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
+    """Find the first equilibrium of a curve through a point of codimension two; at a double Hopf point that of the
+    other pair.
+    """
+    omegas = frequencies_at(at) or [0.0]
+    own = 2.0 * np.pi / at.point.value.seconds
+    omega = omegas[0] if len(omegas) == 1 else max(omegas, key=lambda one: abs(one - own))
+    u = problem.start(at.point.u, omega)
+    if problem.kind == FOLD:
+        value = yield Query(problem, u)
+        problem = EquilibriumCurve(problem.family, kind_of_zero(problem.family, u, value))
+        u = problem.start(u)
+    found = yield from _first(problem, u, CURVE)
+    return None if found is None else (problem, found)
+
+
+def _cycles_sprung(
+    problem: BifurcationProblem, at: SpecialPoint, omega: float
+) -> Steps[tuple[CurveProblem, Point] | None]:
+    """Find a first small cycle on a curve of bifurcations of cycles that starts at a point of codimension two."""
+    family, n = problem.family, problem.family.system.n_states
+    direction = cycle_direction(family, at.point, omega)
+    assert direction is not None
+    normal = np.append(direction, [0.0, 0.0])
+    for amplitude in AMPLITUDES:
+        guess = np.concatenate([at.point.u[:n], at.point.u[-2:]]) + amplitude * normal
+        found = yield from correct(problem, guess, normal / np.linalg.norm(normal), CURVE)
+        if found is not None and not end_of_crossings(family, found):
+            return problem, found
+    return None
+
+
+def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first orbit on a bifurcation curve that starts at a point of codimension two; None if there is no such
     curve.
     """
-    if isinstance(problem, EquilibriumCurve):
-        found = yield from _first(problem, problem.start(at.point.u, _frequency_at(at)), CURVE)
-        return None if found is None else (problem, found)
     if problem.family.period == at.family.period:
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
@@ -248,18 +293,6 @@ def _sprung(problem: CurveProblem, at: SpecialPoint) -> Steps[tuple[CurveProblem
         if found is not None:
             return problem, found
     return None
-
-
-def _frequency_at(at: SpecialPoint) -> float:
-    """Return the angular frequency [rad/s] of the Hopf points that spring from a point of codimension two; at a double
-    Hopf point that of the other pair.
-    """
-    if at.kind == BT:
-        return 0.0
-    values = np.linalg.eigvals(at.point.value.monodromy)
-    upper = values[values.imag > 0.0]
-    near = np.sort(upper[np.argsort(np.abs(upper.real))][: 2 if at.kind == DOUBLE_HOPF else 1].imag)
-    return float(near[np.argmax(np.abs(near - 2.0 * np.pi / at.point.value.seconds))] if len(near) > 1 else near[0])
 
 
 def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
@@ -327,13 +360,14 @@ def _follow(
             return "stuck"
         if has_halved(problem.family, points):
             return "period_halving"
+        if problem.family.period and (end := end_of_crossings(problem.family, here)):
+            return end
         step = np.linalg.norm(here.u - points[-2].u)
         if len(points) > 5 and np.linalg.norm(here.u - points[0].u) < 0.7 * step:
             return "closed"
         return ""
 
-    tries = LOCATE, CURVE
-    detector = Detector(problem, tries) if problem.family.period else EquilibriumDetector(problem, tries)
+    detector = (EquilibriumDetector if isinstance(problem, EquilibriumCurve) else Detector)(problem, (LOCATE, CURVE))
     found = yield from trace(problem, start, _own(settings, problem), stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one

@@ -46,7 +46,7 @@ from pipeline.analysis.branches.codimension_two import (
     Detector,
     SpecialPoint,
 )
-from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import (
     PARAMETER_STEP,
@@ -65,6 +65,10 @@ EQUILIBRIUM_KINDS = (FOLD, HOPF, *BRANCH_POINTS)
 INNER = 1e-3
 """Step of the differences by the first parameter inside of the equations of a branch point, of fourth order."""
 
+SINGULAR = 1e-6
+"""Largest singular value of the dimensionless equations of a fold at a branch point, and its quadratic term at a
+pitchfork."""
+
 PERSISTS = 1e-7
 """Largest imperfection beta of a branch point that counts as none."""
 
@@ -79,7 +83,7 @@ class EquilibriumCurve(FamilyProblem):
 
     family: Family
     kind: str
-    _unit: float = field(default=0.0, init=False, repr=False)
+    unit: float = field(default=0.0, init=False, repr=False)
 
     @property
     def n_free(self) -> int:  # type: ignore[override]
@@ -117,12 +121,14 @@ class EquilibriumCurve(FamilyProblem):
             return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobian, is_rest=True)
         right, left = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
         steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
-        found = np.array([self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))])
+        found = np.array(
+            [self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))]
+        )
         derivative = (found[1 : 1 + self.size] - found[1 + self.size :]).T / (2.0 * steps)
-        derivative[:n, :n] = self.family.scaled(jacobian) * self._unit
+        derivative[:n, :n] = self.family.scaled(jacobian) * self.unit
         seconds = np.nan
         if self.kind == HOPF and u[n] > 0.0:
-            seconds = float(2.0 * np.pi * self._unit / np.sqrt(u[n]))
+            seconds = float(2.0 * np.pi * self.unit / np.sqrt(u[n]))
         images = self.family.rows(u[None]).states
         return Value(found[0], derivative, images, jacobian, seconds, is_rest=True)
 
@@ -136,14 +142,14 @@ class EquilibriumCurve(FamilyProblem):
         """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
         call.
         """
-        if not self._unit:
-            self._unit = 1.0 / (float(np.linalg.norm(self.family.scaled(jacobian))) or 1.0)
-        return self._unit
+        if not self.unit:
+            self.unit = 1.0 / (float(np.linalg.norm(self.family.scaled(jacobian))) or 1.0)
+        return self.unit
 
     def _equations(self, u: np.ndarray, right: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Return the dimensionless equations at some unknowns, with given singular vectors."""
         n, (rates, jacobian) = self.family.system.n_states, self._rates(u)
-        rates, matrix = rates * self._unit, self.family.scaled(jacobian) * self._unit
+        rates, matrix = rates * self.unit, self.family.scaled(jacobian) * self.unit
         if self.kind == HOPF:
             total, product = pair_near(matrix, u[n])
             return np.concatenate([rates, [total, product - u[n]]])
@@ -153,7 +159,7 @@ class EquilibriumCurve(FamilyProblem):
             return np.append(rates, solution[-1])
         step = np.zeros(self.size)
         step[n + 1] = INNER
-        far, near, after, beyond = (self._rates(u + k * step)[0] * self._unit for k in (-2, -1, 1, 2))
+        far, near, after, beyond = (self._rates(u + k * step)[0] * self.unit for k in (-2, -1, 1, 2))
         slope = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * INNER)
         adjoint = np.linalg.solve(bordered.T, np.append(np.zeros(n), 1.0))[:-1]
         return np.concatenate([rates + u[n] * left, [solution[-1], adjoint @ slope]])
@@ -213,7 +219,7 @@ class EquilibriumDetector(Detector):
         elif kind == HOPF:
             kappa = float(point.u[len(rest.matrix)])
             others = self._others(point)
-            tests = {BT: kappa, ZERO_HOPF: _product(others), DOUBLE_HOPF: _pairs(others)}
+            tests = {BT: kappa, ZERO_HOPF: float(np.prod(others * self.problem.unit).real), DOUBLE_HOPF: _pairs(others)}
             tests[GENERALISED_HOPF] = lyapunov(rest, _omega(point))[0] if kappa > 0.0 else np.nan
         else:
             tests = {}
@@ -231,7 +237,7 @@ class EquilibriumDetector(Detector):
     def _others(self, point: Point) -> np.ndarray:
         """Return the eigenvalues besides the pair of a Hopf point."""
         values = np.linalg.eigvals(point.value.monodromy)
-        unit, kappa = self.problem._unit_of(point.value.monodromy), float(point.u[len(values)])
+        unit, kappa = self.problem.unit, float(point.u[len(values)])
         return np.delete(values, _pair_at(values * unit, kappa))
 
     def _named(self, one: SpecialPoint) -> SpecialPoint | None:
@@ -253,7 +259,9 @@ class EquilibriumDetector(Detector):
             else:
                 omega = float(np.abs(upper[np.argmin(np.abs(upper.real))]))
                 own = _omega(point) if is_hopf else 0.0
-                found = partial(double_hopf, rest, *sorted((own, omega))) if is_hopf else partial(zero_hopf, rest, omega)
+                found = (
+                    partial(double_hopf, rest, *sorted((own, omega))) if is_hopf else partial(zero_hopf, rest, omega)
+                )
         return replace(one, coefficients=found())
 
 
@@ -261,9 +269,25 @@ def _omega(point: Point) -> float:
     return 2.0 * np.pi / point.value.seconds
 
 
-def _product(values: np.ndarray) -> float:
-    return float(np.prod(values / np.abs(values).max(initial=1e-300)).real)
-
-
 def _pairs(values: np.ndarray) -> float:
     return hopf_test(np.diag(values)) if len(values) > 1 else 1.0
+
+
+def kind_of_zero(family: Family, u: np.ndarray, value: Value) -> str:
+    """Return the kind of the curve through an equilibrium with an eigenvalue 0, from the value of the equations of a
+    fold: these are singular at a branch point that persists in both parameters.
+    """
+    if not np.linalg.svd(value.derivative, compute_uv=False)[-1] < SINGULAR:
+        return FOLD
+    rest = Rest(family, u, family.scaled(value.monodromy))
+    right, left = null_vectors(rest.matrix)
+    bend = abs(left @ rest.second(right, right).real) / float(np.linalg.norm(rest.matrix))
+    return PITCHFORK if bend < SINGULAR else TRANSCRITICAL
+
+
+def frequencies_at(one: SpecialPoint) -> list[float]:
+    """Return the angular frequencies [rad/s] of the imaginary pairs at a point of codimension two of equilibria."""
+    n_pairs = {GENERALISED_HOPF: 1, ZERO_HOPF: 1, DOUBLE_HOPF: 2}.get(one.kind, 0)
+    values = np.linalg.eigvals(one.point.value.monodromy)
+    upper = values[values.imag > 0.0]
+    return [float(value) for value in upper[np.argsort(np.abs(upper.real))][:n_pairs].imag]

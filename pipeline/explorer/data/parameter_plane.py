@@ -105,6 +105,8 @@ def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
     n_curves = 0 if found is None else found.sizes["curve"]
     if found is None or not 0 <= curve < n_curves:
         raise RequestError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
+    if not int(found["orbit_period"][curve]):
+        raise RequestError(f"curve {curve} has equilibria, which do not move.")
     n_points = int(found["n_points"][curve])
     if not 0 <= point < n_points:
         raise RequestError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")

@@ -11,6 +11,8 @@ import pytest
 import sympy
 from scipy.optimize import brentq, fsolve
 
+from magpend_core.crossing import Crossing
+from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.curves import continue_curves, curves_dataset
 from pipeline.analysis.branches.equilibrium_curves import EquilibriumCurve
@@ -219,34 +221,50 @@ def follower_polynomial(load, share, c=0.3):
 
 def first_order(mass, damping, stiffness):
     n = len(mass)
-    return np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)]])
+    return np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)]]
+    )
 
 
 def routh(polynomial):
-    """Vanishes where two eigenvalues of four have the sum 0."""
+    """Vanishes where two eigenvalues of four have the sum 0; relative."""
     _, a, b, c, d = polynomial
-    return a * b * c - c**2 - a**2 * d
+    return 1.0 - c / (a * b) - a * d / (b * c)
+
+
+def least_sum(polynomial):
+    """Least sum of two eigenvalues, relative."""
+    values = np.roots(polynomial)
+    i, j = np.triu_indices(len(values), 1)
+    return np.abs(values[i] + values[j]).min() / np.abs(values).max()
 
 
 def test_follower_force():
     """Flutter by Routh and Hurwitz, divergence where det K = 0; both meet at the double zero."""
-    flutter = brentq(lambda load: routh(follower_polynomial(load, 1.0)), 1.0, 2.0, xtol=1e-14)
+    flutter = brentq(lambda load: routh(follower_polynomial(load, 1.0)), 1.0, 2.0, xtol=1e-12)
     bounds = ((0.2, 4.0), (0.0, 1.2))
-    curves = curves_of(FOLLOWER, "hopf", [0, 0, 0, 0], [flutter, 1.0], bounds, generations=0)
-    (curve,) = curves
+    curves = curves_of(FOLLOWER, "hopf", [0, 0, 0, 0], [flutter, 1.0], bounds)
+    curve, sprung = curves
+    assert (curve.kind, sprung.kind) == ("hopf", "pitchfork")
     assert "bogdanov_takens" in curve.ends
-    assert max(abs(routh(follower_polynomial(*values))) for values in curve.values) < 1e-9
-    buckling = brentq(lambda load: follower_polynomial(load, 0.2)[-1], 0.1, 0.8, xtol=1e-14)
+    assert max(least_sum(follower_polynomial(*values)) for values in curve.values) < 1e-9
+    buckling = brentq(lambda load: follower_polynomial(load, 0.2)[-1], 0.1, 0.8, xtol=1e-12)
     (divergence,) = curves_of(FOLLOWER, "pitchfork", [0, 0, 0, 0], [buckling, 0.2], bounds)
-    assert max(abs(follower_polynomial(*values)[-1]) for values in divergence.values) < 1e-9
-    known = fsolve(lambda x: follower_polynomial(*x)[-2:], curve.special[0].values, xtol=1e-14)
+    for values in (*divergence.values, *sprung.values):
+        assert abs(follower_polynomial(*values)[-1]) < 1e-9
+    known = fsolve(lambda x: follower_polynomial(*x)[-2:], curve.special[0].values + 1e-3, xtol=1e-12)
     (double_zero,) = (one for one in curve.special if one.kind == "bogdanov_takens")
     np.testing.assert_allclose(double_zero.values, known, atol=1e-9)
     np.testing.assert_allclose(list(double_zero.coefficients.values()), 0.0, atol=1e-12)  # by symmetry
 
 
 FLUTTER = model_of(
-    {"h": "dh", "a": "da", "dh": "(r2*lift - offset*moment)/(r2 - offset^2)", "da": "(moment - offset*lift)/(r2 - offset^2)"},
+    {
+        "h": "dh",
+        "a": "da",
+        "dh": "(r2*lift - offset*moment)/(r2 - offset^2)",
+        "da": "(moment - offset*lift)/(r2 - offset^2)",
+    },
     {"speed": 1.0, "offset": 0.2, "r2": 0.25, "heave3": 2.0, "pitch3": 0.4},
     define={
         "lift": "-.2*h - .3*speed^2*a - (.02 + .1*speed)*dh - heave3*h^3",
@@ -314,17 +332,69 @@ def test_flutter_and_hunting(model, matrices, bounds, at):
         grid = np.linspace(*bounds[0], 400)
         values = [of(x, second) for x in grid]
         k = int(np.flatnonzero(np.diff(np.sign(values)))[0])
-        return brentq(of, grid[k], grid[k + 1], args=(second,), xtol=1e-14)
+        return brentq(of, grid[k], grid[k + 1], args=(second,), xtol=1e-12)
 
     curves = curves_of(model, "hopf", [0, 0, 0, 0], [hopf(at), at], bounds, generations=0)
     (curve,) = curves
-    assert max(abs(of(*values)) for values in curve.values) < 1e-9
-    first, second = only_values(curve, "generalised_hopf")
-    known = brentq(lambda q: cubic_lyapunov(*matrices(hopf(q), q)), second - 0.03, second + 0.03, xtol=1e-13)
-    assert [first, second] == pytest.approx([hopf(known), known], abs=1e-8)
+    assert max(least_sum(np.poly(first_order(*matrices(*values)[:3]))) for values in curve.values) < 1e-9
+    found = [one.values for one in curve.special if one.kind == "generalised_hopf"]
+    assert found
+    for values in found:
+        known = fsolve(lambda x: [of(*x), cubic_lyapunov(*matrices(*x))], values + 1e-3, xtol=1e-12)
+        assert values == pytest.approx(known, abs=1e-8)
 
 
-def only_values(curve, kind):
-    """Return both values of the one located point of a kind on a curve."""
-    (one,) = (one for one in curve.special if one.kind == kind)
-    return one.values
+# ---- curves of cycles that spring from points of equilibria ---------------------------------------
+
+
+def seen(model, of):
+    """Return a model seen where a state crosses the place of its equilibrium."""
+    return sectioned(model, Crossing(of, SHIFT, longest=60.0))
+
+
+def test_switching__fold_of_cycles():
+    """From a generalised Hopf point: p + q r^2 + 3 r^4 has a double root where q^2 = 12 p, q < 0."""
+    s = "(x^2 + y^2)"
+    rates = {"x": f"(p + q*{s} + 3*{s}^2)*x - (17/10 + {s}/2)*y", "y": f"(p + q*{s} + 3*{s}^2)*y + (17/10 + {s}/2)*x"}
+    model = seen(disguised(rates, {"p": 0.0, "q": 0.0}), "y")
+    curves = curves_of(model, "hopf", bent([0, 0]), [0.0, -0.5], ((-0.2, 0.2), (-1.0, 1.0)))
+    assert sorted((c.kind, c.family.period) for c in curves) == [("fold", 1), ("hopf", 0)]
+    cycles = next(c for c in curves if c.kind == "fold")
+    p, q = cycles.values.T
+    np.testing.assert_allclose(q**2, 12.0 * p, atol=1e-7)
+    assert q.max() < 0.0
+    assert q.min() < -0.9
+    assert "equilibrium" in cycles.ends
+
+
+def test_switching__tori():
+    """From a double Hopf point: the cycle r^2 = 2 p at q = .4 r^2, and the cycle s^2 = -q/.7 at p = -.3 s^2."""
+    r, s = "(x^2 + y^2)", "(z^2 + w^2)"
+    rates = {
+        "x": f"(p - {r}/2 + 3*{s}/10)*x - 2*y",
+        "y": f"(p - {r}/2 + 3*{s}/10)*y + 2*x",
+        "z": f"(q - 2*{r}/5 + 7*{s}/10)*z - 73*w/100",
+        "w": f"(q - 2*{r}/5 + 7*{s}/10)*w + 73*z/100",
+    }
+    model = seen(disguised(rates, {"p": 0.0, "q": 0.0}), "y")
+    curves = curves_of(model, "hopf", bent([0, 0, 0, 0]), [0.0, -0.2], ((-0.2, 0.2), (-0.2, 0.2)), omega=2.0)
+    tori = [c for c in curves if c.kind == "neimark_sacker"]
+    p, q = np.concatenate([c.values for c in tori]).T
+    first, second = np.abs(q - 0.8 * p), np.abs(p - 0.3 * q / 0.7)
+    assert np.minimum(first, second).max() < 1e-7
+
+
+def test_switching__zero_hopf():
+    """From a zero-Hopf point: on the circle of cycles the trace 2 b x + ... vanishes."""
+    s = "(y^2 + z^2)"
+    rates = {
+        "x": f"p - 4*x^2/5 + {s}/2",
+        "y": "(q - 3*x/5 + 9*x^2/10)*y - 13*z/10",
+        "z": "(q - 3*x/5 + 9*x^2/10)*z + 13*y/10",
+    }
+    model = seen(disguised(rates, {"p": 0.0, "q": 0.0}), "z")
+    curves = curves_of(model, "fold", bent([0, 0, 0]), [0.0, -0.2], ((-0.2, 0.2), (-0.2, 0.2)))
+    (torus,) = [c for c in curves if c.kind == "neimark_sacker"]
+    # d(x')/dx + d(r')/dr = -1.6 x + (q - .6 x + .9 x^2) = 0 and x' = r' = 0: x = 0, q = 0
+    np.testing.assert_allclose(torus.values[:, 1], 0.0, atol=1e-7)
+    assert torus.values[:, 0].min() < -0.15
