@@ -43,6 +43,7 @@ from pipeline.analysis.branches.homoclinic_curves import (
     HETEROCLINIC,
     Bounds,
     homoclinic_curves,
+    loop_near,
     loops_of,
     saddle_nodes_of,
     saddle_quantity,
@@ -107,6 +108,9 @@ equilibria 0 for equilibria, 1 for cycles."""
 SAME_PERIOD = 0.1
 """Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
 
+BESIDE = (0.02, 0.005)
+"""Scaled distances from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins."""
+
 AMPLITUDES = (0.02, 0.05, 0.1)
 """Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
 
@@ -165,10 +169,13 @@ def curves_from(
     starts = _starts(branches, parameters, second, bounds, longest)
     nodes = saddle_nodes_of(branches, parameters, second, bounds, longest)
     starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
-    loops = homoclinic_curves(loops_of(branches, parameters, second, bounds, longest), bounds)
-    return [
-        *continue_curves(starts, bounds, CURVE, longest, generations),
-        *(Curve(c.family, HOMOCLINIC, c.points, c.ends, -1, c.special, c.n_missed) for c in loops),
+    found = continue_curves(starts, bounds, CURVE, longest, generations)
+    takens = [p for p in merged({i: c.special for i, c in enumerate(found)}) if p.kind == BT]
+    beside = [loop_near(point, away) for point in takens for away in BESIDE]
+    loops = loops_of(branches, parameters, second, bounds, longest) + [loop for loop in beside if loop is not None]
+    return found + [
+        Curve(c.family, HOMOCLINIC, c.points, c.ends, -1, c.special, c.n_missed)
+        for c in homoclinic_curves(loops, bounds)
     ]
 
 

@@ -67,6 +67,9 @@ MEETS = 1e-3
 SAMPLES = 8000
 """Instants of a long cycle that is the first guess."""
 
+ANGLES, LOOP = 36, 6.0
+"""Directions about a Bogdanov-Takens point that are tried, and half the length of a loop in units of its time 1/k."""
+
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 """Intervals of both parameters."""
 
@@ -408,3 +411,90 @@ def _passes(curve: HomoclinicCurve, problem: HomoclinicProblem, first: Point) ->
         if -0.01 <= share <= 1.01 and np.linalg.norm(here - a - share * chord) < 0.02 * np.linalg.norm(chord) + 1e-6:
             return True
     return False
+
+
+# ---- starts at Bogdanov-Takens points ----------------------------------------------------------
+
+
+def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
+    """Predict the homoclinic orbit at a small distance from a Bogdanov-Takens point.
+
+    To leading order the orbit is the loop x = x_s + 3/2 (x_f - x_s) sech(k t)**2 about the focus x_f beside the saddle
+    x_s, with 4 k**2 = -l_u l_s. The damping, which is linear in x, does no work on it where a seventh of the trace of
+    the critical eigenvalues at x_s and six sevenths of that at x_f add up to 0 (Melnikov's integral).
+
+    Parameters
+    ----------
+    takens
+        The point, with the family of its equilibria.
+    away
+        Distance of the parameters from the point, in units of their scales.
+
+    Returns
+    -------
+    Loop or None
+        None if no direction in the plane of the parameters fulfils the condition.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)
+    pairs = [_pair_at(takens, away, angle) for angle in angles]
+    for i in range(ANGLES):
+        low, high = angles[i], angles[i + 1]
+        first, last = pairs[i], pairs[i + 1]
+        if first is None or last is None or first.work * last.work >= 0.0:
+            continue
+        while high - low > 1e-6 and first is not None:
+            middle = 0.5 * (low + high)
+            pair = _pair_at(takens, away, middle)
+            if pair is None or pair.work * first.work > 0.0:
+                low, first = middle, pair
+            else:
+                high = middle
+        return None if first is None else first.loop(takens.family)
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Saddle and focus beside a Bogdanov-Takens point [scaled], with the Jacobian at the saddle."""
+
+    saddle: np.ndarray
+    focus: np.ndarray
+    jacobian: np.ndarray  # at the saddle, scaled [1/s]
+    work: float  # of the damping on the loop about the focus, to leading order [1/s]
+    values: np.ndarray  # (2,): scaled parameters
+
+    def loop(self, family: Family) -> Loop:
+        """Return the loop of the leading order about the focus."""
+        rates = leading_of(np.linalg.eigvals(self.jacobian))
+        k = 0.5 * float(np.sqrt(rates[0].real * -rates[1].real))
+        along = self.focus - self.saddle
+        left, sizes, right = np.linalg.svd(self.jacobian)
+        across = right[:-1].T @ ((left[:, :-1].T @ along) / sizes[:-1])
+        t = np.linspace(-LOOP / k, LOOP / k, SAMPLES // 4)
+        bow = 1.5 / np.cosh(k * t) ** 2
+        states = self.saddle + bow[:, None] * along + (-2.0 * k * np.tanh(k * t) * bow)[:, None] * across
+        scales = np.asarray(family.system.scales)
+        return Loop(family, t - t[0], states * scales, self.saddle * scales, self.values * np.asarray(family.scales))
+
+
+def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
+    """Find the saddle and the focus beside a Bogdanov-Takens point in one direction of the plane of parameters."""
+    family, system, n = takens.family, takens.family.system, takens.family.system.n_states
+    scales = np.asarray(system.scales)
+    at = takens.point.u[:n]
+    values = takens.point.u[-2:] + away * np.array([np.cos(angle), np.sin(angle)])
+    packed = family.rows(np.append(at, values)[None]).parameters[0]
+    null = np.linalg.svd(family.scaled(takens.point.value.monodromy))[2][-1]
+    reach = np.outer(np.sqrt(away) * np.array([-1.0, -0.3, 0.3, 1.0]), null)
+    with np.errstate(all="ignore"):
+        found = find_equilibria(system, (at + reach) * scales, packed)
+    good = found.converged & (np.abs(found.states / scales - at).max(axis=1) < 4.0 * np.sqrt(away))
+    ends: dict[bool, tuple[np.ndarray, np.ndarray, float]] = {}
+    for state, jacobian in zip(found.states[good] / scales, found.jacobians[good], strict=True):
+        values_here = np.linalg.eigvals(jacobian)
+        critical = values_here[np.argsort(np.abs(values_here))[:2]]
+        ends[bool(np.prod(critical).real < 0.0)] = state, family.scaled(jacobian), float(critical.sum().real)
+    if len(ends) < 2:
+        return None
+    (saddle, jacobian, of_saddle), (focus, _, of_focus) = ends[True], ends[False]
+    return _Pair(saddle, focus, jacobian, (of_saddle + 6.0 * of_focus) / 7.0, values)

@@ -6,10 +6,12 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
 from pipeline.analysis.branches.analysis import curves_table
+from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.homoclinic import Loop
-from pipeline.analysis.branches.homoclinic_curves import homoclinic_curves
-from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.homoclinic_curves import homoclinic_curves, loop_near
+from pipeline.analysis.branches.problems import Family, Value
 from pipeline.plots.regimes import plot_curves
 from tests.core.flows import LORENZ, flow, table
 from tests.pipeline.analysis.test_branches_flows import followed
@@ -87,14 +89,12 @@ def takens_split(b1, b2):
 
 def test_homoclinic_curves__bogdanov_takens():
     """b1 = -(6/25) b2**2 + ... from the point (0, 0), at which the curve ends."""
-    family, b2 = family_in(TAKENS, "b1", "b2", (1.0, 1.0)), -0.1
-    b1 = -6.0 / 25.0 * b2**2
-    saddle, size = 0.5 * (-b2 + np.sqrt(b2 * b2 - 4.0 * b1)), np.sqrt(b2 * b2 - 4.0 * b1)
-    half = 0.5 * np.sqrt(size)  # the loop of x'' = b1 + b2 x + x**2
-    t = np.linspace(-5.0 / half, 5.0 / half, 2001)
-    bow = 1.0 / np.cosh(half * t) ** 2
-    states = np.stack([saddle - 1.5 * size * bow, 3.0 * size * half * bow * np.tanh(half * t)], axis=1)
-    guess = Loop(family, t - t[0], states, np.array([saddle, 0.0]), np.array([b1, b2]))
+    family = family_in(TAKENS, "b1", "b2", (1.0, 1.0))
+    jacobian = np.array([[0.0, 1.0], [0.0, 0.0]])
+    value = Value(np.zeros(1), np.zeros((1, 4)), np.zeros((1, 2)), jacobian, is_rest=True)
+    takens = SpecialPoint("bogdanov_takens", family, Point(np.zeros(4), np.zeros(4), value, 0), np.zeros(2))
+    guess = loop_near(takens, 0.05)
+    assert guess.values[0] / guess.values[1] ** 2 == pytest.approx(-6.0 / 25.0, rel=0.05)
     (curve,) = homoclinic_curves([guess], ((-1.0, 1.0), (-0.3, 0.1)))
     assert curve.ends == ("bound", "bogdanov_takens")
     (end,) = curve.special
