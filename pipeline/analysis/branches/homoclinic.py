@@ -283,16 +283,20 @@ def homoclinic_point(loop: Loop, settings: Settings = SETTINGS) -> Steps[tuple[H
 
 
 def _damped(problem: HomoclinicProblem, u: np.ndarray, normal: np.ndarray) -> Steps[np.ndarray]:
-    """Bring a rough guess near to the solution by Newton's method, with steps that lessen the residual."""
+    """Bring a rough guess near to the solution by Newton's method, with steps that shorten the next one.
+
+    The residual itself may grow on the way: errors at the nodes grow with the flow (Deuflhard, Newton Methods for
+    Nonlinear Problems, 2004, section 3.3).
+    """
     value = yield Query(problem, u)
     for _ in range(DAMPED):
-        residual = float(np.linalg.norm(value.residual))
-        if not value.is_finite or residual < NEAR:
+        if not value.is_finite or np.linalg.norm(value.residual) < NEAR:
             break
-        step = np.linalg.lstsq(np.vstack([value.derivative, normal]), np.append(-value.residual, 0.0), rcond=None)[0]
+        inverse = np.linalg.pinv(np.vstack([value.derivative, normal]))
+        step = -inverse[:, :-1] @ value.residual
         for share in 0.5 ** np.arange(8):
             there = yield Query(problem, u + share * step)
-            if np.linalg.norm(there.residual) < (1.0 - 0.3 * share) * residual:
+            if np.linalg.norm(inverse[:, :-1] @ there.residual) < (1.0 - 0.3 * share) * np.linalg.norm(step):
                 break
         else:
             break
