@@ -5,6 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
+from magpend_core.crossing import Crossing
+from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
@@ -161,8 +163,8 @@ def resting_current(v):
 def test_curves_from__homoclinic_orbits_of_a_neuron():
     """From the end of a branch. The fold of the equilibria lies at one current, whatever the rate of w."""
     ds = followed(NEURON, "v", [0.0365, 0.1], "y", 0.06, 0.09, level=0.0365, y=0.075)
-    parameters = flow(NEURON).load(y=0.075)
-    found = curves_from(ds, parameters, "rate", ((0.06, 0.09), (0.8, 1.6)), 1)
+    parameters = sectioned(flow(NEURON), Crossing("v", 0.0365, longest=50.0)).load(y=0.075)
+    found = curves_from(ds.isel(bifurcation=slice(0)), parameters, "rate", ((0.06, 0.09), (0.8, 1.6)), 1)
     (curve,) = [one for one in found if one.kind == "homoclinic"]
     assert at_second(curve, 1.15) == pytest.approx(0.07293069625, abs=1e-9)
     for rate in (1.0, 1.3):
@@ -223,8 +225,8 @@ def test_curves_from__saddle_node_on_a_circle():
         define={"s": "x**2 + y**2", "rate": "omega - level*y/sqrt(s)"},
     )
     ds = followed(equations, "y", [1.0, 0.0], "omega", 0.5, 1.5, omega=1.3)
-    parameters = flow(equations).load(omega=1.3)
-    (curve,) = curves_from(ds, parameters, "level", ((0.5, 1.5), (0.7, 1.3)), 1)
+    parameters = sectioned(flow(equations), Crossing("y", longest=50.0)).load(omega=1.3)
+    (curve,) = curves_from(ds.isel(bifurcation=slice(0)), parameters, "level", ((0.5, 1.5), (0.7, 1.3)), 1)
     assert (curve.kind, curve.family.period, curve.start) == ("fold", 0, -1)
     np.testing.assert_allclose(curve.values[:, 0], curve.values[:, 1], atol=1e-8)
     assert np.ptp(curve.values[:, 1]) > 0.5
