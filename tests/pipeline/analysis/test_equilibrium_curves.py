@@ -61,7 +61,8 @@ def curves_of(model, kind, state, values, bounds=((-1.0, 1.0), (-1.0, 1.0)), ome
     """Follow the curve of a bifurcation in the plane of the first two parameters, and those that spring from it."""
     free = tuple(model.parameter_names[:2])
     scales = tuple(high - low for low, high in bounds)
-    family = Family(model.system, 0, 1.0, model.load().pack(), free, scales)
+    rate = model.crossing.frequency_hz if model.crossing else 1.0
+    family = Family(model.system, 0, rate, model.load().pack(), free, scales)
     u = family.unknowns(np.array(state, float), values)
     start = EquilibriumCurve(family, kind).start(u, omega)
     return continue_curves([(0, family, kind, start)], bounds, generations=generations)
