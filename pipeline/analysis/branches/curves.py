@@ -374,7 +374,11 @@ def _follow(
             return "closed"
         return ""
 
-    detector = (EquilibriumDetector if isinstance(problem, EquilibriumCurve) else Detector)(problem, (LOCATE, CURVE))
+    detector: Detector
+    if isinstance(problem, EquilibriumCurve):
+        detector = EquilibriumDetector(problem, (LOCATE, CURVE))
+    else:
+        detector = Detector(problem, (LOCATE, CURVE))
     found = yield from trace(problem, start, _own(settings, problem), stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
