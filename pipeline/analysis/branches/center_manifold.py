@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.jets import Monomials, monomials, rates_on
+from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import Family
 
 NO_TERM = 1e-9
@@ -104,7 +105,7 @@ def normal_form(rest: Rest, values: Sequence[complex], order: int) -> dict[tuple
                     [left[:, along].conj().T, np.zeros((len(along), len(along)))],
                 ]
             )
-            solution = np.linalg.solve(system, np.append(-known[:, k], np.zeros(len(along))))
+            solution = solved(system, np.append(-known[:, k], np.zeros(len(along))))
             states[:, k], flow[along, k] = solution[:n], solution[n:]
             found.update({(i, tuple(exponents.tolist())): complex(flow[i, k]) for i in along})
     return found
@@ -146,9 +147,9 @@ def bogdanov_takens(rest: Rest) -> dict[str, float]:
     """Return the coefficients a and b of a Bogdanov-Takens point (Kuznetsov 2004, Eqs. 8.51 and 8.52)."""
     q0, p1 = null_vectors(rest.matrix)
     bordered = np.block([[rest.matrix, p1[:, None]], [q0[None], np.zeros((1, 1))]])
-    q1 = np.linalg.solve(bordered, np.append(q0, 0.0))[:-1]
+    q1 = solved(bordered, np.append(q0, 0.0))[:-1]
     p1 = p1 / (p1 @ q1)
-    p0 = np.linalg.solve(bordered.T, np.append(p1, 0.0))[:-1]
+    p0 = solved(bordered.T, np.append(p1, 0.0))[:-1]
     p0 = p0 - (p0 @ q1) * p1
     square = rest.second(q0, q0).real
     a = float(0.5 * p1 @ square)

@@ -48,6 +48,7 @@ from pipeline.analysis.branches.codimension_two import (
 )
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import Steps
+from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import (
     PARAMETER_STEP,
     STATE_STEP,
@@ -154,14 +155,14 @@ class EquilibriumCurve(FamilyProblem):
             total, product = pair_near(matrix, u[n])
             return np.concatenate([rates, [total, product - u[n]]])
         bordered = np.block([[matrix, left[:, None]], [right[None], np.zeros((1, 1))]])
-        solution = np.linalg.solve(bordered, np.append(np.zeros(n), 1.0))
+        solution = solved(bordered, np.append(np.zeros(n), 1.0))
         if self.kind == FOLD:
             return np.append(rates, solution[-1])
         step = np.zeros(self.size)
         step[n + 1] = INNER
         far, near, after, beyond = (self._rates(u + k * step)[0] * self.unit for k in (-2, -1, 1, 2))
         slope = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * INNER)
-        adjoint = np.linalg.solve(bordered.T, np.append(np.zeros(n), 1.0))[:-1]
+        adjoint = solved(bordered.T, np.append(np.zeros(n), 1.0))[:-1]
         return np.concatenate([rates + u[n] * left, [solution[-1], adjoint @ slope]])
 
 
@@ -169,6 +170,8 @@ def pair_near(matrix: np.ndarray, kappa: float) -> tuple[float, float]:
     """Return sum and product of that pair of eigenvalues, complex or real, whose sum is nearest to 0 and whose product
     is nearest to kappa.
     """
+    if not np.isfinite(matrix).all():
+        return np.nan, np.nan
     values = np.linalg.eigvals(matrix)
     i, j = _pair_at(values, kappa)
     return float((values[i] + values[j]).real), float((values[i] * values[j]).real)
@@ -277,7 +280,7 @@ def kind_of_zero(family: Family, u: np.ndarray, value: Value) -> str:
     """Return the kind of the curve through an equilibrium with an eigenvalue 0, from the value of the equations of a
     fold: these are singular at a branch point that persists in both parameters.
     """
-    if not np.linalg.svd(value.derivative, compute_uv=False)[-1] < SINGULAR:
+    if not value.is_finite or np.linalg.svd(value.derivative, compute_uv=False)[-1] > SINGULAR:
         return FOLD
     rest = Rest(family, u, family.scaled(value.monodromy))
     right, left = null_vectors(rest.matrix)

@@ -353,6 +353,7 @@ def seen(model, of):
     return sectioned(model, Crossing(of, SHIFT, longest=60.0))
 
 
+@pytest.mark.slow
 def test_switching__fold_of_cycles():
     """From a generalised Hopf point: p + q r^2 + 3 r^4 has a double root where q^2 = 12 p, q < 0."""
     s = "(x^2 + y^2)"
@@ -370,6 +371,7 @@ def test_switching__fold_of_cycles():
     assert "equilibrium" in cycles.ends
 
 
+@pytest.mark.slow
 def test_switching__tori():
     """From a double Hopf point: the cycle r^2 = 2 p at q = .4 r^2, and the cycle s^2 = -q/.7 at p = -.3 s^2."""
     r, s = "(x^2 + y^2)", "(z^2 + w^2)"
@@ -387,6 +389,7 @@ def test_switching__tori():
     assert np.minimum(first, second).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_switching__zero_hopf():
     """From a zero-Hopf point: on the circle of cycles the trace 2 b x + ... vanishes."""
     s = "(y^2 + z^2)"
