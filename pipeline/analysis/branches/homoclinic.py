@@ -131,6 +131,9 @@ class HomoclinicProblem:
     def value(self, u: np.ndarray, ends: Ends) -> Value:
         """Compute the equations and their derivatives; NaN if the equilibrium is no saddle of the same dimensions."""
         parts = self.parts(u)
+        if not np.isfinite(u).all():
+            nothing = np.full((self.size - 1, self.size), np.nan)
+            return Value(nothing[:, 0], nothing, parts.saddle[None], nothing[:, :0], is_rest=True)
         joins, by_joins = self._joins(parts)
         at_ends, by_ends = self._at_ends(parts)
         rest, by_rest, jacobian = self._rest(parts)
@@ -294,6 +297,7 @@ def _damped(problem: HomoclinicProblem, u: np.ndarray, normal: np.ndarray) -> St
             break
         inverse = np.linalg.pinv(np.vstack([value.derivative, normal]))
         step = -inverse[:, :-1] @ value.residual
+        step *= min(1.0, TIME_UNIT / max(abs(float(step[-3])), 1e-300))  # T by a factor of e at most
         for share in 0.5 ** np.arange(8):
             there = yield Query(problem, u + share * step)
             if np.linalg.norm(inverse[:, :-1] @ there.residual) < (1.0 - 0.3 * share) * np.linalg.norm(step):
