@@ -31,7 +31,7 @@ from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import Family
 
 NO_TERM = 1e-9
-"""Coefficient, relative to the largest one, that counts as 0: a ratio to it has no meaning."""
+"""Relative size of a coefficient that counts as 0: a ratio to it has no meaning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +154,8 @@ def bogdanov_takens(rest: Rest) -> dict[str, float]:
     square = rest.second(q0, q0).real
     a = float(0.5 * p1 @ square)
     b = float(p0 @ square + p1 @ rest.second(q0, q1).real)
+    norm = float(np.linalg.norm(rest.matrix))
+    a, b = (value if abs(value) > least else 0.0 for value, least in ((a, NO_TERM * norm**2), (b, NO_TERM * norm)))
     return {"a": abs(a), "b": float(b * np.copysign(1.0, a))}
 
 
