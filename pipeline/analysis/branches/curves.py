@@ -403,7 +403,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
     with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found;
-    of equilibria also the coefficients of the normal forms, such as ``special_l2`` (see `center_manifold`).
+    of equilibria also the coefficients of the normal forms, such as ``special_lyapunov2`` (see `center_manifold`).
 
     Parameters
     ----------
