@@ -11,7 +11,16 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.completeness import counted_lines, searched_lines
-from pipeline.analysis.branches.kinds import BRANCH_POINTS, COEFFICIENTS, FOLD, KINDS, LABELS, LIMITS
+from pipeline.analysis.branches.kinds import (
+    BRANCH_POINTS,
+    BRANCHING,
+    COEFFICIENTS,
+    FOLD,
+    KINDS,
+    LABELS,
+    LIMITS,
+    PITCHFORK,
+)
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
