@@ -10,7 +10,7 @@ point               normal form                                                 
 =================== ========================================================================== =======================
 cusp                w' = c w^3                                                                 c [1/s]
 Bogdanov-Takens     w0' = w1, w1' = a w0^2 + b w0 w1, a > 0                                    a [1/s2], b [1/s]
-generalised Hopf    w' = i omega w + c1 w |w|^2 + c2 w |w|^4                                   l2 = Re c2 / omega
+generalised Hopf    w' = i omega w + c1 w |w|^2 + c2 w |w|^4                                   lyapunov2 = Re c2 / omega
 zero-Hopf           x' = b x^2 + c |z|^2 + ..., z' = i omega z + d x z + e x^2 z, after a      s = sign(b c),
                     change of time                                                             theta = Re d / b, e [1/s]
 double Hopf         z1' = i omega1 z1 + p11 z1 |z1|^2 + p12 z1 |z2|^2, z2' alike, of which     p11, p22 [1/s],
@@ -31,7 +31,7 @@ from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import Family
 
 NO_TERM = 1e-9
-"""Coefficient, relative to the largest one, that counts as 0: a ratio to it has no meaning."""
+"""Relative size of a coefficient that counts as 0: a ratio to it has no meaning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +154,8 @@ def bogdanov_takens(rest: Rest) -> dict[str, float]:
     square = rest.second(q0, q0).real
     a = float(0.5 * p1 @ square)
     b = float(p0 @ square + p1 @ rest.second(q0, q1).real)
+    norm = float(np.linalg.norm(rest.matrix))
+    a, b = (value if abs(value) > least else 0.0 for value, least in ((a, NO_TERM * norm**2), (b, NO_TERM * norm)))
     return {"a": abs(a), "b": float(b * np.copysign(1.0, a))}
 
 

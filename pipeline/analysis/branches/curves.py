@@ -105,6 +105,9 @@ SPRINGING = {
 """Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit; at
 equilibria 0 for equilibria, 1 for cycles."""
 
+NO_FREQUENCY = 1e-6
+"""Square of the dimensionless frequency of a Hopf point below which it is a Bogdanov-Takens point."""
+
 SAME_PERIOD = 0.1
 """Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
 
@@ -403,7 +406,7 @@ def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
     Two curves of Hopf points that cross at a double Hopf point differ in the period of their cycles.
     """
     family, points, seconds = problem.family, curve.points, start.value.seconds
-    if problem.kind == HOPF and np.isfinite(seconds):
+    if problem.kind == HOPF and start.u[family.system.n_states] > NO_FREQUENCY:
         points = [point for point in points if abs(point.value.seconds / seconds - 1.0) < SAME_PERIOD]
     is_alike = curve.kind == problem.kind and curve.family.period == family.period
     return is_alike and lies_on(points, family, start)
@@ -431,7 +434,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
     with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found;
-    of equilibria also the coefficients of the normal forms, such as ``special_l2`` (see `center_manifold`).
+    of equilibria also the coefficients of the normal forms, such as ``special_lyapunov2`` (see `center_manifold`).
 
     Parameters
     ----------

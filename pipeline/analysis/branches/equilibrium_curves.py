@@ -251,7 +251,7 @@ class EquilibriumDetector(Detector):
         elif one.kind == BT:
             found = partial(bogdanov_takens, rest)
         elif one.kind == GENERALISED_HOPF:
-            return replace(one, coefficients={"l2": lyapunov(rest, _omega(point), 5)[1]})
+            return replace(one, coefficients={"lyapunov2": lyapunov(rest, _omega(point), 5)[1]})
         else:
             values = self._others(point) if is_hopf else np.linalg.eigvals(point.value.monodromy)
             upper = values[values.imag > 0.0]

@@ -40,6 +40,6 @@ transcritical point is a branch point to both.
 
 COEFFICIENTS = {
     **{"a": "1/s2", "b": "1/s", "c": "1/s", "e": "1/s", "p11": "1/s", "p22": "1/s"},
-    **dict.fromkeys(("l2", "s", "theta", "delta"), "1"),
+    **dict.fromkeys(("lyapunov2", "s", "theta", "delta"), "1"),
 }
 """Coefficients of the normal forms of equilibria at points of codimension two, with their units (`center_manifold`)."""
