@@ -16,8 +16,9 @@ from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
+from pipeline.analysis.events.crises import Crises, Crisis
 from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
-from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -96,6 +97,7 @@ class Event:
     n_cells: int = 0
     after: Stretch | None = None  # the attractor beyond a change
     born: Born | None = None  # evidence of a cascade
+    crisis: Crisis | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +135,14 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    stretches = _stretches(scene)
+    stretches = Crises(scene).split(_stretches(scene))
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
     scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    named = [_aperiodic(scene, one, named) for one in named]
+    crises = Crises(scene)
+    named = [_aperiodic(scene, crises, one, named) for one in named]
     return _dataset(scene, stretches, _merged(named))
 
 
@@ -271,10 +274,13 @@ def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -
     return dict(counts.most_common()), int(here.sum())
 
 
-def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
-    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, if that proves it."""
+def _aperiodic(scene: Scene, crises: Crises, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by a crisis, if
+    there is proof.
+    """
     if one.what != UNDECIDED or one.stretch.period or SETS[one.stretch.kind] not in ("chaotic_set", "torus"):
         return one
+    is_chaotic = SETS[one.stretch.kind] == "chaotic_set"
     place, way = one.stretch.places[one.rises], 1 if one.rises else -1
     heir = next(iter(one.to), -1)
     facing = [
@@ -287,11 +293,13 @@ def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
         and next(iter(other.to), -1) == one.stretch.attractor
     ]
     if not facing or len(one.to) > 1:
-        return replace(one, fate=replace(one.fate, why=_why_open(one, heir, named)))
+        why = _why_open(one, heir, named)
+        return crises.name(one, why) if is_chaotic else replace(one, fate=replace(one.fate, why=why))
     born = _born(scene, one.stretch, place, way, facing[0].fate)
     fate = replace(facing[0].fate, value=born.value, why=born.why)
     if not born.what:
-        return replace(one, fate=replace(fate, bifurcation=-1))
+        open_end = replace(one, fate=replace(fate, bifurcation=-1))
+        return crises.name(open_end, born.why) if is_chaotic else open_end
     error = max(born.error, LOCATED * scene.scale)
     return replace(one, fate=fate, what=born.what, error=error, born=born)
 
@@ -322,7 +330,7 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
 
 
 def _merged(named: Sequence[Event]) -> list[Event]:
-    """Make one event of two ends of an attractor at one bifurcation: it changes its period there."""
+    """Make one event of two ends of an attractor at one bifurcation or crisis: it changes its period or size there."""
     merged: list[Event] = []
     for one in named:
         last = merged[-1] if merged else None
@@ -330,7 +338,10 @@ def _merged(named: Sequence[Event]) -> list[Event]:
             last is not None
             and (last.rises, one.rises) == (True, False)
             and last.stretch.attractor == one.stretch.attractor
-            and last.fate.bifurcation == one.fate.bifurcation >= 0
+            and (
+                last.fate.bifurcation == one.fate.bifurcation >= 0
+                or (last.what in CRISES and (last.what, last.fate.value) == (one.what, one.fate.value))
+            )
         ):
             merged[-1] = replace(last, after=one.stretch)
         else:
@@ -372,6 +383,19 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
         "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
+        "met_period": (
+            [one.crisis.period if one.crisis else 0 for one in named],
+            "period of the orbit that is met",
+            {},
+        ),
+        "exponent": ([one.crisis.exponent if one.crisis else np.nan for one in named], "exponent of lifetimes", {}),
+        "exponent_error": ([one.crisis.exponent_error if one.crisis else np.nan for one in named], "its error", {}),
+        "twin": ([one.crisis.twin if one.crisis else -1 for one in named], "id of the set it merges with, -1 none", {}),
+        "lives_beyond": (
+            [int(one.crisis is not None and one.crisis.lives_beyond) for one in named],
+            "1 if the set on the other side meets the orbit",
+            {},
+        ),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {
