@@ -135,13 +135,13 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    stretches = Crises(scene).split(_stretches(scene))
+    crises = Crises(scene)
+    stretches = crises.split(_stretches(scene))
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
-    scene = replace(scene, names=names)
+    scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    crises = Crises(scene)
     named = [_aperiodic(scene, crises, one, named) for one in named]
     return _dataset(scene, stretches, _merged(named))
 

@@ -1,12 +1,12 @@
 """Measure the clearance between a chaotic set and the stable manifold of a saddle orbit, and lifetimes beyond contact.
 
 A chaotic set that is lost, grows or merges with another one in a crisis touches the stable manifold of an unstable
-orbit (Grebogi, Ott and Yorke, Physica D 7, 1983, 181). Near such an orbit a trajectory is on one side of the manifold or
-on the other. The left eigenvector of the orbit's one unstable multiplier u tells the side, most exactly at the closest
-approach; divided by u for each turn since the trajectory came near, this coordinate is the *clearance* with which it
-came. While the set lives, the least clearance of many passages is positive. It is 0 where the set touches the manifold.
-Beyond, trajectories with a negative clearance leave, and their mean lifetime is a power of the distance (Grebogi, Ott
-and Yorke, Phys. Rev. Lett. 57, 1986, 1284).
+orbit (Grebogi, Ott and Yorke, Physica D 7, 1983, 181). Near such an orbit a trajectory is on one side of the manifold
+or on the other. The left eigenvector of the orbit's one unstable multiplier u tells the side, most exactly at the
+closest approach; divided by u for each turn since the trajectory came near, this coordinate is the *clearance* with
+which it came. While the set lives, the least clearance of many passages is positive. It is 0 where the set touches the
+manifold. Beyond, trajectories with a negative clearance leave, and their mean lifetime is a power of the distance
+(Grebogi, Ott and Yorke, Phys. Rev. Lett. 57, 1986, 1284).
 
 Bands of a set may lie on both sides of an orbit between them. So passages are sorted by the section point of the orbit
 and by time modulo the number of bands. The number of states does not matter, but the orbit has one unstable multiplier.
@@ -44,6 +44,9 @@ SETTLE = 24
 LEAST = 32
 """Fewest passages that show on which side of the manifold a set lies."""
 
+FEW = 32
+"""Trajectories that are looked at first."""
+
 SUBSAMPLE = 8
 """The error of the least clearance is its change if an eighth of the trajectories is taken."""
 
@@ -52,6 +55,9 @@ NEIGHBOURS, REFERENCES = 48, 8
 
 MOST_STEPS_TO_ROOT = 40
 """Most parameter values at which the clearance is computed to find its zero."""
+
+JUMP = 0.01
+"""Largest clearance at the value where it changes its sign, as a share of the distance of passages."""
 
 SCATTER = 0.05
 """Relative deviation of lifetimes from a power law that counts as one standard deviation: they have fine structure."""
@@ -299,9 +305,13 @@ class Approach:
 
     def begin(self, paths: np.ndarray) -> bool:
         """Find the sides on which the living set passes; return whether it keeps to one side in each class."""
-        found, _ = self.passages(self.value, paths)
-        self.sides = {key: float(np.sign(np.median(a))) for key, (a, _, _) in found.items() if len(a) >= LEAST}
-        return bool(self.sides) and self.least(self.value, paths).least > 0.0
+        for some in (paths[:FEW], paths):  # few show that most orbits lie inside of the set
+            found, _ = self.passages(self.value, some)
+            sides = {key: (np.sign(np.median(a)), a) for key, (a, _, _) in found.items() if len(a) >= LEAST}
+            self.sides = {key: float(side) for key, (side, _) in sides.items()}
+            if any((side * a).min() <= 0.0 for side, a in sides.values()):
+                return False
+        return bool(self.sides)
 
     def least(self, value: float, paths: np.ndarray | None = None) -> Clearance:
         """Compute the least clearance at a parameter value."""
@@ -395,25 +405,24 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         last = 1 if best.is_beyond else -1
         if abs(best.least) <= best.error or abs(high - low) <= 1e-14 * abs(high):
             break
-    if not np.isfinite(best.least):
-        return None
+    if not abs(best.least) <= max(best.error, JUMP * NEAR[0] * approach.size):
+        return None  # it jumps there
     for near in NEAR:
         approach.near = near
-        found = _confirmed(approach, x, best, beyond)
+        h = _span(approach, x, beyond)
+        values = x + (0.0 if h is None else h) * np.array([-1.0, -0.5, 0.5, 1.0])
+        least = np.array([approach.least(float(one)).least for one in values])
+        if not (least[0] > least[1] > 0.0 > least[2] > least[3]):
+            return None
+        found = _confirmed(x, best, values, least)
         if found is not None:
             return found
     return None
 
 
-def _confirmed(approach: Approach, value: float, best: Clearance, beyond: float) -> Contact | None:
-    """Extrapolate the clearance to 0 from both sides; None unless both lead to one value."""
-    h = _span(approach, value, beyond)
-    if h is None:
-        return None
-    x = value + h * np.array([-1.0, -0.5, 0.5, 1.0])
-    y = np.array([approach.least(float(one)).least for one in x])
-    if not np.isfinite(y).all() or not (y[0] > y[1] > 0.0 > y[2] > y[3]):
-        return None
+def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray) -> Contact | None:
+    """Extrapolate the clearances y at two values x on each side to 0; None unless both lead to the value found."""
+    h = x[3] - value
     living, far = (float(x[i] - y[i] * (x[j] - x[i]) / (y[j] - y[i])) for i, j in ((0, 1), (3, 2)))
     slope = float((y[2] - y[1]) / (x[2] - x[1]))
     error = 2.0 * max(best.error, abs(best.least)) / abs(slope)

@@ -44,7 +44,7 @@ from pipeline.layout.vocabulary import letter
 if TYPE_CHECKING:
     from pipeline.analysis.events.analysis import Event, Scene, Stretch
 
-OF_MAP, OF_FLOW = Effort(256, 2048), Effort(64, 256)
+OF_MAP, OF_FLOW = Effort(256, 1024), Effort(64, 256)
 """Trajectories of maps and of flows."""
 
 LONGEST, OF_BANDS = 6, 12

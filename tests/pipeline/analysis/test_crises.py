@@ -25,7 +25,7 @@ def sweep(model, folder, starts, **axis):
 
 
 def decided(run):
-    """The crises of a run by the way and the range of their event: name, period of the orbit, value, error, exponent."""
+    """The decided events of a run: name, period of the orbit, value and exponent of lifetimes with their errors."""
     table = run.table("events")
     rows = table[~table["what"].isin(["range_end", "not_decided"])]
     names = ["what", "met_period", "value", "value_error", "exponent", "exponent_error"]
@@ -107,13 +107,14 @@ def tangency_of_henon():
         return x, y
 
     def clearance(a):
-        """Least distance from the stable manifold over the leftmost folds of the unstable one; those of two fewer images
-        give 1.4269225, of four fewer 1.426978.
+        """Least distance from the stable manifold over the leftmost folds of the unstable one.
+
+        The tangency of those of two fewer images is at 1.4269225, of four fewer at 1.426978.
         """
         least = np.inf
         for n in (24, 25):
             t = np.linspace(0.0, 1.0, 6001)
-            x, y = along(a, t, n)
+            x, _ = along(a, t, n)
             for k in np.flatnonzero((x[1:-1] < x[:-2]) & (x[1:-1] < x[2:]) & (x[1:-1] < -1.2)) + 1:
                 fold = minimize_scalar(
                     lambda s, n=n: along(a, s, n)[0] - boundary(a, along(a, s, n)[1]),
