@@ -59,6 +59,12 @@ MOST_STEPS_TO_ROOT = 40
 JUMP = 0.01
 """Largest clearance at the value where it changes its sign, as a share of the distance of passages."""
 
+CURVED = 0.2
+"""Largest distance of the zero from those of the lines on each side, as a share of the distance of their values."""
+
+LONGEST_SPAN = 8.0
+"""Largest distance at which lifetimes are taken, in units of that of the clearances."""
+
 SCATTER = 0.05
 """Relative deviation of lifetimes from a power law that counts as one standard deviation: they have fine structure."""
 
@@ -378,7 +384,7 @@ class Contact:
     slope: float  # of the clearance by the parameter
     living: float  # the same value, extrapolated from the side on which the set lives
     beyond: float  # and from the other side
-    extrapolation: float  # largest error of these two
+    span: float  # distance at which the clearance was taken for them
 
 
 def contact_of(approach: Approach, beyond: float) -> Contact | None:
@@ -412,7 +418,7 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         h = _span(approach, x, beyond)
         values = x + (0.0 if h is None else h) * np.array([-1.0, -0.5, 0.5, 1.0])
         least = np.array([approach.least(float(one)).least for one in values])
-        if not (least[0] > least[1] > 0.0 > least[2] > least[3]):
+        if not ((least[:2] > 0.0).all() and (least[2:] < 0.0).all()):
             return None
         found = _confirmed(x, best, values, least)
         if found is not None:
@@ -421,16 +427,19 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
 
 
 def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray) -> Contact | None:
-    """Extrapolate the clearances y at two values x on each side to 0; None unless both lead to the value found."""
+    """Extrapolate the clearances y at two values x on each side to 0; None unless both lead to the value found.
+
+    A trajectory may come within the distance of passages a turn later at one of the values: then there is no line.
+    """
+    if not y[0] > y[1] > y[2] > y[3]:
+        return None
     h = x[3] - value
     living, far = (float(x[i] - y[i] * (x[j] - x[i]) / (y[j] - y[i])) for i, j in ((0, 1), (3, 2)))
     slope = float((y[2] - y[1]) / (x[2] - x[1]))
     error = 2.0 * max(best.error, abs(best.least)) / abs(slope)
-    # a line through two values misses the zero by the curvature: by less than the half distance if it is a line at all
-    extrapolation = 0.2 * abs(h)
-    if max(abs(living - value), abs(far - value)) > extrapolation or not np.isfinite(error):
+    if max(abs(living - value), abs(far - value)) > CURVED * abs(h) or not np.isfinite(error):
         return None
-    return Contact(value, error, slope, living, far, max(abs(living - value), abs(far - value)))
+    return Contact(value, error, slope, living, far, abs(h))
 
 
 def _span(approach: Approach, value: float, beyond: float) -> float | None:
@@ -459,14 +468,14 @@ class Lifetimes:
 
 def lifetimes_of(approach: Approach, contact: Contact, beyond: float) -> Lifetimes | None:
     """Fit a power law to mean lifetimes at several values beyond contact; None if there are too few of them."""
-    h = _span(approach, contact.value, beyond)
+    span = min(abs(beyond - contact.value), LONGEST_SPAN * contact.span) * float(np.sign(beyond - contact.value))
     values, means, counts = [], [], []
-    for k in range(MOST_LIFETIMES) if h is not None else ():
-        value = contact.value + h * 0.5**k
-        mean, n = approach.lifetimes(value, 2 * approach.effort.length)
-        if n < FEWEST_ESCAPES:
+    for k in range(MOST_LIFETIMES):
+        value = contact.value + span * 0.5**k
+        mean, n = approach.lifetimes(value, 4 * approach.effort.length)
+        if n < FEWEST_ESCAPES and values:
             break
-        if mean >= SETTLE:
+        if n >= FEWEST_ESCAPES and mean >= SETTLE:
             values, means, counts = [*values, value], [*means, mean], [*counts, n]
     if len(values) < FEWEST_LIFETIMES:
         return None

@@ -20,7 +20,7 @@ def sweep(model, folder, starts, **axis):
     spec = magpend.Spec("sweep", model)
     for name, values in axis.items():
         spec = spec.with_axis(name, values=values)
-    spec = spec.with_start_random(n=8, seed=0, **starts).with_integration(n_transient=4000, n_keep=200)
+    spec = spec.with_start_random(n=24, seed=0, **starts).with_integration(n_transient=4000, n_keep=100)
     return magpend.run(spec, folder / "run", workers=0)
 
 
@@ -70,7 +70,7 @@ def test_events__crises_of_maps(name, tmp_path):
     for _, _, value, error, exponent, exponent_error in found:
         assert abs(value - known) <= error < 1e-6
         # the edge of the density of a map with a quadratic maximum is a square root
-        assert abs(exponent - 0.5) <= 3.0 * exponent_error < 0.1
+        assert abs(exponent - 0.5) <= 3.0 * exponent_error < 0.2
     assert not (table["what"] == "not_decided").any(), table["evidence"].tolist()
 
 
@@ -128,7 +128,7 @@ def tangency_of_henon():
 
 @pytest.mark.slow
 def test_events__boundary_crisis_of_henon(tmp_path):
-    found, table = decided(sweep(HENON, tmp_path, {"x": (-0.1, 0.1), "y": (-0.1, 0.1)}, a=[1.416, 1.424, 1.43]))
+    found, table = decided(sweep(HENON, tmp_path, {"x": (-0.1, 0.1), "y": (-0.1, 0.1)}, a=[1.42, 1.43]))
     ((what, period, value, error, exponent, exponent_error),) = found
     assert (what, period) == ("boundary_crisis", 1), table["evidence"].tolist()
     assert abs(value - tangency_of_henon()) <= error < 1e-4
