@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
 from pipeline.analysis.branches.dataset import CRITICALITIES
@@ -17,8 +16,9 @@ from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises, Crisis
-from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
+from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.events.names import CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.scene import Event, Scene, Stretch
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -71,56 +71,6 @@ def needs_one_axis(run: OpenRun, options: EventOptions) -> None:
     cube, axis = run.cube(), axis_name(options.parameter)
     if axis in cube.dims:
         select_points(cube.isel({axis: slice(0, 1)}), options.at, purpose=f"events lie along {parameter_name(axis)}")
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Neighbouring parameter values at which an attractor has one kind and period."""
-
-    attractor: int
-    kind: int
-    period: int
-    places: tuple[int, int]  # numbers of its first and last value, in rising order
-    rows: tuple[int, int]  # its rows there
-
-
-@dataclass(frozen=True)
-class Event:
-    """An end of a stretch, or a change between two stretches of one attractor."""
-
-    stretch: Stretch
-    rises: bool
-    fate: Fate
-    what: str = UNDECIDED
-    error: float = np.nan
-    to: Mapping[int, int] = field(default_factory=dict)  # numbers of cells by the id on which they go on
-    n_cells: int = 0
-    after: Stretch | None = None  # the attractor beyond a change
-    born: Born | None = None  # evidence of a cascade
-    crisis: Crisis | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Attractors along one axis, the located branches, and what both need."""
-
-    attractors: xr.Dataset
-    located: xr.Dataset
-    axis: str
-    base: Parameters
-    order: np.ndarray  # positions on the axis by rising value
-    lines: Sequence[Line]
-    names: Mapping[tuple[int, int], int] = field(default_factory=dict)  # ids of joined attractors, by place and id
-
-    @property
-    def along(self) -> np.ndarray:
-        """Values of the axis in rising order."""
-        return np.asarray(self.attractors[self.axis].values[self.order], np.float64)
-
-    @property
-    def scale(self) -> float:
-        """Length of the axis."""
-        return float(np.ptp(self.along))
 
 
 def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
@@ -364,6 +314,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         else 0
         for one in named
     ]
+    crises = [one.born if isinstance(one.born, Crisis) else Crisis("", "") for one in named]
     unit = {"units": str(located.attrs["parameter_units"])}
     columns: dict[str, tuple[Sequence[object], str, Mapping[str, object]]] = {
         "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),
@@ -383,16 +334,16 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
         "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
-        "met_period": (
-            [one.crisis.period if one.crisis else 0 for one in named],
-            "period of the orbit that is met",
+        "exponent": (
+            [one.born.exponent if one.born else np.nan for one in named],
+            "minus the power of the distance with which phases grow",
             {},
         ),
-        "exponent": ([one.crisis.exponent if one.crisis else np.nan for one in named], "exponent of lifetimes", {}),
-        "exponent_error": ([one.crisis.exponent_error if one.crisis else np.nan for one in named], "its error", {}),
-        "twin": ([one.crisis.twin if one.crisis else -1 for one in named], "id of the set it merges with, -1 none", {}),
+        "exponent_error": ([one.born.exponent_error if one.born else np.nan for one in named], "its error", {}),
+        "met_period": ([one.period for one in crises], "period of the unstable orbit that is met, 0 none", {}),
+        "twin": ([one.twin for one in crises], "id of the set with which it merges, -1 none", {}),
         "lives_beyond": (
-            [int(one.crisis is not None and one.crisis.lives_beyond) for one in named],
+            [int(one.lives_beyond) for one in crises],
             "1 if the set on the other side meets the orbit",
             {},
         ),

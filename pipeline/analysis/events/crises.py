@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.deflation import search_orbits, starts_around
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
+from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.contact import (
     SETTLE,
     Approach,
@@ -35,14 +35,12 @@ from pipeline.analysis.events.contact import (
 )
 from pipeline.analysis.events.lines import at
 from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TWINS
+from pipeline.analysis.events.scene import Event, Scene, Stretch
 from pipeline.analysis.ragged import points_of_rows, rows_at
 from pipeline.analysis.sets import nearest_distances
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter
-
-if TYPE_CHECKING:
-    from pipeline.analysis.events.analysis import Event, Scene, Stretch
 
 OF_MAP, OF_FLOW = Effort(256, 1024), Effort(64, 256)
 """Trajectories of maps and of flows."""
@@ -67,18 +65,12 @@ JUMP = 5.0
 """Ratio of a set's growth between neighbouring values to its motion from which a crisis is looked for."""
 
 
-@dataclass(frozen=True, eq=False)
-class Crisis:
-    """A crisis of a chaotic set; `what` is empty if it is not decided, and then only `why` counts."""
+@dataclass(frozen=True)
+class Crisis(Born):
+    """Verdict on the crisis of a chaotic set, with the law of the mean lifetimes beyond."""
 
-    what: str
-    why: str
-    value: float = np.nan
-    error: float = np.nan
     period: int = 0  # of the orbit that is met
-    exponent: float = np.nan  # of the mean lifetimes beyond
-    exponent_error: float = np.nan
-    bands: tuple[int, int] = (0, 0)  # before and after
+    bands: tuple[int, int] = (0, 0)  # before and after; 0 unknown
     twin: int = -1  # id of the set with which it merges
     lives_beyond: bool = False  # whether the set that meets the orbit is the one on the other side
 
@@ -103,7 +95,7 @@ class Crises:
         if found is None:
             return replace(one, fate=replace(one.fate, why="; ".join(dict.fromkeys([why, *(x.why for x in tries)]))))
         fate = replace(one.fate, value=found.value, bifurcation=-1, why=found.why)
-        return replace(one, fate=fate, what=found.what, error=found.error, crisis=found)
+        return replace(one, fate=fate, what=found.what, error=found.error, born=found)
 
     def at(self, attractor: int, place: int, way: int) -> Crisis:
         """Return the crisis in which a chaotic set at a place ends as the parameter goes on to the next place."""
@@ -259,7 +251,8 @@ def _judged(
     told += f"; {bands[0]} bands before and {bands[1]} beyond" if bands[1] else ""
     told += f"; beyond, its trajectories reach {letter(twin)}" if twin >= 0 else ""
     error = max(contact.error, 1e-9 * scene.scale)
-    return Crisis(what, told, contact.value, error, period, times.exponent, times.exponent_error, bands, twin)
+    law = {"exponent": times.exponent, "exponent_error": times.exponent_error}
+    return Crisis(what, told, contact.value, error, **law, period=period, bands=bands, twin=twin)
 
 
 def _kind(
