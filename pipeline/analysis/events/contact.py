@@ -31,7 +31,7 @@ from magpend_core.status import Status
 from pipeline.analysis.branches.problems import Family, Rows
 from pipeline.analysis.sets import Geometry
 
-NEAR, WIDEST = (0.03, 0.018, 0.05), 0.3
+NEAR, WIDEST = (0.03, 0.018, 0.05), 0.25
 """Distances within which a trajectory passes an orbit, tried in turn, and the largest one if a set is further away, as
 shares of the set's size."""
 
@@ -55,6 +55,9 @@ NEIGHBOURS, REFERENCES = 48, 8
 
 MOST_STEPS_TO_ROOT = 40
 """Most parameter values at which the clearance is computed to find its zero."""
+
+SHORTEST = 1e-12
+"""Shortest interval of the parameter in which the zero is looked for, as a share of the first one."""
 
 JUMP = 0.01
 """Largest clearance at the value where it changes its sign, as a share of the distance of passages."""
@@ -306,7 +309,9 @@ class Approach:
         geometry = self.along.geometry
         with np.errstate(invalid="ignore"):
             away = min(float(np.nanmin(geometry.distance(paths, x))) for x in saddle.points)
-        reach = self.size * float(np.clip(2.0 * away / self.size, self.near, WIDEST))
+        reach = max(2.0 * away, self.near * self.size)
+        if not reach <= WIDEST * self.size:
+            return {}, np.nan
         return passages(paths, saddle, self.sample.n_bands, reach, geometry), reach
 
     def begin(self, paths: np.ndarray) -> bool:
@@ -409,7 +414,7 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         else:
             low, here, weights = x, best, [1.0, 0.5 * weights[1] if last < 0 else 1.0]
         last = 1 if best.is_beyond else -1
-        if abs(best.least) <= best.error or abs(high - low) <= 1e-14 * abs(high):
+        if abs(best.least) <= best.error or abs(high - low) <= SHORTEST * abs(beyond - approach.value):
             break
     if not abs(best.least) <= max(best.error, JUMP * NEAR[0] * approach.size):
         return None  # it jumps there

@@ -213,15 +213,22 @@ class Crises:
         ways = [one for one in ways if one.begin(here)]
         there = ways[0].paths(beyond) if ways else here
         near = [one for one in ways if one.least(beyond, there).is_beyond]
-        met = [(one, contact) for one in near if (contact := contact_of(one, beyond)) is not None]
-        if not met:
-            return (
-                f"no crisis: of {len(orbits)} unstable orbits at {at(ds, seen)}, {len(ways)} lie beside the set, "
-                f"{len(near)} of them are crossed at {at(ds, beyond)}, and none is met at one value from both sides"
-            )
-        first = min(met, key=lambda pair: abs(pair[1].value - seen))[1]
-        same = [pair for pair in met if abs(pair[1].value - first.value) <= pair[1].error + first.error]
-        return min(same, key=lambda pair: pair[0].first.period)
+        near.sort(key=lambda one: one.least(seen, here).least)
+        first: tuple[Approach, Contact] | None = None
+        before, earlier = seen, here
+        for one in near:
+            # where the set has grown, it crosses other orbits too: only one that it crosses before counts
+            if first is not None and not one.least(before, earlier).is_beyond:
+                continue
+            contact = contact_of(one, beyond)
+            if contact is not None and (first is None or abs(contact.value - seen) < abs(first[1].value - seen)):
+                first = one, contact
+                before = contact.value - 0.5 * contact.span * float(np.sign(beyond - seen))
+                earlier = one.paths(before)
+        return first or (
+            f"no crisis: of {len(orbits)} unstable orbits at {at(ds, seen)}, {len(ways)} lie beside the set, "
+            f"{len(near)} of them are crossed at {at(ds, beyond)}, and none is met at one value from both sides"
+        )
 
 
 def _judged(
