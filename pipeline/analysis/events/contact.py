@@ -220,31 +220,31 @@ def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geom
     found = {}
     for k in range(saddle.period):
         offset = geometry.difference(paths, saddle.points[k])
-        along = offset @ saddle.covectors[k]
-        beside = np.abs(offset - along[..., None] * saddle.directions[k]).max(axis=-1)
-        away = np.maximum(np.abs(along), beside)
         with np.errstate(invalid="ignore"):
-            inside = away < reach
-        for phase in range(step):
-            near = inside[:, phase::step]
-            enters = near.copy()
-            enters[:, 1:] &= ~near[:, :-1]
-            enters[:, 0] = False  # those came near before
-            lane, turn = np.nonzero(near & (np.cumsum(enters, axis=1) > 0))
-            if not len(lane):
-                continue
-            number = np.cumsum(enters.ravel()).reshape(near.shape)[lane, turn]
-            order = np.lexsort((away[lane, turn * step + phase], number))
-            closest = order[np.unique(number[order], return_index=True)[1]]
-            _, first, turns = np.unique(number, return_index=True, return_counts=True)
-            at = turn[closest] * step + phase
-            gone = turn[closest] - turn[first]
-            coordinate = along[lane[closest], at]
-            with np.errstate(over="ignore"):
-                # where the orbit's linear map holds, a trajectory leaves when the coordinate has grown to the reach
-                passes = np.abs(coordinate) * factor ** (turns - 1 - gone) <= SLACK * reach
-            clearance = coordinate * (1.0 / factor) ** gone
-            found[k, phase] = clearance[passes], lane[closest][passes], at[passes]
+            lane, time = np.nonzero(np.abs(offset).max(axis=-1) < 2.0 * reach)
+        offset = offset[lane, time]
+        along = offset @ saddle.covectors[k]
+        beside = np.abs(offset - along[:, None] * saddle.directions[k]).max(axis=-1)
+        away = np.maximum(np.abs(along), beside)
+        order = np.lexsort((time, time % step, lane))
+        order = order[away[order] < reach]
+        along, away, lane, time = along[order], away[order], lane[order], time[order]
+        if not len(lane):
+            continue
+        begins = np.append(True, (np.diff(lane) != 0) | (np.diff(time) != step))
+        number = np.cumsum(begins) - 1
+        closest = np.lexsort((away, number))[np.flatnonzero(begins)]
+        first, turns = time[begins], np.bincount(number)
+        gone = (time[closest] - first) // step
+        with np.errstate(over="ignore"):
+            # where the orbit's linear map holds, a trajectory leaves when the coordinate has grown to the reach
+            passes = np.abs(along[closest]) * factor ** (turns - 1 - gone) <= SLACK * reach
+        passes &= first >= step  # the others came near before
+        closest, gone = closest[passes], gone[passes]
+        clearance = along[closest] * (1.0 / factor) ** gone
+        for phase in np.unique(time[closest] % step).tolist():
+            own = time[closest] % step == phase
+            found[k, phase] = clearance[own], lane[closest][own], time[closest][own]
     return found
 
 
@@ -289,7 +289,8 @@ class Approach:
     def saddle(self, value: float) -> Saddle | None:
         """Return the orbit at a parameter value, followed from the nearest known one."""
         near = min(self._known, key=lambda known: abs(known - value))
-        for x in np.linspace(near, value, 5)[1:].tolist() if near != value else []:
+        steps = 2 if abs(value - near) < 0.02 * self.along.family.scales[0] else 5
+        for x in np.linspace(near, value, steps)[1:].tolist() if near != value else []:
             known = self._known[near]
             found = self.along.saddle(x, known.points[0], known.period)
             if found is None:
@@ -465,9 +466,9 @@ class Lifetimes:
 
     values: tuple[float, ...]
     means: tuple[float, ...]
-    exponent: float
+    exponent: float  # with p_c at the contact
     exponent_error: float
-    value: float  # fitted p_c
+    value: float  # p_c, fitted without knowledge of the contact
     value_error: float
 
 
@@ -487,27 +488,30 @@ def lifetimes_of(approach: Approach, contact: Contact, beyond: float) -> Lifetim
     return fit_lifetimes(values, means, counts, contact.value)
 
 
-def fit_lifetimes(values: Sequence[float], means: Sequence[float], counts: Sequence[int], near: float) -> Lifetimes:
-    """Fit ``c |p - p_c|^-gamma`` to mean lifetimes with a free p_c near a given value.
+def fit_lifetimes(values: Sequence[float], means: Sequence[float], counts: Sequence[int], contact: float) -> Lifetimes:
+    """Fit ``c |p - p_c|^-gamma`` to mean lifetimes: gamma with p_c at the contact, and p_c with both free.
 
     Parameters
     ----------
     values, means, counts
         Parameter values, mean lifetimes there, and numbers of trajectories that left, the nearest value last.
-    near
-        Value from which the fit of p_c starts.
+    contact
+        Value of the contact.
     """
-    away = np.asarray(values) - near
+    away, logs = np.asarray(values) - contact, np.log(means)
     unit, sigma = away[-1], np.sqrt(1.0 / np.asarray(counts) + SCATTER**2)
 
     def residual(u: np.ndarray) -> np.ndarray:
-        return np.asarray((u[0] - u[1] * np.log(away / unit - u[2]) - np.log(means)) / sigma)
+        shift = u[2] if len(u) == 3 else 0.0
+        return np.asarray((u[0] - u[1] * np.log(away / unit - shift) - logs) / sigma)
 
-    bounds = ([-np.inf, -np.inf, -np.inf], [np.inf, np.inf, 0.999])
-    found = least_squares(residual, [np.log(means[-1]), 1.0, 0.0], bounds=bounds)
-    spread = np.linalg.pinv(found.jac.T @ found.jac) * max(1.0, 2.0 * found.cost / max(len(values) - 3, 1))
-    errors = np.sqrt(np.diag(spread))
-    return Lifetimes(
-        tuple(values), tuple(means), float(found.x[1]), float(errors[1]), float(near + unit * found.x[2]),
-        float(abs(unit) * errors[2]),
-    )  # fmt: skip
+    def fitted(start: list[float]) -> tuple[np.ndarray, np.ndarray]:
+        most = [np.inf, np.inf, 0.999][: len(start)]
+        found = least_squares(residual, start, bounds=([-np.inf] * len(start), most))
+        scatter = max(1.0, 2.0 * found.cost / max(len(logs) - len(start), 1))
+        return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac) * scatter))
+
+    fixed, errors = fitted([float(logs[-1]), 1.0])
+    free, free_errors = fitted([*fixed.tolist(), 0.0])
+    value, value_error = float(contact + unit * free[2]), float(abs(unit) * free_errors[2])
+    return Lifetimes(tuple(values), tuple(means), float(fixed[1]), float(errors[1]), value, value_error)

@@ -162,7 +162,10 @@ def test_count_bands__of_the_logistic_map():
 
 def test_fit_lifetimes__a_power_law():
     values = 2.0 + 0.1 * 0.5 ** np.arange(8)
-    found = fit_lifetimes(values.tolist(), (3.0 * (values - 1.9999) ** -0.7).tolist(), [1000] * 8, 2.0)
+    means = (3.0 * (values - 1.9999) ** -0.7).tolist()
+    found = fit_lifetimes(values.tolist(), means, [1000] * 8, 1.9999)
     assert found.exponent == pytest.approx(0.7, abs=1e-6)
+    # the value does not depend on the contact
+    found = fit_lifetimes(values.tolist(), means, [1000] * 8, 2.0)
     assert found.value == pytest.approx(1.9999, abs=1e-8)
     assert 1e-6 < found.value_error < 1e-3
