@@ -77,10 +77,13 @@ FEWEST_ESCAPES, FEWEST_LIFETIMES, MOST_LIFETIMES = 40, 4, 8
 
 @dataclass(frozen=True)
 class Effort:
-    """Number of trajectories, and of section points of each."""
+    """Number of trajectories and of section points of each, and limits of the search for orbits."""
 
     lanes: int
     length: int
+    longest: int  # period
+    starts: int  # of Newton's method for each period
+    rounds: int  # of deflation
 
 
 @dataclass(frozen=True, eq=False)

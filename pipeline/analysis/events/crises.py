@@ -42,14 +42,11 @@ from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter
 
-OF_MAP, OF_FLOW = Effort(256, 1024), Effort(64, 256)
-"""Trajectories of maps and of flows."""
+OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(64, 256, 3, 12, 1)
+"""Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
 
-LONGEST, OF_BANDS = 6, 12
-"""Longest period of the orbits that are looked for, and the longest one if it is once or twice the number of bands."""
-
-STARTS, ROUNDS = 48, 2
-"""Starts of Newton's method for each period, and its deflated rounds."""
+OF_BANDS = 12
+"""Longest period of the orbits that are looked for because it is once or twice the number of bands."""
 
 SURE = 4.0
 """Largest distance of the value from lifetimes, in units of its error."""
@@ -158,7 +155,7 @@ class Crises:
             sample = sample_of(along, seen, points[row][-1], effort)
         except ValueError:
             return Crisis("", "its trajectories end")
-        met = self._met(along, effort, sample, (seen, beyond), self._orbits(along, sample, seen))
+        met = self._met(along, effort, sample, (seen, beyond), self._orbits(along, sample, seen, effort))
         if isinstance(met, str):
             return Crisis("", met)
         others = {
@@ -184,21 +181,21 @@ class Crises:
         family = family_of(model.system, 1, frequency, packed, scene.axis, scene.scale)
         return SectionMap(family, geometry_of(scene.attractors), PORTRAIT_RTOL), OF_MAP if model.is_map else OF_FLOW
 
-    def _orbits(self, along: SectionMap, sample: Sample, seen: float) -> list[Saddle]:
+    def _orbits(self, along: SectionMap, sample: Sample, seen: float, effort: Effort) -> list[Saddle]:
         """Return the saddle orbits at a parameter value: those of located branches, and those around the set."""
         system = along.family.system
         rows = along.rows(seen, sample.points[:1])
         m = sample.n_bands
-        periods = sorted({*range(1, LONGEST + 1), *(p for p in (m, 2 * m) if p <= OF_BANDS)})
-        starts = [starts_around(sample.points[::7], STARTS, 0, system)] * len(periods)
-        asked = np.repeat(periods, STARTS)
+        periods = sorted({*range(1, effort.longest + 1), *(p for p in (m, 2 * m) if p <= OF_BANDS)})
+        starts = [starts_around(sample.points[::7], effort.starts, 0, system)] * len(periods)
+        asked = np.repeat(periods, effort.starts)
         for line in self.scene.lines:
             for node in np.flatnonzero((line.value[:-1] - seen) * (line.value[1:] - seen) <= 0.0).tolist():
                 if line.period:
                     starts.append(line.points[node, :1])
                     asked = np.append(asked, line.period)
         found = search_orbits(
-            np.concatenate(starts), asked, float(rows.frequency_hz[0]), rows.parameters[0], system, rounds=ROUNDS
+            np.concatenate(starts), asked, float(rows.frequency_hz[0]), rows.parameters[0], system, rounds=effort.rounds
         )
         saddles = [along.saddle(seen, one.points[0], one.period) for one in found]
         return [one for one in saddles if one is not None]
