@@ -448,7 +448,7 @@ def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray) -> C
     error = 2.0 * max(best.error, abs(best.least)) / abs(slope)
     if max(abs(living - value), abs(far - value)) > CURVED * abs(h) or not np.isfinite(error):
         return None
-    return Contact(value, error, slope, living, far, abs(h))
+    return Contact(value, error, slope, living, far, float(abs(h)))
 
 
 def _span(approach: Approach, value: float, beyond: float) -> float | None:
