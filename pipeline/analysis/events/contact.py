@@ -124,7 +124,7 @@ class SectionMap:
             lasted = np.maximum(cells.n_periods[failed, 0] - 1, 1)
             again = self._integrate(value[failed], starts[failed], lasted).section[:, 0]
             section[failed, : again.shape[1]] = again
-        return section
+        return np.asarray(section)
 
     def _integrate(self, value: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> Cells:
         rows = self.rows(value, starts)
@@ -478,7 +478,9 @@ class Lifetimes:
 def lifetimes_of(approach: Approach, contact: Contact, beyond: float) -> Lifetimes | None:
     """Fit a power law to mean lifetimes at several values beyond contact; None if there are too few of them."""
     span = min(abs(beyond - contact.value), LONGEST_SPAN * contact.span) * float(np.sign(beyond - contact.value))
-    values, means, counts = [], [], []
+    values: list[float] = []
+    means: list[float] = []
+    counts: list[int] = []
     for k in range(MOST_LIFETIMES):
         value = contact.value + span * 0.5**k
         mean, n = approach.lifetimes(value, 4 * approach.effort.length)

@@ -255,8 +255,8 @@ def _judged(
     told += f"; {bands[0]} bands before and {bands[1]} beyond" if bands[1] else ""
     told += f"; beyond, its trajectories reach {letter(twin)}" if twin >= 0 else ""
     error = max(contact.error, 1e-9 * scene.scale)
-    law = {"exponent": times.exponent, "exponent_error": times.exponent_error}
-    return Crisis(what, told, contact.value, error, **law, period=period, bands=bands, twin=twin)
+    found = Crisis(what, told, contact.value, error, period=period, bands=bands, twin=twin)
+    return replace(found, exponent=times.exponent, exponent_error=times.exponent_error)
 
 
 def _kind(
