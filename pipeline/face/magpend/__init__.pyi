@@ -108,3 +108,4 @@ resilience = Run.resilience
 edge = Run.edge
 escapes = Run.escapes
 density = Run.density
+transfer = Run.transfer
