@@ -109,3 +109,4 @@ resilience = Run.resilience
 edge = Run.edge
 escapes = Run.escapes
 density = Run.density
+transfer = Run.transfer
