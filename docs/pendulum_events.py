@@ -11,9 +11,9 @@ import argparse
 import re
 from pathlib import Path
 
-import magpend
 import pandas as pd
 
+import magpend
 from pipeline.layout.vocabulary import letter
 
 PAGE = Path(__file__).resolve().parent / "tutorials" / "bifurcations.md"

@@ -20,8 +20,9 @@ ENDS = (
     *LIMITS,
     "unstable",
 )
-"""Reasons why a branch ends: ``unstable`` where only stable parts are followed, ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as
-a branch on another section, ``homoclinic`` and ``snic`` where their period grows without bound."""
+"""Reasons why a branch ends: ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as
+a branch on another section, ``homoclinic`` and ``snic`` where their period grows without bound, ``unstable`` beyond a
+stable part where no more is followed."""
 
 TANGENT = 0.01
 """A branch of cycles ends where the crossing speed times the period is below this distance [scales of the state
