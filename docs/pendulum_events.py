@@ -1,7 +1,7 @@
 """Tabulate the events of the pendulum's attractors: ``python docs/pendulum_events.py [--runs FOLDER] [NAME...]``.
 
 For each workflow of `RUNS`, or those named, the run is computed (a complete one is taken as it is), its events are
-named by ``magpend analyse events RUN --stable``, and the tables between the marks ``<!-- events: NAME -->`` and
+named by ``magpend analyse events RUN --stable --period 12``, and the tables between the marks ``<!-- events: NAME -->`` and
 ``<!-- end -->`` of the tutorial are written anew. A CSV file beside the tutorial has all columns.
 """
 
@@ -26,38 +26,42 @@ def computed(name: str, folder: Path) -> magpend.Run:
 
 
 def rows_of(run: magpend.Run) -> pd.DataFrame:
-    """Return the events of a run by rising frequency, each with the sides of its attractor."""
-    rows = run.table("events", stable=True)
-    sides = run.table("attractors").groupby("attractor")["side"].agg(lambda own: ", ".join(sorted(set(own))))
+    """Return the events of a run by rising frequency, each with the side of its attractor."""
+    rows = run.table("events", stable=True, max_period=12)
+    sides = run.table("attractors").groupby("attractor_id")["side"].agg(lambda own: ", ".join(sorted(set(own))))
     rows = rows[~rows["what"].isin(["range_end", "lives_on"])].assign(side=rows["attractor"].map(sides))
     middle = rows["value"].fillna(0.5 * (rows["seen"] + rows["beyond"]))
     return rows.iloc[middle.argsort(kind="stable")]
 
 
-def table_of(rows: pd.DataFrame) -> list[str]:
+def tables_of(rows: pd.DataFrame) -> list[str]:
     """Return the decided events as a Markdown table, and below it the intervals in which nothing is decided."""
-    decided, is_open = rows[rows["what"] != "not_decided"], rows["what"] == "not_decided"
-    lines = ["| Hz | attractor | event |", "|---|---|---|"]
-    for row in decided.to_dict("records"):
-        value, _, what = row["sentence"].partition(" = ")[2].partition(": ")
-        at, _, way = value.partition(" Hz as it ")
-        lines.append(f"| {at} | {_who(row)}, as the frequency {way} | {what} |")
-    lines += [
-        "",
-        f"Not decided are {is_open.sum()} of {len(rows)} ends:",
-        "",
-        "| Hz | attractor | tried |",
-        "|---|---|---|",
-    ]
+    is_open = rows["what"] == "not_decided"
+    lines = ["| Hz | attractor | lost as the frequency | by | its cells |", "|---|---|---|---|---|"]
+    for row in rows[~is_open].to_dict("records"):
+        value, what, cells = _parts(row["sentence"])
+        lines.append(f"| {value} | {_who(row)} | {_way(row)} | {what} | {cells} |")
+    lines += ["", f"{is_open.sum()} of {len(rows)} events are not decided:", ""]
+    lines += ["| Hz | attractor | lost as the frequency | tried | its cells |", "|---|---|---|---|---|"]
     for row in rows[is_open].to_dict("records"):
         low, high = sorted((row["seen"], row["beyond"]))
-        lines.append(f"| {low:.5g} to {high:.5g} | {_who(row)}, as the frequency {_way(row)} | {row['evidence']} |")
+        cells = row["sentence"].rpartition("); ")[2].removeprefix("of its cells ").removeprefix("its cells ")
+        lines.append(f"| {low:.5g} to {high:.5g} | {_who(row)} | {_way(row)} | {row['evidence']} | {cells} |")
     return lines
+
+
+def _parts(sentence: str) -> tuple[str, str, str]:
+    """Return the value with its error, the event and what becomes of the cells, without the numbers of branches."""
+    value, _, rest = sentence.partition(" = ")[2].partition(" Hz as it ")
+    what, _, cells = rest.partition(": ")[2].partition("; ")
+    what = re.sub(r" \(branch \d+\)", "", what.replace("meets the unstable", "meets an unstable"))
+    return value, re.sub(r" of branch \d+", "", what), cells.removeprefix("of its cells ").removeprefix("its cells ")
 
 
 def _who(row: dict[str, object]) -> str:
     own = f"period {row['period']}" if row["period"] else str(row["set"]).replace("_", " ")
-    return f"{letter(int(str(row['attractor'])))}, {row['side']}, {own}"
+    after = f" to {row['period_after']}" if int(str(row["period_after"])) >= 0 else ""
+    return f"{letter(int(str(row['attractor'])))}, {row['side']}, {own}{after}"
 
 
 def _way(row: dict[str, object]) -> str:
@@ -82,7 +86,7 @@ def main() -> None:
     for name in given.names:
         rows = rows_of(computed(name, given.runs))
         rows.to_csv(PAGE.parent / f"{name}.csv", index=False)
-        PAGE.write_text(written(PAGE.read_text("utf-8"), name, table_of(rows)), "utf-8")
+        PAGE.write_text(written(PAGE.read_text("utf-8"), name, tables_of(rows)), "utf-8")
 
 
 if __name__ == "__main__":
