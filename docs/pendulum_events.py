@@ -1,8 +1,9 @@
 """Tabulate the events of the pendulum's attractors: ``python docs/pendulum_events.py [--runs FOLDER] [NAME...]``.
 
-For each workflow of `RUNS`, or those named, the run is computed (a complete one is taken as it is), its events are
-named by ``magpend analyse events RUN --stable --period 12``, and the tables between the marks ``<!-- events: NAME -->`` and
-``<!-- end -->`` of the tutorial are written anew. A CSV file beside the tutorial has all columns.
+A name is that of a workflow. Its run is computed (a complete one is taken as it is), its events are named as by
+``magpend analyse events RUN --stable --period 12``, and the tables of the tutorial are written anew, between the
+marks ``<!-- events: NAME -->`` and ``<!-- end -->``; without names all that have marks. Beside the tutorial lie the
+figure and a CSV file with all columns.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import magpend
 from pipeline.layout.vocabulary import letter
 
 PAGE = Path(__file__).resolve().parent / "tutorials" / "bifurcations.md"
-RUNS = ("events_2_3hz", "events_0p1_2hz")
+OPTIONS = {"stable": True, "max_period": 12}
 
 
 def computed(name: str, folder: Path) -> magpend.Run:
@@ -27,7 +28,7 @@ def computed(name: str, folder: Path) -> magpend.Run:
 
 def rows_of(run: magpend.Run) -> pd.DataFrame:
     """Return the events of a run by rising frequency, each with the side of its attractor."""
-    rows = run.table("events", stable=True, max_period=12)
+    rows = run.table("events", **OPTIONS)
     sides = run.table("attractors").groupby("attractor_id")["side"].agg(lambda own: ", ".join(sorted(set(own))))
     rows = rows[~rows["what"].isin(["range_end", "lives_on"])].assign(side=rows["attractor"].map(sides))
     middle = rows["value"].fillna(0.5 * (rows["seen"] + rows["beyond"]))
@@ -79,13 +80,16 @@ def written(page: str, name: str, lines: list[str]) -> str:
 
 def main() -> None:
     """Compute what the command line names, and write the page and its files."""
+    marked = re.findall(r"<!-- events: (\w+) -->", PAGE.read_text("utf-8"))
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("names", nargs="*", default=RUNS, metavar="NAME", help=f"workflows: {', '.join(RUNS)}")
+    words.add_argument("names", nargs="*", default=marked, metavar="NAME", help=f"workflows: {', '.join(marked)}")
     words.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the runs")
     given = words.parse_args()
     for name in given.names:
-        rows = rows_of(computed(name, given.runs))
+        run = computed(name, given.runs)
+        rows = rows_of(run)
         rows.to_csv(PAGE.parent / f"{name}.csv", index=False)
+        run.plot.genealogy(**OPTIONS).figure.savefig(PAGE.parent / f"{name}.png", dpi=120)
         PAGE.write_text(written(PAGE.read_text("utf-8"), name, tables_of(rows)), "utf-8")
 
 
