@@ -96,10 +96,11 @@ class Series:
         return Series(self.of, self.values * other)
 
     def __truediv__(self, other: Any) -> Series:
-        return self * (power(other, -1.0) if isinstance(other, Series) else 1.0 / other)
+        return self.__mul__(power(other, -1.0) if isinstance(other, Series) else 1.0 / other)
 
     def __rtruediv__(self, other: Any) -> Series:
-        return power(self, -1.0) * other
+        inverse: Series = power(self, -1.0)
+        return inverse * other
 
     def __pow__(self, exponent: Any) -> Series:
         if exponent == int(exponent) and exponent >= 0:
@@ -107,7 +108,8 @@ class Series:
             for _ in range(int(exponent)):
                 found = found * self
             return found
-        return power(self, exponent)
+        found = power(self, exponent)
+        return found
 
     __radd__, __rmul__ = __add__, __mul__
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
-from numba import config
+import numba
 
 
 class _PlainModule:
@@ -52,7 +52,7 @@ def _replaced(value: Any, known: dict[int, Any]) -> Any:
 
 def _is_left_plain(value: Any) -> bool:
     """Return whether a function of the engine or of a model was not compiled, as with ``NUMBA_DISABLE_JIT``."""
-    return bool(config.DISABLE_JIT) and str(getattr(value, "__module__", "")).startswith("magpend_core.")
+    return bool(vars(numba.config)["DISABLE_JIT"]) and str(getattr(value, "__module__", "")).startswith("magpend_core.")
 
 
 def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> FunctionType:

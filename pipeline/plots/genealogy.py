@@ -28,6 +28,9 @@ _ROW_IN = 0.34
 _LETTER = 0.012
 """Width of a letter, as a share of the panel's: names of shorter bars are left out."""
 
+_HALO = [withStroke(linewidth=1.8, foreground="white")]
+"""White outline of texts over bars and arrows."""
+
 _OPEN: dict[str, Any] = {"color": "0.45", "linewidth": 1.2, "linestyle": (0, (1, 1.2))}
 _JOIN: dict[str, Any] = {"arrowstyle": "->", "linewidth": 0.6, "color": "0.35", "shrinkA": 5.0, "shrinkB": 4.0}
 _CRISES = {
@@ -46,7 +49,8 @@ def plot_genealogy(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     """Draw the range of each attractor as a bar in a row of its own, and the events at the ends of the bars.
 
     Marks name the bifurcations (LP, PD, ...). An arrow leads to the attractor on which most cells go on. A dotted
-    line is the interval in which an end is not decided.
+    line is the interval in which an end is not decided. A bar bears its period; where it is too short, the period
+    stands in brackets beside the letter.
 
     Parameters
     ----------
@@ -74,9 +78,9 @@ def plot_genealogy(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     fig = style.new_figure(max(1.3 + _ROW_IN * len(ids), 2.4), stored, frame)
     ax = fig.add_subplot()
     style.style_axes(ax, minor=False)
-    _draw_bars(ax, ds, rows)
+    named = _draw_bars(ax, ds, rows)
     _draw_events(ax, ds, rows)
-    ax.set_yticks(list(rows.values()), [letter(i) for i in rows])
+    ax.set_yticks(list(rows.values()), [letter(i) if i in named else _with_periods(ds, i) for i in rows])
     ax.tick_params(axis="y", length=0.0)
     ax.set_ylim(-0.6, len(ids) - 0.35)
     ax.margins(x=0.02)
@@ -88,7 +92,14 @@ def plot_genealogy(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     return fig
 
 
-def _draw_bars(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
+def _with_periods(ds: xr.Dataset, number: int) -> str:
+    """Return the letter of an attractor with its periods in brackets, if it has some."""
+    periods = set(ds["stretch_period"].values[ds["stretch_attractor"].values == number].tolist()) - {0}
+    return f"{letter(number)} ({', '.join(map(str, sorted(periods)))})" if periods else letter(number)
+
+
+def _draw_bars(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> set[int]:
+    """Draw the bars with their names, and return the attractors of which a bar is long enough for its name."""
     kinds, names = words_of(ds["stretch_set"]), []
     for k in range(ds.sizes["stretch"]):
         number, period = int(ds["stretch_attractor"][k]), int(ds["stretch_period"][k])
@@ -102,18 +113,20 @@ def _draw_bars(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
             ax.plot(low, rows[number], linestyle="none", marker="s", markersize=5.0, color=colour, zorder=3.0)
         text = f"period {period}" if period else plain(kinds[int(ds["stretch_set"][k])])
         middle = 0.5 * (low + high)
-        names.append((high - low, middle, text, rows[number]))
+        names.append((high - low, middle, text, number))
+    named = set()
     width = np.ptp([x for k in ("low", "high") for x in ds[f"stretch_{k}"].values])
-    for length, middle, text, row in names:
+    for length, middle, text, number in names:
         if length > _LETTER * len(text) * width:
+            named.add(number)
             ax.annotate(
-                text, (middle, row), (0.0, -4.5), textcoords="offset points", ha="center", va="top",
-                fontsize=style.look_of(ax).tick, zorder=9.0,
+                text, (middle, rows[number]), (0.0, -4.5), textcoords="offset points", ha="center", va="top",
+                fontsize=style.look_of(ax).tick, zorder=9.0, path_effects=_HALO,
             )  # fmt: skip
+    return named
 
 
 def _draw_events(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
-    halo = [withStroke(linewidth=1.8, foreground="white")]
     taken: dict[int, list[float]] = {row: [] for row in rows.values()}
     width = np.ptp([x for k in ("low", "high") for x in ds[f"stretch_{k}"].values])
     for k in range(ds.sizes["event"]):
@@ -132,7 +145,7 @@ def _draw_events(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
             label = ""
         ax.annotate(
             label, (x, row), (0.0, 5.0), textcoords="offset points", ha="center", va="bottom",
-            fontsize=style.look_of(ax).tick, zorder=9.0, path_effects=halo,
+            fontsize=style.look_of(ax).tick, zorder=9.0, path_effects=_HALO,
         )  # fmt: skip
         to = int(ds["to_attractor"][k, 0])
         if int(ds["period_after"][k]) < 0 and to in rows and rows[to] != row:

@@ -110,19 +110,19 @@ def _draw_boxes(axes: np.ndarray, part: xr.Dataset, own: np.ndarray, names: list
 
 def _draw_curves(axes: np.ndarray, part: xr.Dataset, own: np.ndarray, names: list[str]) -> None:
     measure = labels.state_measure(part, names[0])
-    x, half = part["place"].values[:, 0], 0.5 * float(part["width"][0])
-    density = part["density"].values * part["measure"].values[own] / (2.0 * half)
+    x, width = part["place"].values[:, 0], part["width"].values[:1]
+    density = part["density"].values / width
     for ax, values in zip(axes, (density, part["committor"].values), strict=True):
         for k in range(part.sizes[SET]):
-            _draw_steps(ax, measure.shown(x[own == k]), values[own == k], measure.shown(half), _colour(k))
+            _draw_steps(ax, measure.shown(x[own == k]), values[own == k], float(measure.shown(width)[0]), _colour(k))
         style.style_axes(ax)
         ax.set_ylim(bottom=0.0)
         style.label_axes(ax, measure.label, "density" if ax is axes[0] else "committor of the own set")
 
 
-def _draw_steps(ax: Axes, x: np.ndarray, y: np.ndarray, half: float, colour: str) -> None:
+def _draw_steps(ax: Axes, x: np.ndarray, y: np.ndarray, width: float, colour: str) -> None:
     order = np.argsort(x)
-    ax.bar(x[order], y[order], width=2.0 * half, color=colour, linewidth=0.0, gid="boxes")
+    ax.bar(x[order], y[order], width=width, color=colour, linewidth=0.0, gid="boxes")
 
 
 def draw(run: OpenRun, options: TransferFigureOptions) -> style.DataFigure:

@@ -44,6 +44,9 @@ class BranchOptions(AlongOptions):
         "branches; up to --period, or the longest period of the run's orbits, at most 4.",
         ge=0,
     )
+    stable: bool = option(
+        False, "Follow stable parts only, and a little of what lies beyond: much faster if there are many attractors."
+    )
     start: dict[str, float] = option(
         {}, "Also start from the orbit or equilibrium near a state, such as x=0.1,v=0; the parameter may be among them."
     )

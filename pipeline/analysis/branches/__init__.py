@@ -87,7 +87,8 @@ variable                          dims                     meaning
                                                            (its cycles only touch the section),
                                                            other_section (its cycles go on as a branch on
                                                            the run's section), homoclinic or snic (their period
-                                                           grows without bound, see `limits`)
+                                                           grows without bound, see `limits`), unstable (with
+                                                           --stable: some points beyond its stable part)
 ``limit_value``, ``_error``       branch, end              such an end's parameter value; absent if there is none,
                                                            like all that follows
 ``limit_state``                   branch, end, state       equilibrium at which the cycles come to rest

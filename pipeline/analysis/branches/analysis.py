@@ -35,6 +35,10 @@ NO_LENGTH = 1e-9
 """Length of a stable segment, as a share of its branch, that is nothing but rounding."""
 
 
+BEYOND = 20
+"""Points of a branch beyond its stable part that are followed with ``--stable``: they show what crosses there."""
+
+
 def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
     """Fill in the parameter interval of the branches from the run's swept axis; raise SpecError if it is empty."""
     from pipeline.analysis.branches.asked import check_asked
@@ -58,6 +62,7 @@ def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
 
 def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
+    from pipeline.analysis.branches.arclength import Settings
     from pipeline.analysis.branches.asked import count_equilibria, counted_variables, given_starts
     from pipeline.analysis.branches.dataset import dataset_of
     from pipeline.analysis.branches.exploring import Scope, explore
@@ -82,7 +87,8 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
         place.search(periods)
         starts += place.starts()
     run.echo(f"branches: {len(starts)} starting orbits, periods up to {longest}")
-    scope = Scope(low, high, longest, options.generations)
+    settings = Settings(beyond=BEYOND if options.stable else 0)
+    scope = Scope(low, high, longest, options.generations, settings)
     followed = explore(starts, scope)
     if starts and not followed:
         left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]

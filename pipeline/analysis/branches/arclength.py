@@ -28,6 +28,7 @@ class Settings:
     tolerance: float = 1e-10  # largest scaled residual of a point
     max_iterations: int = 6  # Newton steps before a step is halved
     largest_turn: float = 0.25  # largest angle between neighbouring tangents [rad]
+    beyond: int = 0  # points after which a branch without stability ends; 0: never
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,7 +82,7 @@ class Enclosed:
     @property
     def states(self) -> np.ndarray:
         """Middles of the enclosures, shape (n, n_states)."""
-        return 0.5 * (np.array(self.low) + np.array(self.high))
+        return np.asarray(0.5 * (np.array(self.low) + np.array(self.high)))
 
 
 def enclose_equilibria(rates: Rates, box: Box, most: int = MOST_BOXES) -> Enclosed:
@@ -128,7 +128,8 @@ class _Search:
     def is_covered(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return which of some boxes lie in a region that has one equilibrium, which is known."""
         first, last = self.regions
-        return np.asarray(((first <= low[:, None]) & (high[:, None] <= last)).all(axis=2).any(axis=1))
+        inside = (first <= low[:, None]) & (high[:, None] <= last)
+        return np.asarray(np.any(np.all(inside, axis=2), axis=1))
 
     def look_at(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Exclude boxes, record the equilibria of others, and return the halves of the rest."""
@@ -203,7 +204,7 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
     with np.errstate(all="ignore"):
         middle = 0.5 * (first + last)
         radius = np.nextafter(np.maximum(last - middle, middle - first), np.inf)
-        good = np.isfinite(radius).all(axis=(1, 2))
+        good = np.asarray(np.isfinite(radius).all(axis=(1, 2)))
         good[good] = np.abs(np.linalg.det(middle[good])) > 0.0
         inverse = np.where(good[:, None, None], middle, np.eye(n))
         inverse = np.linalg.inv(inverse)

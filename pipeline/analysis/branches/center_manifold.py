@@ -46,7 +46,7 @@ class Rest:
         """Return the scaled rates on scaled states that are power series."""
         scales, row = np.asarray(self.family.system.scales)[:, None], self.family.rows(self.u[None])
         states = np.concatenate([row.states.T, states[:, 1:] * scales], axis=1)
-        return rates_on(self.family.system, row.parameters[0], of, states) / scales
+        return np.asarray(rates_on(self.family.system, row.parameters[0], of, states) / scales)
 
     def second(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the second derivative B(a, b) of the scaled rates along two vectors."""

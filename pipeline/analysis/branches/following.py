@@ -10,7 +10,7 @@ import numpy as np
 from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, settle_sides
+from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstable, settle_sides
 from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem
@@ -18,9 +18,11 @@ from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneP
 ENDS = (
     *("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section"),
     *LIMITS,
+    "unstable",
 )
 """Reasons why a branch ends: ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as
-a branch on another section, ``homoclinic`` and ``snic`` where their period grows without bound."""
+a branch on another section, ``homoclinic`` and ``snic`` where their period grows without bound, ``unstable`` beyond a
+stable part where no more is followed."""
 
 TANGENT = 0.01
 """A branch of cycles ends where the crossing speed times the period is below this distance [scales of the state
@@ -87,11 +89,14 @@ class Half:
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """Rule that ends a branch at a parameter bound, when it closes, at an equilibrium or at a period halving."""
+    """Rule that ends a branch at a parameter bound, when it closes, at an equilibrium or at a period halving, or
+    `beyond` points after it was stable.
+    """
 
     family: Family
     low: float
     high: float
+    beyond: int = 0
 
     def __call__(self, points: list[Point]) -> str:
         here = points[-1]
@@ -101,7 +106,10 @@ class _Stop:
             return "closed"
         if self.family.period and (end := end_of_crossings(self.family, here)):
             return end
-        return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
+        if len(points) > 2 and has_halved(self.family, points):
+            return "period_halving"
+        last = points[-self.beyond :] if self.beyond else []
+        return "unstable" if len(last) == self.beyond > 0 and all(map(n_unstable, last)) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
         """Return whether the last step of a branch came back to the branch's start, at any section point of the
@@ -180,7 +188,7 @@ def half_branch(
     """
     problem = problem_of(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
-    found = yield from trace(problem, start, settings, _Stop(family, low, high), watch.between)
+    found = yield from trace(problem, start, settings, _Stop(family, low, high, settings.beyond), watch.between)
     n_last = len(found.points) - 2
     if found.end == "bound":
         yield from _cut(problem, found, low, high, settings)

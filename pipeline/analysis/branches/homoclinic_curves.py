@@ -200,8 +200,8 @@ class _Watch:
 
 
 def _neutral(point: Point) -> Steps[float]:
+    yield from ()  # it asks for nothing
     return saddle_quantity(point.value.monodromy)
-    yield  # a computation that asks for nothing
 
 
 def saddle_quantity(jacobian: np.ndarray) -> float:

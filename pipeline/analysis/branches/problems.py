@@ -127,7 +127,7 @@ class Family:
         """Scales of the unknowns: those of the states, then those of the free parameters."""
         return np.array([*self.system.scales, *self.scales])
 
-    def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
+    def unknowns(self, state: np.ndarray, values: Sequence[float] | np.ndarray) -> np.ndarray:
         """Scale a section point and the values of the free parameters; return them as one vector of unknowns."""
         return np.asarray(np.concatenate([state, values]) / self.unit)
 

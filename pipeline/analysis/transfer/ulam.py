@@ -54,7 +54,7 @@ class Grid:
 
     def centres_of(self, boxes: np.ndarray) -> np.ndarray:
         """Return the centres of boxes, shape (box, state)."""
-        return self.low + (self.places_of(boxes) + 0.5) * (self.high - self.low) / self.bins
+        return np.asarray(self.low + (self.places_of(boxes) + 0.5) * (self.high - self.low) / self.bins)
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,8 @@ def stationary(p: csr_array) -> np.ndarray:
     a = csc_array(eye_array(n) - p.T)
     pi = np.ones(n)
     pi[1:] = _solve(csc_array(a[1:, 1:]), -a[1:, [0]].toarray().ravel())
-    return np.maximum(pi, 0.0) / np.maximum(pi, 0.0).sum()
+    pi = np.maximum(pi, 0.0)
+    return np.asarray(pi / pi.sum())
 
 
 def quasi_stationary(p: csr_array) -> tuple[float, np.ndarray]:

@@ -108,7 +108,8 @@ def told(table):
 @pytest.mark.filterwarnings("ignore:invalid value encountered in det:RuntimeWarning")
 @pytest.mark.parametrize("name", RUNS)
 def test_events__closed_forms(name, tmp_path):
-    table = RUNS[name](tmp_path).table("events")
+    run = RUNS[name](tmp_path)
+    table = run.table("events")
     events, values, errors = told(table)
     assert sorted(events) == sorted(one[:5] for one in KNOWN[name])
     known = {one[:5]: one[5] for one in KNOWN[name]}
@@ -116,6 +117,10 @@ def test_events__closed_forms(name, tmp_path):
     assert (errors < (4e-7 if name == "cubic" else 2e-8)).all()
     # the chaotic set of Lorenz's equations ends in a crisis at 24.06, which doublings cannot tell
     assert (table["what"] == "not_decided").sum() == (name == "lorenz")
+    # unstable parts of branches tell nothing that these events need
+    brief, full = run.branches(stable=True), run.branches()
+    assert told(run.table("events", stable=True))[0] == events
+    assert int(brief["n_points"].sum()) < int(full["n_points"].sum()) + (name in ("delayed", "soft", "lorenz"))
 
 
 @pytest.mark.slow
