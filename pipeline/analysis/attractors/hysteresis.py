@@ -14,8 +14,11 @@ import xarray as xr
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Words, aligned, counted, unit_of, values
-from pipeline.products.product import Options, Table
+from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, unit_of, value_with_error, values, words_of
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import parameter_name
+from pipeline.products.attractors import HysteresisOptions
+from pipeline.products.product import Table
 
 
 def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
@@ -113,7 +116,7 @@ def _loops(
     n = present.shape[-1]
 
     def counts(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.array([(a[i][s:e] & ~b[i][s:e]).sum(axis=0) for i, s, e in rows], np.int64).reshape(-1, n)
+        return np.array([(a[i][s:e] & ~b[i][s:e]).sum(axis=0) for i, s, e in rows], np.int64).reshape(len(rows), n)
 
     units = {"units": ids[order[-1]].attrs.get("units", "1")} if order[-1] in ids.coords else {"units": "1"}
     loops: dict[str, Any] = {
@@ -171,14 +174,55 @@ def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict
     return {name: ("jump", data, {"units": "1", "long_name": text}) for name, (data, text) in texts.items()}
 
 
-def needs_directions(run: OpenRun, options: Options) -> None:
+def needs_directions(run: OpenRun, options: HysteresisOptions) -> None:
     """Raise ValueError unless the run is a continuation both up and down its parameter."""
     check_directions(run.cube())
+    if options.events and len(run.spec.axes) > 1:
+        raise ValueError(f"--events: events lie along one parameter, and the run sweeps {', '.join(run.spec.axes)}.")
 
 
-def hysteresis(run: OpenRun, options: Options) -> xr.Dataset:
-    """Compute the hysteresis loops of a run and the jumps between its attractors."""
-    return find_hysteresis(run.cube(), run.derive("attractors"))
+def hysteresis(run: OpenRun, options: HysteresisOptions) -> xr.Dataset:
+    """Compute the hysteresis loops of a run and the jumps between its attractors, with their events if asked for."""
+    found = find_hysteresis(run.cube(), run.derive("attractors"))
+    if not options.events:
+        return found
+    return with_events(found, run.derive("events", parameter=parameter_name(found.attrs["path"])))
+
+
+def with_events(ds: xr.Dataset, events: xr.Dataset) -> xr.Dataset:
+    """Add to each jump the event at which its attractor ends: where branches fall off.
+
+    Parameters
+    ----------
+    ds
+        Result of `find_hysteresis`.
+    events
+        Result of the analysis ``events`` along its path.
+
+    Returns
+    -------
+    Dataset
+        With ``jump_event`` (number of the event), ``jump_what`` (its name), ``jump_value`` and ``jump_value_error``
+        (its parameter value). If the attractor does not end between the two values of a jump, the number is -1 and the
+        name ``none``: branches leave an attractor that others stay on, or that goes on in another stretch.
+    """
+    rises, ids, ends = (events[name].values for name in ("rises", "attractor", "seen"))
+    jumps = zip(*(ds[f"jump_{name}"].values for name in ("direction", "from_id", "from")), strict=True)
+    numbers = []
+    for direction, i, x in jumps:
+        own = np.flatnonzero((rises == (direction > 0)) & (ids == i) & (ends == x))
+        numbers.append(int(own[0]) if own.size else -1)
+    known = np.array(numbers, np.int64)
+    names = words_of(events["what"])
+    columns = {"what": np.where(known >= 0, events["what"].values[known] + 1, 0) if len(events["what"]) else known + 1}
+    for name in ("value", "value_error"):
+        columns[name] = np.append(events[name].values, np.nan)[known]
+    added: dict[str, Any] = {f"jump_{name}": ("jump", column) for name, column in columns.items()}
+    found = ds.assign({"jump_event": ("jump", known), **added})
+    found["jump_what"].attrs = {"long_name": "event at which the attractor ends", **code_flags(["none", *names])}
+    for name in ("jump_value", "jump_value_error"):
+        found[name].attrs = {"units": events["value"].attrs["units"], "long_name": "parameter value of the event"}
+    return found
 
 
 def hysteresis_table(ds: xr.Dataset) -> Table:
@@ -186,6 +230,7 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
     loops.
     """
     names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
+    names += ("jump_what", "jump_value", "jump_value_error")
     jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
     rows = [
         {"direction": "up" if one["jump_direction"] > 0 else "down"}
@@ -201,6 +246,7 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
             "to": f"{r['to']:g}",
             "ids": f"{r['from_id']} -> {r['to_id']}",
             "branches": str(r["count"]),
+            "event": _event_words(r) if "what" in r else None,
         }
         for r in rows
     ]
@@ -211,6 +257,12 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
         *aligned(words),
     ]
     return Table(rows, lines)
+
+
+def _event_words(row: Row) -> str:
+    if not np.isfinite(row["value"]):
+        return plain(row["what"])
+    return f"{plain(row['what'])} at {value_with_error(row['value'], row['value_error'])}"
 
 
 def _loop_words(loop: xr.Dataset, unit: str) -> Words:

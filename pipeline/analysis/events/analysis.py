@@ -19,6 +19,7 @@ from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.graph import at_ends
 from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -128,6 +129,8 @@ class Scene:
 
 def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     """Name the events at the ends of all attractors of a run along a parameter."""
+    if options.refine:
+        return refined(run, options)
     found, axis = run.derive("attractors"), axis_name(options.parameter)
     located = run.derive("branches", **options.part(BranchOptions))
     part = choose(found, options.at, (axis, *start_dims(found)), f"events lie along {parameter_name(axis)}")

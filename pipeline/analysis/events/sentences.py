@@ -9,7 +9,17 @@ from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCH
 from pipeline.analysis.events.graph import graph_of
 from pipeline.analysis.events.names import CASCADE, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.tabular import MOST_ROWS, Row, Words, aligned, counted, plain, values, with_interval
+from pipeline.analysis.tabular import (
+    MOST_ROWS,
+    Row,
+    Words,
+    aligned,
+    counted,
+    plain,
+    value_with_error,
+    values,
+    with_interval,
+)
 from pipeline.layout.vocabulary import letter, parameter_name
 from pipeline.products.product import Table
 
@@ -40,6 +50,9 @@ def events_table(ds: xr.Dataset) -> Table:
     for end in dict.fromkeys(x for x, _ in bounds):
         ids = ", ".join(letter(i) for x, i in bounds if x == end)
         lines.append(f"the range ends at {parameter_name(str(ds.attrs['parameter']))} = {end:.10g}: {ids}")
+    if ds.attrs.get("refined"):
+        more = f"{counted(int(ds.attrs['n_further']), 'further value')} of {parameter_name(str(ds.attrs['parameter']))}"
+        lines.append(f"rests on {more} in {ds.attrs['refined']}, whose letters these are")
     graph = graph_of(ds, rows)
     nodes = [node for node in graph["nodes"] if "attractor" in node]
     length = max(node["high"] for node in nodes) - min(node["low"] for node in nodes) if nodes else 1.0
@@ -89,7 +102,7 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
     if row["what"] == UNDECIDED:
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
-    at = f"{name} = {_with_error(row['value'], row['value_error'])}{unit}"
+    at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
     if row["period_after"] >= 0:
         changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"
         return f"{changes} at {at} as it {way}: {_reason(row, doublings)}"
@@ -137,9 +150,3 @@ def _going_on(attractor: int, to: dict[int, int]) -> str:
     if len(parts) == 1:
         return f"its cells {parts[0][0]}"
     return "of its cells " + ", ".join(f"{n} {text}" for text, n in parts)
-
-
-def _with_error(value: float, error: float) -> str:
-    """Format a value with its error, to the digit of the error."""
-    digits = int(np.clip(np.ceil(-np.log10(error)), 0, 12))
-    return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.0e}"

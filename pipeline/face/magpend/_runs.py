@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from magpend._methods import AnalysisMethod
-from pipeline.products.attractors import AttractorOptions
+from pipeline.products.attractors import AttractorOptions, HysteresisOptions
 from pipeline.products.backbone import BackboneOptions
 from pipeline.products.basins import BasinOptions
 from pipeline.products.branches import (
@@ -74,7 +74,7 @@ class Run(RunDirectory):
 
     attractors = AnalysisMethod(AttractorOptions)
     basins = AnalysisMethod(BasinOptions)
-    hysteresis = AnalysisMethod(Options)
+    hysteresis = AnalysisMethod(HysteresisOptions)
     settling = AnalysisMethod(Options)
     chaos = AnalysisMethod(ChaosOptions)
     dimension = AnalysisMethod(DimensionOptions)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import magpend
+from magpend._runs import shown
 from pipeline.cli.main import app
+from pipeline.runs import extend as extending
+from pipeline.store.errors import RefusedError
 
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
 
@@ -77,3 +81,135 @@ def test_graph__edges_are_the_rows_of_the_table(cubic, tmp_path):
             assert after["low"] == row["value"]
     ends = [(nodes[e["source"]]["name"], nodes[e["target"]]["name"], e["label"]) for e in graph["edges"]]
     assert set(ends) >= {("A", "B", "BP"), ("A", "C", "BP"), ("B", "A", "BP"), ("B", "B", "PD"), ("C", "C", "PD")}
+
+
+# ---- further values -----------------------------------------------------------------------------
+
+LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.9)
+WIDTH = 0.004
+
+
+def logistic(folder, kind="sweep", **how):
+    """Chaos up to its crisis with the border of the basin at r = 4, beyond which all cells diverge."""
+    spec = magpend.Spec(kind, LOGISTIC, **how).with_axis("r", values=[3.91, 3.95, 4.06])
+    spec = spec.with_start_random(n=12, seed=1, x=(0.1, 0.9)).with_integration(n_transient=3000, n_keep=60)
+    return magpend.run(spec, folder / "run", workers=0)
+
+
+def assert_crisis(run, found):
+    """The chaotic set ends within WIDTH of 4, and cells beyond diverge."""
+    ends = [k for k in range(found.sizes["event"]) if found["rises"][k] and found["beyond"][k] > 4.0]
+    (k,) = [k for k in ends if found["seen"][k] <= 4.0]
+    seen, beyond = float(found["seen"][k]), float(found["beyond"][k])
+    error = float(found["value_error"][k])
+    assert beyond - seen <= WIDTH * (1.0 + 1e-9) or abs(found["value"][k] - 4.0) <= error <= WIDTH
+    assert found["to_attractor"].values[k, 0] == -2
+    beside = magpend.Run.open(f"{run.name}-refined")
+    values = beside.cube()["r"].values
+    assert set(run.cube()["r"].values) < set(values)
+    assert found.attrs["n_further"] == len(values) - 3
+    return beside
+
+
+@pytest.mark.slow
+def test_refine__crisis_of_the_logistic_map(tmp_path):
+    run = logistic(tmp_path)
+    beside = assert_crisis(run, run.events(refine=WIDTH, workers=0))
+    same = beside.cube()["section"].sel(r=run.cube()["r"])
+    assert np.array_equal(same, run.cube()["section"], equal_nan=True)
+    assert "further value" in "\n".join(shown(run.events(refine=WIDTH)).lines)
+    # what is there is enough for a wider interval, and no cell is run
+    n = beside.cube().sizes["r"]
+    run.events(refine=2.0 * WIDTH)
+    assert magpend.Run.open(beside.name).cube().sizes["r"] == n
+
+
+@pytest.mark.slow
+def test_refine__continuation_of_the_logistic_map(tmp_path):
+    run = logistic(tmp_path, "continuation", continuation={"direction": "up"})
+    assert_crisis(run, run.events(refine=WIDTH, workers=0))
+
+
+class Killed(BaseException):
+    """Stands for a kill at some place."""
+
+
+@pytest.mark.slow
+def test_refine__goes_on_after_a_kill(tmp_path, monkeypatch):
+    whole = logistic(tmp_path / "whole")
+    whole.events(refine=WIDTH, workers=0)
+    run = logistic(tmp_path / "killed")
+    original = {name: getattr(extending, name) for name in ("carry_out", "_exchange")}
+    rename, place = Path.rename, tmp_path / "killed" / "run-refined"
+
+    def stop(*words, **options):
+        raise Killed
+
+    def stop_afterwards(*words, **options):
+        original["carry_out"](*words, **options)
+        raise Killed
+
+    def half_exchange(self, target):
+        if self.name.endswith(".extending"):
+            raise Killed
+        return rename(self, target)
+
+    kills = [(extending, "carry_out", stop), (extending, "carry_out", stop_afterwards)]
+    kills += [(extending, "carry_out", stop), (extending, "carry_out", stop_afterwards), (extending, "_exchange", stop)]
+    kills += [(Path, "rename", half_exchange)]
+    for n, (owner, name, replacement) in enumerate(kills):
+        monkeypatch.setattr(owner, name, replacement)
+        with pytest.raises(Killed):
+            run.events(refine=WIDTH, workers=0)
+        monkeypatch.undo()
+        assert place.exists() == (1 <= n < 5)
+        if n == 1:  # one round by itself
+            assert len(magpend.Run.open(place).cube()["r"]) == 6
+    run.events(refine=WIDTH, workers=0)
+    assert magpend.Run.open(place).digest == magpend.Run.open(f"{whole.name}-refined").digest
+    assert not place.with_name("run-refined.extending").exists()
+    assert run.table("events", refine=WIDTH).equals(whole.table("events", refine=WIDTH))
+
+
+@pytest.mark.slow
+def test_refine__refuses_what_it_cannot_refine(tmp_path, cubic):
+    spec = cubic.spec.with_axis("mu", values=[0.5, 1.5])
+    magpend.run(spec, f"{cubic.name}-refined", workers=0)
+    with pytest.raises(RefusedError, match=r"is not .* with further values of mu"):
+        cubic.events(refine=0.1)
+
+
+# ---- hysteresis ---------------------------------------------------------------------------------
+
+FOLDED = magpend.model("x' = x + 0.5*(mu + x - x**3)", name="folded", kind="map", mu=0.0)
+BOTH = {"direction": "both"}
+
+
+@pytest.mark.slow
+def test_hysteresis__names_the_folds(tmp_path):
+    """Fixed points with mu = x**3 - x turn at x = +-1/sqrt(3)."""
+    spec = magpend.Spec("continuation", FOLDED, continuation=BOTH).with_axis("mu", -0.6, 0.6, 13)
+    spec = spec.with_start_list([[-1.0], [1.0]]).with_integration(n_transient=500, n_keep=4)
+    run = magpend.run(spec, tmp_path / "run", workers=0)
+    jumps = run.table("hysteresis", events=True)
+    fold = 2.0 / (3.0 * np.sqrt(3.0))
+    assert jumps["what"].tolist() == ["fold", "fold"]
+    assert jumps["direction"].tolist() == ["up", "down"]
+    known = np.array([fold, -fold])
+    assert (np.abs(jumps["value"] - known) <= jumps["value_error"]).all()
+    assert (jumps["value_error"] < 1e-8).all()
+    assert np.allclose(jumps["from"], [0.3, -0.3])
+    assert "fold at 0.3849001795" in "\n".join(shown(run.hysteresis(events=True)).lines)
+    assert "what" not in run.table("hysteresis")
+
+
+@pytest.mark.slow
+def test_hysteresis__without_attractors(tmp_path):
+    """All starts of a map that has no bounded orbit diverge, so that there is neither a loop nor a jump."""
+    away = magpend.model("x' = x + mu", name="away", kind="map", mu=1.0)
+    spec = magpend.Spec("continuation", away, continuation=BOTH).with_axis("mu", values=[1e6, 2e6, 3e6])
+    spec = spec.with_start_list([[0.0], [1.0]]).with_integration(n_transient=2000, n_keep=4)
+    run = magpend.run(spec, tmp_path / "run", workers=0)
+    assert run.attractors().sizes["set"] == 0
+    found = run.hysteresis(events=True)
+    assert (found.sizes["loop"], found.sizes["jump"]) == (0, 0)
