@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -352,7 +353,7 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
-        yield grid_of(rows, SHOWN[name][1], command)
+        yield replace(grid_of(rows, SHOWN[name][1], command), stacked=name == "events")
     else:
         yield Note("Nothing of this kind was found.", command)
     drawn = ANALYSES[name].figure

@@ -85,7 +85,7 @@ def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     along = ids[path].values if path in ids.coords else np.arange(ids.sizes[path])
     return (
         result.assign(_loops(present, differs, along, order, ids))
-        .assign(_jumps(values, direction, along))
+        .assign(_jumps(values, direction, along, str(ids[path].attrs.get("units", "1")) if path in ids.coords else "1"))
         .transpose(*dims, ...)
         .assign_attrs(path=path)
     )
@@ -148,7 +148,7 @@ def _loops(
     return loops
 
 
-def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict[str, Any]:
+def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray, unit: str) -> dict[str, Any]:
     found: dict[tuple[int, int, int, int, int], int] = {}
     for index in np.ndindex(*values.shape[:-2]):
         for branch, word in enumerate(direction):
@@ -171,7 +171,10 @@ def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict
         "jump_to_id": (rows[:, 4].astype(np.int32), "attractor after"),
         "jump_count": (counts, "branches"),
     }
-    return {name: ("jump", data, {"units": "1", "long_name": text}) for name, (data, text) in texts.items()}
+    units = {"jump_from": unit, "jump_to": unit}
+    return {
+        name: ("jump", data, {"units": units.get(name, "1"), "long_name": text}) for name, (data, text) in texts.items()
+    }
 
 
 def needs_directions(run: OpenRun, options: HysteresisOptions) -> None:

@@ -11,6 +11,7 @@ import pytest
 import magpend
 from magpend._runs import shown
 from pipeline.cli.main import app
+from pipeline.report.report import part_of
 from pipeline.runs import extend as extending
 from pipeline.store.errors import RefusedError
 
@@ -79,7 +80,8 @@ def test_graph__edges_are_the_rows_of_the_table(cubic, tmp_path):
             after = nodes[edges[0]["target"]]
             assert (after["attractor"], after["period"]) == (row["attractor"], row["period_after"])
             assert after["low"] == row["value"]
-    ends = [(nodes[e["source"]]["name"], nodes[e["target"]]["name"], e["label"]) for e in graph["edges"]]
+    name = {node["id"]: node["name"] for node in graph["nodes"]}
+    ends = [(name[e["source"]], name[e["target"]], e["label"]) for e in graph["edges"]]
     assert set(ends) >= {("A", "B", "BP"), ("A", "C", "BP"), ("B", "A", "BP"), ("B", "B", "PD"), ("C", "C", "PD")}
 
 
@@ -126,7 +128,7 @@ def test_refine__crisis_of_the_logistic_map(tmp_path):
 
 @pytest.mark.slow
 def test_refine__continuation_of_the_logistic_map(tmp_path):
-    run = logistic(tmp_path, "continuation", continuation={"direction": "up"})
+    run = logistic(tmp_path, "continuation", continuation={"direction": "up", "path": "r"})
     assert_crisis(run, run.events(refine=WIDTH, workers=0))
 
 
@@ -182,7 +184,7 @@ def test_refine__refuses_what_it_cannot_refine(tmp_path, cubic):
 # ---- hysteresis ---------------------------------------------------------------------------------
 
 FOLDED = magpend.model("x' = x + 0.5*(mu + x - x**3)", name="folded", kind="map", mu=0.0)
-BOTH = {"direction": "both"}
+BOTH = {"direction": "both", "path": "mu"}
 
 
 @pytest.mark.slow
@@ -213,3 +215,16 @@ def test_hysteresis__without_attractors(tmp_path):
     assert run.attractors().sizes["set"] == 0
     found = run.hysteresis(events=True)
     assert (found.sizes["loop"], found.sizes["jump"]) == (0, 0)
+
+
+# ---- report -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_report__has_a_sentence_for_each_event(cubic):
+    sentences = [row["sentence"] for _, row in cubic.table("events").iterrows() if row["what"] != "range_end"]
+    parts = part_of(cubic.name, lambda line: None, ("attractors",)).parts
+    (part,) = (one for one in parts if one.title == "Events")
+    grid, picture = part.blocks
+    assert [line[0] for line in grid.rows] == sentences
+    assert "plot genealogy" in picture.command

@@ -80,5 +80,4 @@ def test_events__are_clicked_on_the_axis(visit: Callable[..., Any], line: Path) 
         # a cell that was shown before is shown again
         page.get_by_role("button", name="After", exact=True).click()
         page.locator(f".panels[data-shown^='{fold['after']}-']").wait_for()
-        page.screenshot(path="/tmp/w/graph_explorer.png")
         assert (opened.complaints, opened.outside) == ([], [])
