@@ -338,14 +338,8 @@ def refine(
         If ``NAME-refined`` exists and is another run.
     """
     run = RunDirectory.open(source)
-    if len(run.spec.axes) != 1:
-        raise SpecError(
-            f"{run.name}: sweeps {', '.join(run.spec.axes) or 'nothing'}, and further values are those of one swept "
-            "parameter; make a run that sweeps one: magpend zoom."
-        )
+    place = _place_of_further(run)
     ((key, axis),) = run.spec.axes.items()
-    folder = _folder(run.info.files).resolve()
-    place = folder.with_name(f"{folder.name}-refined")
     _finish_exchange(place, echo)
     own, how = axis.given(), {"workers": workers, "where": where, "echo": echo}
     more = RATES[run.spec.rate].given(np.array(values)) if key == FREQUENCY else np.array(values)
@@ -365,6 +359,19 @@ def refine(
     _exchange(place, _beside(place), lambda line: None)
     shutil.rmtree(aside)
     return RunDirectory.open(place)
+
+
+def _place_of_further(run: RunDirectory) -> Path:
+    """Return the folder of a run's further values; raise SpecError or RefusedError if it can have none."""
+    if len(run.spec.axes) != 1:
+        raise SpecError(
+            f"{run.name}: sweeps {', '.join(run.spec.axes) or 'nothing'}, and further values are those of one swept "
+            "parameter; make a run that sweeps one: magpend zoom."
+        )
+    if run.info.files.local is None:
+        raise RefusedError(f"{run.name}: further values are run in a folder beside it; copy the run to this machine.")
+    folder = run.info.files.local.resolve()
+    return folder.with_name(f"{folder.name}-refined")
 
 
 def _but_axes(spec: Spec) -> Mapping[str, Any]:

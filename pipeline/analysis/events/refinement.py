@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
+
 import numpy as np
 import xarray as xr
 
@@ -44,7 +46,7 @@ def refined(run: OpenRun, options: EventOptions) -> xr.Dataset:
         beside = finer
     axis = axis_name(options.parameter)
     n_more = beside.cube().sizes[axis] - run.cube().sizes[axis]
-    return found.assign_attrs(refined=beside.info.name if n_more else "", n_further=n_more)
+    return found.assign_attrs(refined=PurePath(beside.info.name).name if n_more else "", n_further=n_more)
 
 
 def _unit_of(run: OpenRun, options: EventOptions) -> str:
