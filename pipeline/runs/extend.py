@@ -341,7 +341,8 @@ def refine(
     place = _place_of_further(run)
     ((key, axis),) = run.spec.axes.items()
     _finish_exchange(place, echo)
-    own, how = axis.given(), {"workers": workers, "where": where, "echo": echo}
+    own = axis.given()
+    how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
     more = RATES[run.spec.rate].given(np.array(values)) if key == FREQUENCY else np.array(values)
     if not is_run(open_files(place)):
         return _refined(run, np.union1d(own, more), place, (), **how) if len(more) else run

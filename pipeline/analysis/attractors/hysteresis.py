@@ -232,8 +232,7 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
     """Return the table of hysteresis. It has one row per kind of jump between two attractors, and text lines about the
     loops.
     """
-    names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
-    names += ("jump_what", "jump_value", "jump_value_error")
+    names = [f"jump_{name}" for name in ("from", "to", "from_id", "to_id", "count", "what", "value", "value_error")]
     jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
     rows = [
         {"direction": "up" if one["jump_direction"] > 0 else "down"}
