@@ -5,9 +5,11 @@ The attribute ``py_func`` of a compiled function is plain Python, but still call
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
+
+from numba import config
 
 
 class _PlainModule:
@@ -20,27 +22,37 @@ class _PlainModule:
         return _replaced(getattr(self._module, name), self._known)
 
 
-def plain(function: Callable[..., Any]) -> Callable[..., Any]:
+def plain(
+    function: Callable[..., Any], substitutes: Mapping[Callable[..., Any], Callable[..., Any]] | None = None
+) -> Callable[..., Any]:
     """Return the plain Python version of a compiled function, calling plain Python versions of its callees.
 
     Parameters
     ----------
     function
         Dispatcher of numba, recognised by its attribute ``py_func``; any other object is returned unchanged.
+    substitutes
+        Functions to call in place of some callees.
     """
-    found: Callable[..., Any] = _replaced(function, {})
+    known = {id(own): other for own, other in (substitutes or {}).items()}
+    found: Callable[..., Any] = _replaced(function, known)
     return found
 
 
 def _replaced(value: Any, known: dict[int, Any]) -> Any:
     if id(value) in known:
         return known[id(value)]
-    source = getattr(value, "py_func", None)
+    source = getattr(value, "py_func", value if _is_left_plain(value) else None)
     if isinstance(source, FunctionType):
         return _rebuilt(value, source, known)
     if isinstance(value, ModuleType):
         return _PlainModule(value, known)
     return value
+
+
+def _is_left_plain(value: Any) -> bool:
+    """Return whether a function of the engine or of a model was not compiled, as with ``NUMBA_DISABLE_JIT``."""
+    return bool(config.DISABLE_JIT) and str(getattr(value, "__module__", "")).startswith("magpend_core.")
 
 
 def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> FunctionType:

@@ -104,11 +104,11 @@ class Steady:
         """Return the sentences that refuse an analysis that is for another kind of motion; empty if it suits."""
         if self.model.is_map and analysis.name in NOT_OF_MAPS:
             return f"{analysis.name} follows the motion over a period; {self.model.name} is a map, of iterates alone."
-        if analysis.motion == self.kind:
+        if self.kind in analysis.motions:
             return ""
         if not self.obstacle:
-            return f"{analysis.name} needs a run {NEEDS[analysis.motion]}."
-        own = [f"analyse {name}" for name, other in ANALYSES.items() if other.motion == self.kind]
+            return f"{analysis.name} needs a run {NEEDS[analysis.motions[0]]}."
+        own = [f"analyse {name}" for name, other in ANALYSES.items() if self.kind in other.motions]
         commands = ", ".join([*own, f"plot {self.overview(is_swept=True)}", "plot section"])
         return f"{self.refusal(analysis.name)} Of this run: magpend {commands}."
 

@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.analysis import isolas_of, limits_of
-from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import axis_name
@@ -380,8 +380,10 @@ def draw_branches(run: OpenRun, options: BranchFigureOptions) -> style.DataFigur
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)), (0, (8, 1.5, 1, 1.5, 1, 1.5)))
 """Line styles that can be told apart."""
 
-_ON_MAP = dict(zip(KINDS[:3], DASHES[:3], strict=True))
-_STYLE_NAMES = dict(zip(KINDS[:3], ("solid:", "dashed:", "dotted:"), strict=True))
+_ON_MAP = dict(zip((*KINDS[:3], HOPF, *BRANCH_POINTS), (*DASHES[:4], *[DASHES[4]] * 3), strict=True))
+_ON_MAP[HOMOCLINIC] = (0, (2.5, 1))
+_STYLE_NAMES = dict(zip(DASHES, ("solid:", "dashed:", "dotted:", "dash-dotted:", "dash-dot-dotted:"), strict=True))
+_STYLE_NAMES[_ON_MAP[HOMOCLINIC]] = "short-dashed:"
 
 ROOM = (0.045, 0.045)
 """Room that a short name takes, in units of the axes."""
@@ -407,7 +409,7 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
     for ax in axes:
         low, high = ax.get_xlim(), ax.get_ylim()
         for i in range(ds.sizes["curve"]):
-            n, kind = int(ds["n_points"][i]), KINDS[int(ds["kind"][i])]
+            n, kind = int(ds["n_points"][i]), CURVE_KINDS[int(ds["kind"][i])]
             ax.plot(
                 ds[along].values[i, :n],
                 ds[across].values[i, :n],
@@ -425,8 +427,10 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
 
 def line_note(ds: xr.Dataset) -> str:
     """Return a text on which line style stands for which kind of bifurcation."""
-    present = {KINDS[int(kind)] for kind in ds["kind"].values}
-    return ", ".join(f"{_STYLE_NAMES[kind]} {LABELS[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
+    present = {CURVE_KINDS[int(kind)] for kind in ds["kind"].values}
+    return ", ".join(
+        f"{_STYLE_NAMES[_ON_MAP[kind]]} {LABELS[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present
+    )
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:

@@ -15,7 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, t
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
-from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
 from pipeline.analysis.run import OpenRun
@@ -350,7 +350,12 @@ def _swept_of(run: OpenRun, x: str, y: str) -> str:
     return swept[0] if len(swept) == 1 else x
 
 
-_CURVE_COLOURS = dict(zip(KINDS[:4], (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE), strict=True))
+_CURVE_COLOURS = {
+    **dict(zip(KINDS[:3], (style.BLUE, style.VERMILLION, style.GREEN), strict=True)),
+    HOPF: style.ORANGE,
+    HOMOCLINIC: "black",
+    **dict.fromkeys(BRANCH_POINTS, style.PURPLE),
+}
 
 
 @style.drawn
@@ -377,14 +382,14 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     periods = sorted({int(p) for p in ds["orbit_period"].values})
     seen: dict[tuple[int, str], Line2D] = {}
     for i in range(ds.sizes["curve"]):
-        n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), KINDS[int(ds["kind"][i])]
+        n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), CURVE_KINDS[int(ds["kind"][i])]
         (line,) = ax.plot(
             ds["first"].values[i, :n],
             ds["second"].values[i, :n],
             color=_CURVE_COLOURS[kind],
             linestyle=DASHES[periods.index(period) % len(DASHES)],
             linewidth=1.2,
-            label=f"{LABELS[kind]} {NAMES[kind]}, period {period}",
+            label=f"{LABELS[kind]} {NAMES[kind]}{_of_period(kind, period)}",
         )
         seen.setdefault((period, kind), line)
     style.label_axes(
@@ -398,6 +403,12 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     style.legend_above(fig, [seen[key] for key in sorted(seen)], size=fig.look.tick)
     style.finish(fig)
     return fig
+
+
+def _of_period(kind: str, period: int) -> str:
+    if kind == HOMOCLINIC:
+        return ""
+    return f", period {period}" if period else ", equilibrium"
 
 
 def draw_curves(run: OpenRun, options: CurveFigureOptions) -> style.DataFigure:

@@ -117,15 +117,17 @@ BRANCHES = Analysis(
 
 CURVES = Analysis(
     "curves",
-    """Continue folds, period doublings and Neimark-Sacker points in the plane of two parameters.
+    """Continue folds, doublings, Neimark-Sacker, Hopf and branch points in the plane of two parameters.
 
-    Starts from the bifurcations that `branches` locates.""",
+    Starts from the bifurcations that `branches` locates, and from the homoclinic orbits and saddle nodes at which
+    branches end.""",
     CurveOptions,
     compute=f"{_ROOM}:curves",
     table="pipeline.analysis.branches.analysis:curves_table",
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
+    version=2,
 )
 
 BANDS = Analysis(

@@ -14,6 +14,7 @@ from pipeline.products.product import Figure, FigureOptions, Options, StateOptio
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
 from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
+from pipeline.products.transfer import TransferOptions
 
 Per = Literal["s", "period"]
 
@@ -183,6 +184,10 @@ class EscapeFigureOptions(EscapeOptions, FigureOptions):
 
 class DensityFigureOptions(DensityOptions, FigureOptions):
     """Options of a figure of the density of section points."""
+
+
+class TransferFigureOptions(TransferOptions, FigureOptions):
+    """Options of a figure of the transfer operator's sets."""
 
 
 BIFURCATION = Figure(
@@ -401,6 +406,15 @@ DENSITY = Figure(
     DensityFigureOptions,
     "pipeline.plots.noise:draw_density",
     panels="either",
+)
+
+TRANSFER = Figure(
+    "transfer",
+    "Draw the slow sets of the section map: stationary density within each, cores, and committors.",
+    TransferFigureOptions,
+    "pipeline.plots.transfer:draw",
+    needs="pipeline.analysis.transfer.analysis:needs_pairs",
+    panels="several",
 )
 
 

@@ -44,7 +44,7 @@ ESCAPES = Analysis(
     table=f"{_ROOM}.escapes:escapes_table",
     needs=f"{_ROOM}.escapes:needs_set",
     figure="escapes",
-    motion="noisy",
+    motions=("noisy",),
     by_point=True,
     finish=f"{_ROOM}.escapes:finish_escapes",
 )
@@ -58,5 +58,5 @@ DENSITY = Analysis(
     compute=f"{_ROOM}.density:density",
     table=f"{_ROOM}.density:density_table",
     figure="density",
-    motion="noisy",
+    motions=("noisy",),
 )

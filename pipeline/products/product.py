@@ -256,8 +256,8 @@ class Analysis:
         Name of the figure that shows the result best, or empty.
     ignores : tuple of str
         Options that do not change the result.
-    motion : str
-        Kind of motion that its runs have: ``"steady"``, ``"drifting"`` or ``"noisy"``; see `pipeline.motion`.
+    motions : tuple of str
+        Kinds of motion that its runs may have: ``"steady"``, ``"drifting"``, ``"noisy"``; see `pipeline.motion`.
     by_point : bool
         Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
         results `pipeline.analysis.ragged.joined` joins.
@@ -278,7 +278,7 @@ class Analysis:
     builds_on: tuple[str, ...] = ()
     figure: str = ""
     ignores: tuple[str, ...] = ()
-    motion: Literal["steady", "drifting", "noisy"] = "steady"
+    motions: tuple[Literal["steady", "drifting", "noisy"], ...] = ("steady",)
     by_point: bool = False
     finish: str = ""
     version: int = 1

@@ -62,6 +62,7 @@ ANALYSES: Registry[Analysis] = Registry(
             "basins": ("basins", "a sweep; all numbers but fractions need starts on a grid"),
             "resilience": ("resilience", "a sweep"),
             "edge": ("resilience", "a sweep, and " + _POINT),
+            "transfer": ("transfer", "a sweep"),
             "overlaps": ("tipping", "a sweep along the parameter that changes"),
         },
         "Chaos and spectra": {"chaos": ("chaos", ""), "dimension": ("chaos", ""), "spectrum": ("spectrum", "")},
@@ -100,6 +101,7 @@ _FIGURES = {
         "fractions": _ONE,
         "resilience": "a sweep, and at most " + _ONE,
         "edge": "a sweep, and " + _POINT,
+        "transfer": "a sweep, and " + _POINT,
     },
     "Chaos and spectra": {
         "lyapunov": f"{_EXPONENTS}, and {_ONE}; two with --map",

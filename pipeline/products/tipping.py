@@ -49,7 +49,7 @@ TIPPING = Analysis(
     table=f"{_ROOM}.analysis:tipping_table",
     needs=f"{_ROOM}.analysis:needs_drift",
     figure="drift",
-    motion="drifting",
+    motions=("drifting",),
 )
 
 OVERLAPS = Analysis(
@@ -76,5 +76,5 @@ DELAY = Analysis(
     table=f"{_ROOM}.delay:delay_table",
     needs=f"{_ROOM}.delay:needs_sections",
     figure="drift",
-    motion="drifting",
+    motions=("drifting",),
 )

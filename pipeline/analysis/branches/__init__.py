@@ -9,8 +9,10 @@ crossings (`magpend_core.orbits` has its derivative); its branch is followed by 
 it is stable or not. `problems` has the equations of orbits and equilibria, `lockstep` evaluates many of them in one
 call of the engine, `arclength` traces, `bifurcations` notices and locates, `following` makes one branch, `limits`
 names ends at which the period grows without bound, `exploring` all that hang together, `searching` finds orbits of
-detached ones, `curves` continues located points in two parameters. `connecting` says which orbits of a grid of
-parameter points lie on one branch or sheet, which `sheets` keeps. Any `magpend_core.engine.system.System` will do;
+detached ones, `curves` continues located points in two parameters (`equilibrium_curves`: those of equilibria, with
+normal forms by `center_manifold`; `homoclinic_curves`: homoclinic orbits, with the equations of `homoclinic`).
+`connecting` says which orbits of a grid of parameter points lie on one branch or sheet, which `sheets` keeps. Any
+`magpend_core.engine.system.System` will do;
 names, units and the class of a motion are the model's.
 
 Located bifurcations

@@ -11,7 +11,17 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.completeness import counted_lines, searched_lines
-from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LABELS, LIMITS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import (
+    BRANCH_POINTS,
+    BRANCHING,
+    COEFFICIENTS,
+    FOLD,
+    HOMOCLINIC,
+    KINDS,
+    LABELS,
+    LIMITS,
+    PITCHFORK,
+)
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
@@ -417,7 +427,7 @@ def cut_of(ds: xr.Dataset) -> list[int]:
 
 def _unconnected(ds: xr.Dataset) -> list[int]:
     """Return the branches that spring from no other one and are connected to none by a branch point."""
-    crossing = np.isin(ds["kind"].values, [KINDS.index(kind) for kind in (BRANCHING, PITCHFORK, TRANSCRITICAL)])
+    crossing = np.isin(ds["kind"].values, [KINDS.index(kind) for kind in BRANCH_POINTS])
     connected = {*ds["of_branch"].values[crossing].tolist(), *ds["to_branch"].values[crossing].tolist()}
     return [i for i in range(ds.sizes["branch"]) if int(ds["origin"][i]) < 0 and i not in connected]
 
@@ -526,7 +536,8 @@ def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
 def curves_table(ds: xr.Dataset) -> Table:
     """Return the table of the points of codimension two, with text lines that describe the bifurcation curves.
 
-    ``error`` is the larger of the errors of both parameters, in units of the ranges that the curves cover.
+    ``error`` is the larger of the errors of both parameters, in units of the ranges that the curves cover. Points of
+    equilibria have the coefficients of their normal forms (see `pipeline.analysis.branches.center_manifold`).
     """
     names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
     rows = [_special(ds, names, k) for k in range(ds.sizes["special"])]
@@ -554,12 +565,21 @@ def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
         "period": int(one["special_period"]),
         "error": max((e / r for e, r in zip(errors, ranges, strict=True) if r > 0.0), default=np.nan),
         "curve": int(one["special_curve"]),
+        **{name: float(one[f"special_{name}"]) for name in COEFFICIENTS if f"special_{name}" in one},
     }
 
 
 def _special_words(row: Row) -> Words:
+    own = {name: row[name] for name in COEFFICIENTS if name in row and row[name] == row[name]}
     words = {name: f"{value:.7f}" if isinstance(value, float) else str(value) for name, value in row.items()}
-    return words | {"error": f"{row['error']:.1g}"}
+    words = {name: word for name, word in words.items() if name not in COEFFICIENTS}
+    told = ", ".join(f"{name} = {value:.5g}" for name, value in own.items())
+    coefficients = {"normal form": told} if any(name in row for name in COEFFICIENTS) else {}
+    return words | {"period": _cycles(row["period"]), "error": f"{row['error']:.1g}"} | coefficients
+
+
+def _cycles(period: int) -> str:
+    return str(period) if period else "equilibrium"
 
 
 def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
@@ -567,5 +587,9 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     lines = [one[role].values[:n] for role in ("first", "second")]
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
     ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
-    what = f"{LABELS[told['kind']]} {told['kind']}, period {told['orbit_period']}"
+    period = int(told["orbit_period"])
+    what = f"{LABELS[told['kind']]} {told['kind']}, {f'period {period}' if period else 'equilibrium'}"
+    if told["kind"] == HOMOCLINIC:
+        quantity = one["saddle_quantity"].values[:n]
+        what = f"{LABELS[HOMOCLINIC]} homoclinic, saddle quantity {quantity.min():.4g} to {quantity.max():.4g} 1/s"
     return f"  {number}: {what}: {spans}" + (f"; ends: {ends}" if ends else "")

@@ -27,7 +27,8 @@ its direction instead: ``turn`` in `_torus_tests`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -43,7 +44,18 @@ CUSP, GENERALISED, CHENCINER = "cusp", "generalised_doubling", "chenciner"
 R1, R2, R3, R4 = "r1", "r2", "r3", "r4"
 FOLD_FLIP, FOLD_TORUS = "fold_flip", "fold_neimark_sacker"
 DOUBLING_TORUS, DOUBLE_TORUS = "doubling_neimark_sacker", "double_neimark_sacker"
-POINT_KINDS = (CUSP, GENERALISED, CHENCINER, R1, R2, R3, R4, FOLD_FLIP, FOLD_TORUS, DOUBLING_TORUS, DOUBLE_TORUS)
+OF_EQUILIBRIA = BT, GENERALISED_HOPF, ZERO_HOPF, DOUBLE_HOPF = (
+    *("bogdanov_takens", "generalised_hopf", "zero_hopf", "double_hopf"),
+)
+"""Points of codimension two on curves of equilibria, beside the cusp (see `equilibrium_curves`)."""
+
+OF_LOOPS = NEUTRAL, NONCENTRAL = "neutral_saddle", "saddle_node_homoclinic"
+"""Points of codimension two on curves of homoclinic orbits, beside Bogdanov-Takens (see `homoclinic_curves`)."""
+
+POINT_KINDS = (
+    *(CUSP, GENERALISED, CHENCINER, R1, R2, R3, R4, FOLD_FLIP, FOLD_TORUS, DOUBLING_TORUS, DOUBLE_TORUS),
+    *(*OF_EQUILIBRIA, *OF_LOOPS),
+)
 
 TURN = "turn"
 """Test function of a pair that passes 1 or -1 and stays on the circle; the point is an R1 or R2."""
@@ -68,6 +80,7 @@ class SpecialPoint:
     # (2,): distance of the values of both parameters between which the test function changes its sign
     bracket: np.ndarray
     curve: int = -1  # number of the curve on which it was located
+    coefficients: Mapping[str, float] = field(default_factory=dict)  # of the normal form, at equilibria
 
     @property
     def values(self) -> np.ndarray:
@@ -132,17 +145,9 @@ class Detector:
         """Locate and store the point of codimension two where a test function vanishes between two points of a curve;
         count failures.
         """
-
-        def test(point: Point) -> Steps[float]:
-            if kind == OF_COEFFICIENT[self.problem.kind]:
-                _, values = yield from self._tests(point, frame)
-                return values[kind]
-            case = Case(self.problem.family, self.problem.kind, point.u, point.value.monodromy)
-            return _matrix_tests(self.problem.kind, case.matrix, _Frame.of(case, frame))[kind]
-
         ends = None
         for settings in self.settings:
-            ends = yield from find_root(self.problem, a, b, test, settings)
+            ends = yield from find_root(self.problem, a, b, partial(self._test, kind, frame), settings)
             if ends is not None:
                 break
         if ends is None:
@@ -152,15 +157,25 @@ class Detector:
         if not min(abs(at_low), abs(at_high)) <= VANISHES * max(abs(a[1]), abs(b[1])):
             return
         nearest = low if abs(at_low) <= abs(at_high) else high
-        if kind == TURN:
-            cosine = _cosine(np.linalg.eigvals(nearest.value.monodromy))
-            if abs(cosine) < 1.0 - ON_AXIS:
-                return
-            kind = R1 if cosine > 0.0 else R2
         bracket = np.abs(self.problem.family.values(high.u) - self.problem.family.values(low.u))
-        one = SpecialPoint(kind, self.problem.family, nearest, bracket)
-        if not any(_is_same(one, other) for other in self.found):
+        one = self._named(SpecialPoint(kind, self.problem.family, nearest, bracket))
+        if one is not None and not any(_is_same(one, other) for other in self.found):
             self.found.append(one)
+
+    def _test(self, kind: str, frame: _Frame, point: Point) -> Steps[float]:
+        """Compute one test function at a point near that of a frame."""
+        if kind == OF_COEFFICIENT[self.problem.kind]:
+            _, values = yield from self._tests(point, frame)
+            return values[kind]
+        case = Case(self.problem.family, self.problem.kind, point.u, point.value.monodromy)
+        return _matrix_tests(self.problem.kind, case.matrix, _Frame.of(case, frame))[kind]
+
+    def _named(self, one: SpecialPoint) -> SpecialPoint | None:
+        """Return a located zero of a test function with its final kind; None if it is no point of codimension two."""
+        if one.kind != TURN:
+            return one
+        cosine = _cosine(np.linalg.eigvals(one.point.value.monodromy))
+        return replace(one, kind=R1 if cosine > 0.0 else R2) if abs(cosine) >= 1.0 - ON_AXIS else None
 
 
 def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:
@@ -261,7 +276,7 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
         for one in ones:
             is_resonance = one.kind == CHENCINER and any(_is_same_orbit(one, other) for other in strong)
             if not is_resonance and not any(one.kind == other.kind and _is_same_orbit(one, other) for other in found):
-                found.append(SpecialPoint(one.kind, one.family, one.point, one.bracket, number))
+                found.append(replace(one, curve=number))
     return found
 
 

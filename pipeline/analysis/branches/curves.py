@@ -13,19 +13,52 @@ from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import multipliers_of
 from pipeline.analysis.branches.codimension_two import (
+    BT,
+    DOUBLE_HOPF,
     DOUBLING_TORUS,
     FOLD_FLIP,
     FOLD_TORUS,
     GENERALISED,
+    GENERALISED_HOPF,
+    NONCENTRAL,
     POINT_KINDS,
     R1,
     R2,
+    ZERO_HOPF,
     Detector,
     SpecialPoint,
     merged,
 )
-from pipeline.analysis.branches.following import has_halved, opposite
-from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
+from pipeline.analysis.branches.equilibrium_curves import (
+    EQUILIBRIUM_KINDS,
+    PERSISTS,
+    EquilibriumCurve,
+    EquilibriumDetector,
+    frequencies_at,
+    kind_of_zero,
+)
+from pipeline.analysis.branches.exploring import cycle_direction, cycle_family
+from pipeline.analysis.branches.following import end_of_crossings, has_halved, opposite
+from pipeline.analysis.branches.homoclinic_curves import (
+    HETEROCLINIC,
+    Bounds,
+    homoclinic_curves,
+    loop_near,
+    loops_of,
+    saddle_nodes_of,
+    saddle_quantity,
+)
+from pipeline.analysis.branches.kinds import (
+    BRANCH_POINTS,
+    COEFFICIENTS,
+    CURVE_KINDS,
+    DOUBLING,
+    FOLD,
+    HOMOCLINIC,
+    HOPF,
+    KINDS,
+    TORUS,
+)
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import (
@@ -43,10 +76,16 @@ CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1
 """Settings with longer steps than on a branch, since nothing is located in between. The residual includes the
 test function, and is limited by finite differences of monodromy matrices."""
 
+REST_CURVE = replace(CURVE, longest_step=0.05, max_points=2000, tolerance=1e-11)
+"""Settings of curves of equilibria, which need no integration, and whose states may move far."""
+
 LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 """Settings for locating points of codimension two, in both parameters to 1e-8."""
 
-CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck", "period_halving")
+CURVE_ENDS = (
+    *("bound", "closed", "resonance", "max_points", "stuck", "period_halving"),
+    *(BT, "equilibrium", "tangent", NONCENTRAL, HETEROCLINIC),
+)
 
 GENERATIONS = 3
 """Number of generations of curves that spring from points of codimension two."""
@@ -58,8 +97,22 @@ SPRINGING = {
     FOLD_FLIP: ((FOLD, 1), (DOUBLING, 1)),
     FOLD_TORUS: ((FOLD, 1), (TORUS, 1)),
     DOUBLING_TORUS: ((DOUBLING, 1), (TORUS, 1)),
+    BT: ((FOLD, 0), (HOPF, 0)),
+    GENERALISED_HOPF: ((FOLD, 1),),
+    ZERO_HOPF: ((FOLD, 0), (HOPF, 0), (TORUS, 1)),
+    DOUBLE_HOPF: ((HOPF, 0), (TORUS, 1)),
 }
-"""Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit."""
+"""Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit; at
+equilibria 0 for equilibria, 1 for cycles."""
+
+NO_FREQUENCY = 1e-6
+"""Square of the dimensionless frequency of a Hopf point below which it is a Bogdanov-Takens point."""
+
+SAME_PERIOD = 0.1
+"""Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
+
+BESIDE = (0.02, 0.005)
+"""Scaled distances from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins."""
 
 AMPLITUDES = (0.02, 0.05, 0.1)
 """Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
@@ -73,7 +126,9 @@ class Curve:
     kind: str  # kind of bifurcation
     points: list[Point]  # orbits in order
     ends: tuple[str, str]  # reasons for both ends, of `CURVE_ENDS`
-    start: int  # number of the located bifurcation it started from; -1 if it springs from a point of codimension two
+    # number of the located bifurcation it started from; -1 if it springs from a point of codimension two, or from an
+    # end of a branch (homoclinic orbits, saddle nodes on a circle)
+    start: int
     special: list[SpecialPoint] = field(default_factory=list)  # points of codimension two on it
     n_missed: int = 0  # sign changes of their test functions that could not be located
 
@@ -111,18 +166,24 @@ def curves_from(
     Returns
     -------
     list of Curve
-        Curves in the order of the located points they start from, none twice.
+        Curves in the order of the located points they start from, none twice; then those of homoclinic orbits.
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     starts = _starts(branches, parameters, second, bounds, longest)
-    return continue_curves(starts, bounds, CURVE, longest, generations)
+    nodes = saddle_nodes_of(branches, parameters, second, bounds, longest)
+    starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
+    found = continue_curves(starts, bounds, CURVE, longest, generations)
+    takens = [p for p in merged({i: c.special for i, c in enumerate(found)}) if p.kind == BT]
+    beside = [loop_near(point, away) for point in takens for away in BESIDE]
+    loops = loops_of(branches, parameters, second, bounds, longest) + [loop for loop in beside if loop is not None]
+    return found + [
+        Curve(c.family, HOMOCLINIC, c.points, c.ends, -1, c.special, c.n_missed)
+        for c in homoclinic_curves(loops, bounds)
+    ]
 
 
 CurveStart = tuple[int, Family, str, np.ndarray]
 """Number of a located point, its family with two free parameters, its kind, its unknowns."""
-
-Bounds = tuple[tuple[float, float], tuple[float, float]]
-"""Intervals of both parameters."""
 
 
 def continue_curves(
@@ -136,7 +197,7 @@ def continue_curves(
 
     Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
     """
-    problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
+    problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
     firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     curves: list[Curve] = []
@@ -146,39 +207,89 @@ def continue_curves(
         points = merged({i: curve.special for i, curve in enumerate(curves)})
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
-        sprung = [
-            _sprung(BifurcationProblem(replace(one.family, period=times * one.family.period), kind), one)
-            for one in fresh
-            for kind, times in SPRINGING.get(one.kind, ())
-            if times == 1 or times * one.family.period <= max_period
-        ]
+        sprung = [steps for one in fresh for steps in _springing(one, max_period)]
         ready = [(-1, *pair) for pair in run_together(sprung) if pair is not None]
         if not ready:
             break
     return curves
 
 
-Ready = tuple[int, BifurcationProblem, Point]
+CurveProblem = BifurcationProblem | EquilibriumCurve
+"""The problems with two free parameters, whose solutions are curves of bifurcations."""
+
+
+def _problem_of(family: Family, kind: str) -> CurveProblem:
+    return BifurcationProblem(family, kind) if family.period else EquilibriumCurve(family, kind)
+
+
+Ready = tuple[int, CurveProblem, Point]
 """Number of a located point (-1: none), the problem of its curve, and the curve's first point."""
 
 
 def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
     """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
-    ready = [r for r in ready if not any(_passes(curve, r[1].kind, r[1].family, r[2]) for curve in curves)]
+    ready = [r for r in ready if not any(_passes(curve, r[1], r[2]) for curve in curves)]
     traces = run_together(
         [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
     )
     for i, (number, problem, first) in enumerate(ready):
         (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
-        is_known = any(_passes(curve, problem.kind, problem.family, first) for curve in curves)
+        is_known = any(_passes(curve, problem, first) for curve in curves)
         if not is_known and (number >= 0 or len(points) > 2):
             ends = back.end, ahead.end
             n_missed = missed_before + missed_after
             curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after, n_missed))
 
 
-def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
+def _springing(one: SpecialPoint, max_period: int) -> list[Steps[tuple[CurveProblem, Point] | None]]:
+    """Return the searches for a first orbit on each curve that may start at a point of codimension two."""
+    family, kinds = one.family, SPRINGING.get(one.kind, ())
+    if family.period:
+        periods = [(kind, n * family.period) for kind, n in kinds if n == 1 or n * family.period <= max_period]
+        return [_sprung(BifurcationProblem(replace(family, period=p), kind), one) for kind, p in periods]
+    found = [_rest_sprung(EquilibriumCurve(family, kind), one) for kind, n in kinds if not n]
+    for kind in (kind for kind, n in kinds if n):
+        for omega in frequencies_at(one):
+            cycles = cycle_family(family, one.point, omega)
+            if cycles is not None:
+                found.append(_cycles_sprung(BifurcationProblem(cycles, kind), one, omega))
+    return found
+
+
+def _rest_sprung(problem: EquilibriumCurve, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
+    """Find the first equilibrium of a curve through a point of codimension two; at a double Hopf point that of the
+    other pair.
+    """
+    omegas = frequencies_at(at) or [0.0]
+    own = 2.0 * np.pi / at.point.value.seconds
+    omega = omegas[0] if len(omegas) == 1 else max(omegas, key=lambda one: abs(one - own))
+    u = problem.start(at.point.u, omega)
+    if problem.kind == FOLD:
+        value = yield Query(problem, u)
+        problem = EquilibriumCurve(problem.family, kind_of_zero(problem.family, u, value))
+        u = problem.start(u)
+    found = yield from _first(problem, u, CURVE)
+    return None if found is None else (problem, found)
+
+
+def _cycles_sprung(
+    problem: BifurcationProblem, at: SpecialPoint, omega: float
+) -> Steps[tuple[CurveProblem, Point] | None]:
+    """Find a first small cycle on a curve of bifurcations of cycles that starts at a point of codimension two."""
+    family, n = problem.family, problem.family.system.n_states
+    direction = cycle_direction(family, at.point, omega)
+    assert direction is not None
+    normal = np.append(direction, [0.0, 0.0])
+    for amplitude in AMPLITUDES:
+        guess = np.concatenate([at.point.u[:n], at.point.u[-2:]]) + amplitude * normal
+        found = yield from correct(problem, guess, normal / np.linalg.norm(normal), CURVE)
+        if found is not None and not end_of_crossings(family, found):
+            return problem, found
+    return None
+
+
+def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first orbit on a bifurcation curve that starts at a point of codimension two; None if there is no such
     curve.
     """
@@ -204,32 +315,43 @@ def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds,
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
-        if not 0 < period <= max_period or kind not in TESTS:
+        if period > max_period or kind not in (TESTS if period else EQUILIBRIUM_KINDS):
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
         family = Family(parameters.model.system, period, frequency, own.pack(), (first, second), (scales[0], scales[1]))
         here = frequency if second == FREQUENCY else own[second]
         state = np.asarray(ds["bifurcation_section"].values[k, 0])
-        found.append((k, family, kind, family.unknowns(state, [float(ds["value"][k]), here])))
+        u = family.unknowns(state, [float(ds["value"][k]), here])
+        found.append((k, family, kind, u if period else EquilibriumCurve(family, kind).start(u)))
     return found
 
 
-def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+def _own(settings: Settings, problem: CurveProblem) -> Settings:
+    return settings if problem.family.period else REST_CURVE
+
+
+def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     value = yield Query(problem, u)
-    found = (yield from correct(problem, u, kernel_of(value), settings)) if value.is_finite else None
-    if found is None:
+    found = (yield from correct(problem, u, kernel_of(value), _own(settings, problem))) if value.is_finite else None
+    if found is None or not _persists(problem, found):
         return None
     tangent = kernel_of(found.value)
     return replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))
 
 
+def _persists(problem: CurveProblem, point: Point) -> bool:
+    """Return False at an imperfect branch point: one that a change of the second parameter has broken up."""
+    return problem.kind not in BRANCH_POINTS or abs(float(point.u[problem.family.system.n_states])) < PERSISTS
+
+
 def _follow(
-    problem: BifurcationProblem, start: Point, bounds: Bounds, settings: Settings
+    problem: CurveProblem, start: Point, bounds: Bounds, settings: Settings
 ) -> Steps[tuple[Trace, list[SpecialPoint], int]]:
     """Follow a bifurcation curve in one direction, and locate its points of codimension two; stay within the bounds.
 
-    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real.
+    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real, and a Hopf curve
+    at the Bogdanov-Takens point where its pair of eigenvalues does.
     """
 
     def is_inside(u: np.ndarray) -> bool:
@@ -242,23 +364,33 @@ def _follow(
             return "bound"
         if problem.kind == TORUS and not _has_torus(here):
             return "resonance"
+        if problem.kind == HOPF and not np.isfinite(here.value.seconds):
+            return BT
+        if not _persists(problem, here):
+            return "stuck"
         if has_halved(problem.family, points):
             return "period_halving"
+        if problem.family.period and (end := end_of_crossings(problem.family, here)):
+            return end
         step = np.linalg.norm(here.u - points[-2].u)
         if len(points) > 5 and np.linalg.norm(here.u - points[0].u) < 0.7 * step:
             return "closed"
         return ""
 
-    detector = Detector(problem, (LOCATE, CURVE))
-    found = yield from trace(problem, start, settings, stop, detector.between)
+    detector: Detector
+    if isinstance(problem, EquilibriumCurve):
+        detector = EquilibriumDetector(problem, (LOCATE, CURVE))
+    else:
+        detector = Detector(problem, (LOCATE, CURVE))
+    found = yield from trace(problem, start, _own(settings, problem), stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
         last, before = (p.u for p in found.points[:-3:-1])
         special = [one for one in special if np.linalg.norm(one.point.u - last) > np.linalg.norm(before - last)]
-    if found.end in ("bound", "resonance"):
+    if found.end in ("bound", "resonance", BT):
         found.points.pop()
-    if found.end == "resonance":
-        found.points += [one.point for one in special if one.kind in (R1, R2)][-1:]
+    if found.end in ("resonance", BT):
+        found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
 
 
@@ -268,15 +400,22 @@ def _has_torus(point: Point) -> bool:
     return bool(len(pairs)) and bool(np.abs(np.abs(pairs) - 1.0).min() < 1e-4)
 
 
-def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points."""
-    is_alike = curve.kind == kind and curve.family.period == family.period
-    return is_alike and lies_on(curve.points, family, start)
+def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
+    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points.
+
+    Two curves of Hopf points that cross at a double Hopf point differ in the period of their cycles.
+    """
+    family, points, seconds = problem.family, curve.points, start.value.seconds
+    if problem.kind == HOPF and start.u[family.system.n_states] > NO_FREQUENCY:
+        points = [point for point in points if abs(point.value.seconds / seconds - 1.0) < SAME_PERIOD]
+    is_alike = curve.kind == problem.kind and curve.family.period == family.period
+    return is_alike and lies_on(points, family, start)
 
 
 def lies_on(points: Sequence[Point], family: Family, start: Point) -> bool:
     """Return whether a curve in two parameters passes through an orbit, at any of the orbit's section points."""
-    for a, b in pairwise(np.array([p.u for p in points])):
+    n = family.system.n_states  # of a Hopf point an unknown stands between the states and the parameters
+    for a, b in pairwise([np.concatenate([p.u[:n], p.u[-2:]]) for p in points]):
         chord = b - a
         length = float(np.linalg.norm(chord))
         if not length:
@@ -294,7 +433,8 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     codimension two).
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
-    with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found.
+    with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found;
+    of equilibria also the coefficients of the normal forms, such as ``special_lyapunov2`` (see `center_manifold`).
 
     Parameters
     ----------
@@ -310,15 +450,20 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     values = np.full((len(curves), n, 2), np.nan)
     section = np.full((len(curves), n, len(names)), np.nan)
     residual = np.full((len(curves), n), np.nan)
+    quantity = np.full((len(curves), n), np.nan)
     for i, curve in enumerate(curves):
         values[i, : len(curve.points)] = curve.values
         section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
         residual[i, : len(curve.points)] = [p.residual for p in curve.points]
+        if curve.kind == HOMOCLINIC:
+            quantity[i, : len(curve.points)] = [saddle_quantity(p.value.monodromy) for p in curve.points]
     dims = ("curve", "point")
     one, units = {"units": "1"}, state_units(model)
 
     def codes(i: int) -> np.ndarray:
         return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
+
+    kinds = np.array([CURVE_KINDS.index(c.kind) for c in curves], np.int8)
 
     def numbers(values: list[int]) -> np.ndarray:
         return np.array(values, np.int32)
@@ -328,9 +473,14 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
         {
             "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
             "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
-            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point"}),
+            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point, or the saddle"}),
             "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
-            "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **code_flags(KINDS)}),
+            "saddle_quantity": (
+                dims,
+                quantity,
+                {"units": "1/s", "long_name": "sum of the leading eigenvalues of the saddle of a homoclinic orbit"},
+            ),
+            "kind": ("curve", kinds, {**one, **code_flags(CURVE_KINDS)}),
             "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
             "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
             "n_missed": (
@@ -363,6 +513,9 @@ def _special_points(
         "special_period": ("special", np.array([p.family.period for p in found], np.int32), one),
         "special_section": (("special", "state"), section, {"units": state_units(model)}),
     }
+    for name in sorted({name for p in found for name in p.coefficients}):
+        about = {"units": COEFFICIENTS[name], "long_name": f"normal form coefficient {name}"}
+        variables[f"special_{name}"] = ("special", np.array([p.coefficients.get(name, np.nan) for p in found]), about)
     for i, (role, name) in enumerate((("first", first), ("second", second))):
         units = {"units": parameter_units(name, model)}
         variables[f"special_{role}"] = ("special", values[:, i], {**units, "long_name": name})

@@ -277,7 +277,7 @@ def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
     points = [
         (branch, one) for branch in branches for one in branch.bifurcations if one.kind == HOPF and one.child is None
     ]
-    families = [cycle_family(branch.family, one) for branch, one in points]
+    families = [cycle_family(branch.family, one.point) for branch, one in points]
     ready = [(*point, family) for point, family in zip(points, families, strict=True) if family is not None]
     halves = run_together(
         [cycles_from(family, one, scope.low, scope.high, scope.settings) for _, one, family in ready], FOLLOWING
@@ -336,27 +336,29 @@ def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
     return parts
 
 
-def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
+def cycle_family(equilibria: Family, at: Point, omega: float | None = None) -> Family | None:
     """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if they do
     not cross it.
+
+    The cycles have the angular frequency `omega` [rad/s], by default that of the pair nearest to the imaginary axis.
 
     There is none if the system has no section by crossing, or if the crossing state does not oscillate.
     """
     crossed = crossed_state(equilibria.system)
-    if crossed is None or _direction(equilibria, at) is None:
+    if crossed is None or cycle_direction(equilibria, at, omega) is None:
         return None
     level = equilibria.parameters.copy()
-    at_rest = float(at.point.value.images[0, crossed])
+    at_rest = float(at.value.images[0, crossed])
     if abs(at_rest - level[-1]) > SAME_LEVEL * equilibria.system.scales[crossed]:
         level[-1] = at_rest
-    for name, value in zip(equilibria.free, equilibria.values(at.point.u), strict=True):
+    for name, value in zip(equilibria.free, equilibria.values(at.u), strict=True):
         level[equilibria.system.parameter_names.index(name)] = value
     return replace(equilibria, period=1, parameters=level)
 
 
 def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settings: Settings) -> Steps[Half | None]:
     """Follow the limit cycles that start at a Hopf point along the parameter; None if no small cycle is found."""
-    direction = _direction(family, at)
+    direction = cycle_direction(family, at.point)
     assert direction is not None
     normal = np.append(direction / np.linalg.norm(direction), 0.0)
     for amplitude in AMPLITUDES:
@@ -367,17 +369,18 @@ def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settin
     return None
 
 
-def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
+def cycle_direction(family: Family, at: Point, omega: float | None = None) -> np.ndarray | None:
     """Return the scaled direction from an equilibrium to the point where small limit cycles cross the section; None if
-    they do not cross it.
+    they do not cross it. See `cycle_family` for `omega`.
 
     It is the real part of the critical eigenvector at the phase at which the crossing state passes its level in
     the section's direction; its largest component is 1.
     """
     assert family.system.section is not None
     crossed, sign = family.system.section
-    values, vectors = np.linalg.eig(family.scaled(at.point.value.monodromy))
-    vector = vectors[:, int(np.argmin(np.abs(values.real) + 1e300 * (values.imag <= 0.0)))]
+    values, vectors = np.linalg.eig(family.scaled(at.value.monodromy))
+    away = np.abs(values.real) if omega is None else np.abs(values - 1j * omega)
+    vector = vectors[:, int(np.argmin(away + 1e300 * (values.imag <= 0.0)))]
     if abs(vector[crossed]) < 1e-6 * np.abs(vector).max():
         return None
     turned = vector * np.exp(-1j * (sign * np.pi / 2.0 + np.angle(vector[crossed])))

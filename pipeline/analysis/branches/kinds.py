@@ -3,9 +3,13 @@
 FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
 HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
 KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
+BRANCH_POINTS = (BRANCHING, PITCHFORK, TRANSCRITICAL)
 
-LIMITS = ("homoclinic", "snic")
+HOMOCLINIC, SNIC = LIMITS = ("homoclinic", "snic")
 """Kinds of ends at which the period of a flow's cycles grows without bound (see `limits`)."""
+
+CURVE_KINDS = (*KINDS, *LIMITS)
+"""Kinds of curves in two parameters, in the order of their codes."""
 
 LABELS = {
     **dict(zip(KINDS, ("LP", "PD", "NS", "BP", "H", "BP", "BP"), strict=True)),
@@ -21,9 +25,21 @@ LABELS = {
     "fold_neimark_sacker": "LPNS",
     "doubling_neimark_sacker": "PDNS",
     "double_neimark_sacker": "NSNS",
+    "bogdanov_takens": "BT",
+    "generalised_hopf": "GH",
+    "zero_hopf": "ZH",
+    "double_hopf": "HH",
+    "neutral_saddle": "NSS",
+    "saddle_node_homoclinic": "NCH",
 }
 """Labels of bifurcations, and of points of codimension two, as MatCont and MatContM print them.
 
 AUTO writes HB for H and TR (torus) for NS; MatCont writes LPC for the fold of a limit cycle. A pitchfork or
 transcritical point is a branch point to both.
 """
+
+COEFFICIENTS = {
+    **{"a": "1/s2", "b": "1/s", "c": "1/s", "e": "1/s", "p11": "1/s", "p22": "1/s"},
+    **dict.fromkeys(("lyapunov2", "s", "theta", "delta"), "1"),
+}
+"""Coefficients of the normal forms of equilibria at points of codimension two, with their units (`center_manifold`)."""

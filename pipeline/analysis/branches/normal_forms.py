@@ -235,7 +235,8 @@ Form = Callable[[Case, Sequence[Bend]], float]
 """Computes a coefficient from the derivatives along the real and, if it is complex, imaginary part of q."""
 
 
-def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve linear equations; NaN if the matrix is singular."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
@@ -257,7 +258,7 @@ def _size(case: Case, bends: Sequence[Bend]) -> float:
 
 def _doubling(case: Case, bends: Sequence[Bend]) -> float:
     (bend,) = bends
-    inner = _solved(case.matrix - np.eye(len(case.q)), bend.first @ case.q)
+    inner = solved(case.matrix - np.eye(len(case.q)), bend.first @ case.q)
     return float(np.vdot(case.p, bend.second @ case.q - 3.0 * bend.first @ inner).real / 6.0)
 
 
@@ -265,7 +266,7 @@ def _cubic(case: Case, bends: Sequence[Bend]) -> float:
     (bend,) = bends
     n = len(case.q)
     bordered = np.block([[case.matrix - np.eye(n), case.q[:, None]], [case.p.conj()[None], np.zeros((1, 1))]])
-    inner = _solved(bordered, np.append(bend.first @ case.q, 0.0))[:n]
+    inner = solved(bordered, np.append(bend.first @ case.q, 0.0))[:n]
     return float(np.vdot(case.p, bend.second @ case.q - 3.0 * bend.first @ inner).real / 6.0)
 
 
@@ -279,8 +280,8 @@ def _complex_parts(case: Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.nd
 def _torus(case: Case, bends: Sequence[Bend]) -> float:
     along, against, third = _complex_parts(case, bends)
     one, mu, q = np.eye(len(case.q)), case.critical, case.q
-    mean = _solved(one - case.matrix, along @ q.conj())
-    double = _solved(mu * mu * one - case.matrix, along @ q)
+    mean = solved(one - case.matrix, along @ q.conj())
+    double = solved(mu * mu * one - case.matrix, along @ q)
     total = third + 2.0 * along @ mean + against @ double
     return float((np.conj(mu) * np.vdot(case.p, total)).real / 2.0)
 
@@ -288,8 +289,8 @@ def _torus(case: Case, bends: Sequence[Bend]) -> float:
 def _hopf(case: Case, bends: Sequence[Bend]) -> float:
     along, against, third = _complex_parts(case, bends)
     one, omega, q = np.eye(len(case.q)), case.critical.imag, case.q
-    mean = _solved(case.matrix.astype(complex), along @ q.conj())
-    double = _solved(2j * omega * one - case.matrix, along @ q)
+    mean = solved(case.matrix.astype(complex), along @ q.conj())
+    double = solved(2j * omega * one - case.matrix, along @ q)
     total = third - 2.0 * along @ mean + against @ double
     return float(np.vdot(case.p, total).real / (2.0 * omega))
 

@@ -137,18 +137,18 @@ class Family:
         return wrap_angles(np.asarray(u[:n] * np.asarray(self.system.scales)), self.system)
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """Return the values of the free parameters that the unknowns `u` stand for."""
-        return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
+        """Return the values of the free parameters that the unknowns `u` stand for: the last ones."""
+        return np.asarray(u[len(u) - len(self.scales) :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
         """Return the trajectories to integrate over one period of the orbit, one for each vector of unknowns in
         `many`.
         """
-        n = self.system.n_states
+        n, first = self.system.n_states, many.shape[1] - len(self.free)
         frequency = np.full(len(many), self.frequency_hz)
         packed = np.tile(self.parameters, (len(many), 1))
         for i, (name, scale) in enumerate(zip(self.free, self.scales, strict=True)):
-            column = many[:, n + i] * scale
+            column = many[:, first + i] * scale
             if name == FREQUENCY:
                 frequency = column
             else:

@@ -20,7 +20,7 @@ from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of, settle_branches
 from pipeline.analysis.branches.bands import digest_of_draws, draws_of
-from pipeline.analysis.branches.kinds import BRANCHING, FOLD, HOPF, LABELS, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, LABELS
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test, parameter_units
 from pipeline.analysis.run import OpenRun
@@ -41,8 +41,6 @@ least; the change is its error."""
 
 INNER = 1e-3
 """Step of the differences by the continued parameter inside of the test function of a branch point."""
-
-BRANCH_POINTS = (BRANCHING, PITCHFORK, TRANSCRITICAL)
 
 NEWTON_STEPS, CLOSE, NEAR = 6, 1e-9, 1e-6
 """Most steps of Newton's method, the step after which it ends, and the largest last one with which a point counts."""

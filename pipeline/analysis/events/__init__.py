@@ -4,7 +4,7 @@ An attractor that is a closed orbit or an equilibrium lives where its branch is 
 at which cells end on it, its branch is followed until it loses stability (`lines`). So the event is the first
 located bifurcation on the branch of that very orbit, wherever it lies on the grid of parameter values; where the
 branch gives no reason, the event is not decided. `analysis` joins attractors and branches, `cascades` decides ends of
-chaotic sets and tori, `sentences` has the table.
+chaotic sets and tori, `crises` names crises by what `contact` measures, `sentences` has the table.
 
 Ids that lie on one stable piece of a branch are one attractor and have the least of their ids, since ids of
 equilibria rest on distance alone. Nothing is looked for between neighbouring values at which cells end on the same
@@ -38,6 +38,10 @@ variable                       dims              meaning
 ``stretch_after``              event             stretch of the same attractor beyond a change; -1 none
 ``to_stretch``                 event, outcome    stretches on which the cells go on; -1 none, -2 they diverge
 ``doublings``, ``ratio``       event, doubling   of a cascade: doublings, and the ratio of the last intervals
+``met_period``, ``exponent``,  event             of a crisis: period of the unstable orbit that is met, exponent of
+``exponent_error``                               the mean lifetimes beyond
+``twin``, ``lives_beyond``     event             of a crisis: id of the set with which it merges (-1 none); 1 if the
+                                                 set on the other side meets the orbit
 ``evidence``                   event             what decided the event, or what was tried
 ``stretch_attractor``, ...     stretch           ``_set``, ``_period``, ``_low``, ``_high``: the range, up to
                                                  its events where they are decided

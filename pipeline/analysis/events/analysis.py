@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
+from pipeline.analysis.events.crises import Crises, Crisis
 from pipeline.analysis.events.graph import at_ends
-from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
-from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
+from pipeline.analysis.events.names import CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.events.refinement import refined
+from pipeline.analysis.events.scene import Event, Scene, Stretch
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -74,59 +75,6 @@ def needs_one_axis(run: OpenRun, options: EventOptions) -> None:
         select_points(cube.isel({axis: slice(0, 1)}), options.at, purpose=f"events lie along {parameter_name(axis)}")
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Neighbouring parameter values at which an attractor has one kind and period."""
-
-    attractor: int
-    kind: int
-    period: int
-    places: tuple[int, int]  # numbers of its first and last value, in rising order
-    rows: tuple[int, int]  # its rows there
-
-
-@dataclass(frozen=True)
-class Event:
-    """An end of a stretch, or a change between two stretches of one attractor."""
-
-    stretch: Stretch
-    rises: bool
-    fate: Fate
-    what: str = UNDECIDED
-    error: float = np.nan
-    to: Mapping[int, int] = field(default_factory=dict)  # numbers of cells by the id on which they go on
-    n_cells: int = 0
-    after: Stretch | None = None  # the attractor beyond a change
-    born: Born | None = None  # evidence of a cascade
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Attractors along one axis, the located branches, and what both need."""
-
-    attractors: xr.Dataset
-    located: xr.Dataset
-    axis: str
-    base: Parameters
-    order: np.ndarray  # positions on the axis by rising value
-    lines: Sequence[Line]
-    names: Mapping[tuple[int, int], int] = field(default_factory=dict)  # ids of joined attractors, by place and id
-
-    @property
-    def along(self) -> np.ndarray:
-        """Values of the axis in rising order."""
-        return np.asarray(self.attractors[self.axis].values[self.order], np.float64)
-
-    @property
-    def scale(self) -> float:
-        """Length of the axis."""
-        return float(np.ptp(self.along))
-
-    def ids_of(self, attractor: int, place: int) -> list[int]:
-        """Return the ids that an attractor has at a place."""
-        return [i for (p, i), name in self.names.items() if (p, name) == (place, attractor)]
-
-
 def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     """Name the events at the ends of all attractors of a run along a parameter."""
     if options.refine:
@@ -141,13 +89,14 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    stretches = _stretches(scene)
+    crises = Crises(scene)
+    stretches = crises.split(_stretches(scene))
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
-    scene = replace(scene, names=names)
+    scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    named = [_aperiodic(scene, one, named) for one in named]
+    named = [_aperiodic(scene, crises, one, named) for one in named]
     return _dataset(scene, stretches, _merged(named))
 
 
@@ -279,10 +228,13 @@ def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -
     return dict(counts.most_common()), int(here.sum())
 
 
-def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
-    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, if that proves it."""
+def _aperiodic(scene: Scene, crises: Crises, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by a crisis, if
+    there is proof.
+    """
     if one.what != UNDECIDED or one.stretch.period or SETS[one.stretch.kind] not in ("chaotic_set", "torus"):
         return one
+    is_chaotic = SETS[one.stretch.kind] == "chaotic_set"
     place, way = one.stretch.places[one.rises], 1 if one.rises else -1
     heir = next(iter(one.to), -1)
     facing = [
@@ -295,11 +247,13 @@ def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
         and next(iter(other.to), -1) == one.stretch.attractor
     ]
     if not facing or len(one.to) > 1:
-        return replace(one, fate=replace(one.fate, why=_why_open(one, heir, named)))
+        why = _why_open(one, heir, named)
+        return crises.name(one, why) if is_chaotic else replace(one, fate=replace(one.fate, why=why))
     born = _born(scene, one.stretch, place, way, facing[0].fate)
     fate = replace(facing[0].fate, value=born.value, why=born.why)
     if not born.what:
-        return replace(one, fate=replace(fate, bifurcation=-1))
+        open_end = replace(one, fate=replace(fate, bifurcation=-1))
+        return crises.name(open_end, born.why) if is_chaotic else open_end
     error = max(born.error, LOCATED * scene.scale)
     return replace(one, fate=fate, what=born.what, error=error, born=born)
 
@@ -330,7 +284,7 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
 
 
 def _merged(named: Sequence[Event]) -> list[Event]:
-    """Make one event of two ends of an attractor at one bifurcation: it changes its period there."""
+    """Make one event of two ends of an attractor at one bifurcation or crisis: it changes its period or size there."""
     merged: list[Event] = []
     for one in named:
         last = merged[-1] if merged else None
@@ -338,7 +292,10 @@ def _merged(named: Sequence[Event]) -> list[Event]:
             last is not None
             and (last.rises, one.rises) == (True, False)
             and last.stretch.attractor == one.stretch.attractor
-            and last.fate.bifurcation == one.fate.bifurcation >= 0
+            and (
+                last.fate.bifurcation == one.fate.bifurcation >= 0
+                or (last.what in CRISES and (last.what, last.fate.value) == (one.what, one.fate.value))
+            )
         ):
             merged[-1] = replace(last, after=one.stretch)
         else:
@@ -361,6 +318,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         else 0
         for one in named
     ]
+    crises = [one.born if isinstance(one.born, Crisis) else Crisis("", "") for one in named]
     unit = {"units": str(located.attrs["parameter_units"])}
     columns: dict[str, tuple[Sequence[object], str, Mapping[str, object]]] = {
         "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),
@@ -380,6 +338,19 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
         "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
+        "exponent": (
+            [one.born.exponent if one.born else np.nan for one in named],
+            "minus the power of the distance with which phases grow",
+            {},
+        ),
+        "exponent_error": ([one.born.exponent_error if one.born else np.nan for one in named], "its error", {}),
+        "met_period": ([one.period for one in crises], "period of the unstable orbit that is met, 0 none", {}),
+        "twin": ([one.twin for one in crises], "id of the set with which it merges, -1 none", {}),
+        "lives_beyond": (
+            [int(one.lives_beyond) for one in crises],
+            "1 if the set on the other side meets the orbit",
+            {},
+        ),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {

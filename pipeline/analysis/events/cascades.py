@@ -46,6 +46,8 @@ class Born:
     error: float = np.nan
     doublings: tuple[float, ...] = ()
     ratio: float = np.nan
+    exponent: float = np.nan  # minus the power of the distance with which laminar phases grow
+    exponent_error: float = np.nan
 
 
 def cascade_of(

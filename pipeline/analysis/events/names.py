@@ -6,5 +6,9 @@ from pipeline.analysis.branches.kinds import KINDS, LIMITS
 
 UNDECIDED, RANGE_END, LIVES_ON, CASCADE = "not_decided", "range_end", "lives_on", "cascade"
 
-NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE)
+BOUNDARY, INTERIOR, BANDS, TWINS = "boundary_crisis", "interior_crisis", "band_merging", "attractor_merging"
+CRISES = (BOUNDARY, INTERIOR, BANDS, TWINS)
+"""Crises: a chaotic set is lost, grows, or merges its bands or with another set, as it meets an unstable orbit."""
+
+NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *CRISES)
 """Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""

@@ -7,7 +7,7 @@ import xarray as xr
 
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.events.graph import graph_of
-from pipeline.analysis.events.names import CASCADE, LIVES_ON, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import BANDS, BOUNDARY, CASCADE, CRISES, LIVES_ON, RANGE_END, TWINS, UNDECIDED
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tabular import (
     MOST_ROWS,
@@ -25,7 +25,8 @@ from pipeline.products.product import Table
 
 _NAMES = (
     *("attractor", "set", "period", "period_after", "rises", "what", "criticality", "value", "value_error", "seen"),
-    *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "evidence"),
+    *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "met_period", "exponent"),
+    *("exponent_error", "twin", "lives_beyond", "evidence"),
 )
 
 _LIMITS = {"homoclinic": "homoclinic end (HOM) at a saddle", "snic": "saddle node on a circle (SNIC)"}
@@ -103,6 +104,8 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
     at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
+    if row["period_after"] >= 0 and row["what"] in CRISES:
+        return f"{who} changes at {at} as it {way}: {_crisis(row)}"
     if row["period_after"] >= 0:
         changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"
         return f"{changes} at {at} as it {way}: {_reason(row, doublings)}"
@@ -117,6 +120,8 @@ def _reason(row: Row, doublings: list[float]) -> str:
     if what == CASCADE:
         listed = ", ".join(f"{x:.7g}" for x in doublings)
         return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    if what in CRISES:
+        return _crisis(row)
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
@@ -142,6 +147,16 @@ def _reason(row: Row, doublings: list[float]) -> str:
     }
     verb = "exchanges stability with" if what == TRANSCRITICAL else "meets"
     return f"{head}, {told.get((what, own), f'it {verb} the {kind}{of}')}"
+
+
+def _crisis(row: Row) -> str:
+    """Name a crisis, the orbit that is met, and how lifetimes grow."""
+    name = {BANDS: "merging of bands", TWINS: "merging of attractors"}.get(row["what"], plain(row["what"]))
+    who = "the set beyond" if row["lives_beyond"] else "it"
+    twin = f" together with {letter(row['twin'])}" if row["twin"] >= 0 else ""
+    times = f"lifetimes {'' if row['what'] == BOUNDARY else 'of its parts '}grow with the power"
+    power = f"-{row['exponent']:.2f} ± {row['exponent_error']:.2f} of the distance"
+    return f"{name}, {who} meets the unstable orbit of period {row['met_period']}{twin}; {times} {power}"
 
 
 def _going_on(attractor: int, to: dict[int, int]) -> str:

@@ -139,7 +139,7 @@ def find_passages(run: OpenRun, cells: PointCells, options: EscapeOptions, *, ha
     """
     model, motion = run.model, run.spec.motion
     assert isinstance(motion, Noisy)
-    inputs = _inputs_at(run, cells)
+    inputs = inputs_at(run, cells)
     steps = int(motion.steps(inputs)[0])
     n_before = run.spec.integration.n_transient + options.skip + 1
     words = cell_words(inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states)
@@ -191,7 +191,7 @@ def find_passages(run: OpenRun, cells: PointCells, options: EscapeOptions, *, ha
     )
 
 
-def _inputs_at(run: OpenRun, cells: PointCells) -> Inputs:
+def inputs_at(run: OpenRun, cells: PointCells) -> Inputs:
     """Return the inputs of the cells of a parameter point."""
     layout = CellMap(run.spec)
     block = {d: slice(0, n) for d, n in zip(layout.dims, layout.shape, strict=True)}

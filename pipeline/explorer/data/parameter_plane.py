@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
-from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.kinds import CURVE_KINDS, HOMOCLINIC, LABELS
 from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
@@ -53,7 +53,7 @@ def _curve(found: xr.Dataset, i: int) -> dict[str, Any]:
     n, period = int(found["n_points"][i]), int(found["orbit_period"][i])
     return {
         "id": i,
-        "kind": NAMES[KINDS[int(found["kind"][i])]],
+        "kind": NAMES[CURVE_KINDS[int(found["kind"][i])]],
         "period": period,
         "x": found["first"].values[i, :n].tolist(),
         "y": found["second"].values[i, :n].tolist(),
@@ -105,13 +105,17 @@ def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
     n_curves = 0 if found is None else found.sizes["curve"]
     if found is None or not 0 <= curve < n_curves:
         raise RequestError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
+    if not int(found["orbit_period"][curve]):
+        raise RequestError(f"curve {curve} has equilibria, which do not move.")
     n_points = int(found["n_points"][curve])
     if not 0 <= point < n_points:
         raise RequestError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
+    if CURVE_KINDS[int(found["kind"][curve])] == HOMOCLINIC:
+        raise RequestError(f"curve {curve} has homoclinic orbits, which never return to the section.")
     source = explored if explored.curves is None else ExploredRun.of(explored.curves)
     parameters, clock_hz = _parameters_at(source, found.isel(curve=curve, point=point))
     state, period = found["section"].values[curve, point], int(found["orbit_period"][curve])
-    return packed_orbit(source, parameters, clock_hz, state, period, NAMES[KINDS[int(found["kind"][curve])]])
+    return packed_orbit(source, parameters, clock_hz, state, period, NAMES[CURVE_KINDS[int(found["kind"][curve])]])
 
 
 def packed_orbit(

@@ -50,6 +50,7 @@ class Plots:
     edge = OnePanel(options.EdgeFigureOptions)
     escapes = AnyPanels(options.EscapeFigureOptions)
     density = AnyPanels(options.DensityFigureOptions)
+    transfer = SeveralPanels(options.TransferFigureOptions)
 
     def __init__(self, source: RunDirectory | xr.Dataset) -> None:
         self._source = source

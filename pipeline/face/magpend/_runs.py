@@ -28,6 +28,7 @@ from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
 from pipeline.products.spectrum import SpectrumOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
+from pipeline.products.transfer import TransferOptions
 from pipeline.runs.arguments import names_arguments
 from pipeline.runs.derive import shown_table, stale, stored_each
 from pipeline.runs.progress import bar_in_notebook
@@ -97,6 +98,7 @@ class Run(RunDirectory):
     edge = AnalysisMethod(EdgeOptions)
     escapes = AnalysisMethod(EscapeOptions)
     density = AnalysisMethod(DensityOptions)
+    transfer = AnalysisMethod(TransferOptions)
 
     @classmethod
     def open(cls, source: str | Path | Files | RunDirectory) -> Self:

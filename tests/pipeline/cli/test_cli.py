@@ -34,8 +34,8 @@ def test_help__groups_products_by_what_they_need(main, verb, guide, names):
         assert f" {name} " in text
         assert words in text
         if verb == "analyse":
-            assert ("noise" in words) == (ANALYSES[name].motion == "noisy")
-            assert ("drift" in words) == (ANALYSES[name].motion == "drifting")
+            assert ("noise" in words) == (ANALYSES[name].motions == ("noisy",))
+            assert ("drift" in words) == (ANALYSES[name].motions == ("drifting",))
 
 
 REFUSED = {

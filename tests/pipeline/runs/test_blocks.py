@@ -127,7 +127,7 @@ NUMBERS = {"chaos": "attractor_lyapunov", "dimension": "correlation_dimension", 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), BY_POINT)
 def test_in_blocks__every_analysis_of_points(name, options, copy, sizes):
-    text = NOISY if ANALYSES[name].motion == "noisy" else CHAOTIC
+    text = NOISY if ANALYSES[name].motions == ("noisy",) else CHAOTIC
     one, other = copy("one", text), copy("other", text)
     assert len(blocks.blocks_of(one)) == 1
     found = derive(one, name, options, workers=0)

@@ -1,0 +1,296 @@
+"""Equations of folds, Hopf points and branch points of equilibria in two parameters, and the special points on them.
+
+A is the Jacobian; p and q are its left and right singular vectors of the least singular value. "Others" are the
+eigenvalues besides the critical ones (Kuznetsov, Elements of Applied Bifurcation Theory, 3rd ed., 2004, Ch. 8 and 10;
+Govaerts, Numerical Methods for Bifurcations of Dynamical Equilibria, 2000).
+
+============================ ========================= =======================================================
+point                        on curves of              test function
+============================ ========================= =======================================================
+``cusp``                     folds                     <p, B(q, q)>
+``bogdanov_takens``          folds; Hopf points        <p, q>; kappa
+``generalised_hopf``         Hopf points               the first Lyapunov coefficient
+``zero_hopf``                folds; Hopf points        product of l_i + l_j of others; of others
+``double_hopf``              Hopf points               product of l_i + l_j of others
+============================ ========================= =======================================================
+
+A Hopf point is a pair of eigenvalues with the sum 0 and the product kappa, an unknown of its own. So the equations stay
+regular where another pair is imaginary (double Hopf), and where kappa, the square of the frequency, passes 0
+(Bogdanov-Takens); there the curve ends, since beyond it the pair is real. No test function is a difference quotient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from magpend_core.pointwise import jacobian_at, rates_at
+from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.center_manifold import (
+    Rest,
+    bogdanov_takens,
+    cusp,
+    double_hopf,
+    lyapunov,
+    null_vectors,
+    zero_hopf,
+)
+from pipeline.analysis.branches.codimension_two import (
+    BT,
+    CUSP,
+    DOUBLE_HOPF,
+    GENERALISED_HOPF,
+    ZERO_HOPF,
+    Detector,
+    SpecialPoint,
+)
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.lockstep import Steps
+from pipeline.analysis.branches.normal_forms import solved
+from pipeline.analysis.branches.problems import (
+    PARAMETER_STEP,
+    STATE_STEP,
+    Ends,
+    Family,
+    FamilyProblem,
+    Rows,
+    Value,
+    hopf_test,
+)
+
+EQUILIBRIUM_KINDS = (FOLD, HOPF, *BRANCH_POINTS)
+"""Kinds of bifurcations of equilibria that are followed in two parameters."""
+
+INNER = 1e-3
+"""Step of the differences by the first parameter inside of the equations of a branch point, of fourth order."""
+
+SINGULAR = 1e-6
+"""Largest singular value of the dimensionless equations of a fold at a branch point, and its quadratic term at a
+pitchfork."""
+
+PERSISTS = 1e-7
+"""Largest imperfection beta of a branch point that counts as none."""
+
+
+@dataclass(eq=False)
+class EquilibriumCurve(FamilyProblem):
+    """Equations for equilibria at a bifurcation, with two free parameters. Their value needs no integration.
+
+    The unknowns are the states, one number more at Hopf points (kappa) and branch points (the imperfection beta, a
+    constant added to the rates along p, which is 0 where the branch point persists), and the parameters.
+    """
+
+    family: Family
+    kind: str
+    unit: float = field(default=0.0, init=False, repr=False)
+
+    @property
+    def n_free(self) -> int:  # type: ignore[override]
+        """Number of unknowns beside the states."""
+        return 2 if self.kind == FOLD else 3
+
+    def start(self, u: np.ndarray, omega: float | None = None) -> np.ndarray:
+        """Return unknowns from those of states and parameters; a Hopf point has the angular frequency `omega` [rad/s],
+        by default that of the pair nearest to the imaginary axis.
+        """
+        n = self.family.system.n_states
+        if self.kind == FOLD:
+            return np.concatenate([u[:n], u[-2:]])
+        extra = 0.0
+        if self.kind == HOPF:
+            _, jacobian = self._rates(u)
+            values = np.linalg.eigvals(jacobian)
+            upper = values[values.imag > 0.0]
+            if omega is None and len(upper):
+                omega = float(np.abs(upper[np.argmin(np.abs(upper.real))]))
+            extra = ((omega or 0.0) * self._unit_of(jacobian)) ** 2
+        return np.concatenate([u[:n], [extra], u[-2:]])
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """Return no trajectories to integrate: the equations for equilibria need none."""
+        return self.family.rows(u[None][:0])
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Compute the scaled rates and the conditions of the bifurcation, and their derivatives by central
+        differences.
+        """
+        n, (rates, jacobian) = self.family.system.n_states, self._rates(u)
+        if not (np.isfinite(rates).all() and np.isfinite(jacobian).all()):
+            nothing = np.full((self.size - 1, self.size), np.nan)
+            return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobian, is_rest=True)
+        right, left = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
+        steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
+        found = np.array(
+            [self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))]
+        )
+        derivative = (found[1 : 1 + self.size] - found[1 + self.size :]).T / (2.0 * steps)
+        derivative[:n, :n] = self.family.scaled(jacobian) * self.unit
+        seconds = np.nan
+        if self.kind == HOPF and u[n] > 0.0:
+            seconds = float(2.0 * np.pi * self.unit / np.sqrt(u[n]))
+        images = self.family.rows(u[None]).states
+        return Value(found[0], derivative, images, jacobian, seconds, is_rest=True)
+
+    def _rates(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the scaled rates [1/s] and the Jacobian [1/s], not scaled."""
+        rows, system = self.family.rows(u[None]), self.family.system
+        rates = rates_at(system, rows.states, rows.parameters[0])[0] / np.asarray(system.scales)
+        return rates, jacobian_at(system, rows.states, rows.parameters[0])[0]
+
+    def _unit_of(self, jacobian: np.ndarray) -> float:
+        """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
+        call.
+        """
+        if not self.unit:
+            self.unit = 1.0 / (float(np.linalg.norm(self.family.scaled(jacobian))) or 1.0)
+        return self.unit
+
+    def _equations(self, u: np.ndarray, right: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Return the dimensionless equations at some unknowns, with given singular vectors."""
+        n, (rates, jacobian) = self.family.system.n_states, self._rates(u)
+        rates, matrix = rates * self.unit, self.family.scaled(jacobian) * self.unit
+        if self.kind == HOPF:
+            total, product = pair_near(matrix, u[n])
+            return np.concatenate([rates, [total, product - u[n]]])
+        bordered = np.block([[matrix, left[:, None]], [right[None], np.zeros((1, 1))]])
+        solution = solved(bordered, np.append(np.zeros(n), 1.0))
+        if self.kind == FOLD:
+            return np.append(rates, solution[-1])
+        step = np.zeros(self.size)
+        step[n + 1] = INNER
+        far, near, after, beyond = (self._rates(u + k * step)[0] * self.unit for k in (-2, -1, 1, 2))
+        slope = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * INNER)
+        adjoint = solved(bordered.T, np.append(np.zeros(n), 1.0))[:-1]
+        return np.concatenate([rates + u[n] * left, [solution[-1], adjoint @ slope]])
+
+
+def pair_near(matrix: np.ndarray, kappa: float) -> tuple[float, float]:
+    """Return sum and product of that pair of eigenvalues, complex or real, whose sum is nearest to 0 and whose product
+    is nearest to kappa.
+    """
+    if not np.isfinite(matrix).all():
+        return np.nan, np.nan
+    values = np.linalg.eigvals(matrix)
+    i, j = _pair_at(values, kappa)
+    return float((values[i] + values[j]).real), float((values[i] * values[j]).real)
+
+
+def _pair_at(values: np.ndarray, kappa: float) -> tuple[int, int]:
+    i, j = np.triu_indices(len(values), 1)
+    sums, products = values[i] + values[j], values[i] * values[j]
+    away = np.abs(sums) ** 2 + np.abs(products - kappa)
+    k = int(np.argmin(np.where(np.abs(sums.imag) <= 1e-12 * np.abs(values).max(), away, np.inf)))
+    return int(i[k]), int(j[k])
+
+
+# ---- points of codimension two -----------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Vectors:
+    """Null vectors of a fold, turned as those at the point before."""
+
+    right: np.ndarray
+    left: np.ndarray
+
+    @classmethod
+    def of(cls, matrix: np.ndarray, before: _Vectors | None) -> _Vectors:
+        right, left = null_vectors(matrix)
+        if before is not None:
+            right, left = (v * np.copysign(1.0, v @ w) for v, w in ((right, before.right), (left, before.left)))
+        return cls(right, left)
+
+
+@dataclass(eq=False)
+class EquilibriumDetector(Detector):
+    """Detector of points of codimension two along a curve of bifurcations of equilibria; it stores the located points
+    with the coefficients of their normal forms.
+    """
+
+    problem: EquilibriumCurve  # type: ignore[assignment]
+
+    def _tests(self, point: Point, frame: _Vectors | None) -> Steps[tuple[_Vectors, dict[str, float]]]:  # type: ignore[override]
+        rest = self._rest(point)
+        vectors, kind = _Vectors.of(rest.matrix, frame), self.problem.kind
+        if kind == FOLD:
+            values = np.linalg.eigvals(rest.matrix)
+            others = np.delete(values, int(np.argmin(np.abs(values))))
+            bend = rest.second(vectors.right, vectors.right).real @ vectors.left
+            tests = {CUSP: float(bend), BT: float(vectors.left @ vectors.right), ZERO_HOPF: _pairs(others)}
+        elif kind == HOPF:
+            kappa = float(point.u[len(rest.matrix)])
+            others = self._others(point)
+            tests = {BT: kappa, ZERO_HOPF: float(np.prod(others * self.problem.unit).real), DOUBLE_HOPF: _pairs(others)}
+            tests[GENERALISED_HOPF] = lyapunov(rest, _omega(point))[0] if kappa > 0.0 else np.nan
+        else:
+            tests = {}
+        return vectors, tests
+        yield  # type: ignore[unreachable]  # a computation that asks for nothing
+
+    def _test(self, kind: str, frame: _Vectors, point: Point) -> Steps[float]:  # type: ignore[override]
+        _, values = yield from self._tests(point, frame)
+        return values[kind]
+
+    def _rest(self, point: Point) -> Rest:
+        family = self.problem.family
+        return Rest(family, point.u, family.scaled(point.value.monodromy))
+
+    def _others(self, point: Point) -> np.ndarray:
+        """Return the eigenvalues besides the pair of a Hopf point."""
+        values = np.linalg.eigvals(point.value.monodromy)
+        unit, kappa = self.problem.unit, float(point.u[len(values)])
+        return np.delete(values, _pair_at(values * unit, kappa))
+
+    def _named(self, one: SpecialPoint) -> SpecialPoint | None:
+        """Return a located point with its coefficients; None if what meets is a neutral saddle."""
+        point, rest, is_hopf = one.point, self._rest(one.point), self.problem.kind == HOPF
+        if one.kind == CUSP:
+            found = partial(cusp, rest)
+        elif one.kind == BT:
+            found = partial(bogdanov_takens, rest)
+        elif one.kind == GENERALISED_HOPF:
+            return replace(one, coefficients={"lyapunov2": lyapunov(rest, _omega(point), 5)[1]})
+        else:
+            values = self._others(point) if is_hopf else np.linalg.eigvals(point.value.monodromy)
+            upper = values[values.imag > 0.0]
+            if one.kind == ZERO_HOPF and is_hopf:
+                found = partial(zero_hopf, rest, _omega(point))
+            elif not len(upper) or np.abs(upper.real).min() > 1e-6 * np.abs(upper).max():
+                return None
+            else:
+                omega = float(np.abs(upper[np.argmin(np.abs(upper.real))]))
+                own = _omega(point) if is_hopf else 0.0
+                found = (
+                    partial(double_hopf, rest, *sorted((own, omega))) if is_hopf else partial(zero_hopf, rest, omega)
+                )
+        return replace(one, coefficients=found())
+
+
+def _omega(point: Point) -> float:
+    return 2.0 * np.pi / point.value.seconds
+
+
+def _pairs(values: np.ndarray) -> float:
+    return hopf_test(np.diag(values)) if len(values) > 1 else 1.0
+
+
+def kind_of_zero(family: Family, u: np.ndarray, value: Value) -> str:
+    """Return the kind of the curve through an equilibrium with an eigenvalue 0, from the value of the equations of a
+    fold: these are singular at a branch point that persists in both parameters.
+    """
+    if not value.is_finite or np.linalg.svd(value.derivative, compute_uv=False)[-1] > SINGULAR:
+        return FOLD
+    rest = Rest(family, u, family.scaled(value.monodromy))
+    right, left = null_vectors(rest.matrix)
+    bend = abs(left @ rest.second(right, right).real) / float(np.linalg.norm(rest.matrix))
+    return PITCHFORK if bend < SINGULAR else TRANSCRITICAL
+
+
+def frequencies_at(one: SpecialPoint) -> list[float]:
+    """Return the angular frequencies [rad/s] of the imaginary pairs at a point of codimension two of equilibria."""
+    n_pairs = {GENERALISED_HOPF: 1, ZERO_HOPF: 1, DOUBLE_HOPF: 2}.get(one.kind, 0)
+    values = np.linalg.eigvals(one.point.value.monodromy)
+    upper = values[values.imag > 0.0]
+    return [float(value) for value in upper[np.argsort(np.abs(upper.real))][:n_pairs].imag]

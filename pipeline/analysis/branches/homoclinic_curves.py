@@ -1,0 +1,500 @@
+"""Follow curves of homoclinic orbits in the plane of two parameters, from the ends of branches of cycles.
+
+On a curve, with the saddle's leading eigenvalues l_u > 0 > l_s (Champneys and Kuznetsov, Int. J. Bifurcation Chaos 4,
+1994, 785):
+
+=========================== ==================================================================================
+point                       where
+=========================== ==================================================================================
+``neutral_saddle``          the saddle quantity l_u + l_s vanishes: the cycles change their stability
+``bogdanov_takens``         both eigenvalues vanish, and the orbit shrinks to a point: the curve ends
+``saddle_node_homoclinic``  one of them vanishes: the saddle meets a node, on the fold curve of the equilibria; the
+                            curve ends, and beyond it the cycles end at saddle nodes on a circle
+=========================== ==================================================================================
+
+Both parameters are carried on to the end of the curve by polynomials of the eigenvalue that vanishes. The curve also
+ends where the orbit comes near another equilibrium: ``heteroclinic``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.equilibria import find_equilibria
+from magpend_core.models.model import Parameters
+from magpend_core.orbits import wrap_angles
+from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.sampling import Drive, sample
+from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of, trace
+from pipeline.analysis.branches.bifurcations import find_root
+from pipeline.analysis.branches.codimension_two import BT, NEUTRAL, NONCENTRAL, SpecialPoint
+from pipeline.analysis.branches.following import leading_of, opposite
+from pipeline.analysis.branches.homoclinic import (
+    CUTS,
+    SETTINGS,
+    HomoclinicProblem,
+    Loop,
+    homoclinic_point,
+    lay_nodes,
+    loop_of,
+)
+from pipeline.analysis.branches.kinds import HOMOCLINIC, SNIC
+from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.tabular import words_of
+from pipeline.analysis.tolerances import BRANCH_RTOL
+
+HETEROCLINIC = "heteroclinic"
+"""End of a curve of homoclinic orbits near another equilibrium."""
+
+AT_ONCE = 8
+"""Points that are followed before the nodes are laid anew."""
+
+VANISHED = 0.08
+"""A leading eigenvalue has vanished if it is below this share of its largest value on the curve."""
+
+RANGE, FITTED = 6.0, 7
+"""Range of the vanishing eigenvalue, as a factor, over which both parameters are fitted, and the number of points."""
+
+MEETS = 1e-3
+"""Distance from another equilibrium at which the orbit ends as heteroclinic, in units of the orbit's size."""
+
+SAMPLES = 8000
+"""Instants of a long cycle that is the first guess."""
+
+ANGLES, LOOP = 36, 6.0
+"""Directions about a Bogdanov-Takens point that are tried, and half the length of a loop in units of its time 1/k."""
+
+Bounds = tuple[tuple[float, float], tuple[float, float]]
+"""Intervals of both parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class HomoclinicCurve:
+    """Curve of homoclinic orbits: its points as equilibria of two parameters, the reasons for its ends."""
+
+    family: Family
+    points: list[Point]
+    ends: tuple[str, str]
+    special: list[SpecialPoint]
+    n_missed: int
+    middle: np.ndarray  # (n_states,): mean distance of the first orbit from its saddle [scaled]
+
+
+@dataclass(eq=False)
+class Arm:
+    """One direction of a curve of homoclinic orbits: its points as equilibria of two parameters, and its end."""
+
+    points: list[Point] = field(default_factory=list)
+    special: list[SpecialPoint] = field(default_factory=list)
+    end: str = ""
+    n_missed: int = 0
+
+
+def follow_homoclinic(
+    problem: HomoclinicProblem, start: Point, bounds: Bounds, settings: Settings = SETTINGS
+) -> Steps[Arm]:
+    """Follow homoclinic orbits in the plane of two parameters in one direction.
+
+    Parameters
+    ----------
+    problem, start
+        From `homoclinic_point`; the tangent of `start` gives the direction.
+    bounds
+        Intervals of both parameters.
+    settings
+        Step lengths, tolerance and limits.
+
+    Returns
+    -------
+    Arm
+        Points with the saddle as their state. Its end is ``bound``, ``closed``, ``max_points``, ``stuck``,
+        ``bogdanov_takens`` and ``saddle_node_homoclinic`` where leading eigenvalues vanish, or ``heteroclinic`` where
+        the orbit comes near another saddle. Neutral saddles and these ends are among its special points.
+    """
+    arm = Arm()
+    here, step = start, settings.first_step
+    arm.points.append(as_rest(problem, start))
+    while True:
+        watch = _Watch(problem, settings, bounds, arm)
+        rest = replace(settings, first_step=step, max_points=AT_ONCE)
+        found = yield from trace(problem, here, rest, watch.stop, watch.between)
+        if found.end == "max_points" and len(arm.points) < settings.max_points:
+            before, here = found.points[-2:]
+            step = float(np.linalg.norm(here.u - before.u))
+            loop = loop_of(problem, here.u)
+            if meets_another(loop):
+                arm.end = HETEROCLINIC
+                return arm
+            laid = yield from _laid_anew(problem, here, settings)
+            if laid is None:
+                arm.end = "stuck"
+                return arm
+            problem, here = laid
+            continue
+        arm.end = found.end
+        if found.end in (BT, NONCENTRAL):
+            _carry_on(problem.family, arm)
+        return arm
+
+
+def _laid_anew(
+    problem: HomoclinicProblem, here: Point, settings: Settings
+) -> Steps[tuple[HomoclinicProblem, Point] | None]:
+    """Lay the nodes of an orbit anew, and keep the direction of the curve."""
+    laid = lay_nodes(loop_of(problem, here.u), CUTS[0])
+    if laid is None:
+        return None
+    fresh, u = laid
+    n = problem.system.n_states
+    normal = np.zeros(fresh.size)
+    normal[-n - 3 :] = here.tangent[-n - 3 :]
+    normal /= np.linalg.norm(normal)
+    found = yield from correct(fresh, u, normal, settings)
+    if found is None:
+        return None
+    tangent = kernel_of(found.value)
+    return fresh, replace(found, tangent=tangent * (1.0 if tangent @ normal >= 0.0 else -1.0))
+
+
+@dataclass(eq=False)
+class _Watch:
+    """Rule that ends a curve of homoclinic orbits, and detector of its neutral saddles."""
+
+    problem: HomoclinicProblem
+    settings: Settings
+    bounds: Bounds
+    arm: Arm
+
+    def stop(self, points: list[Point]) -> str:
+        here = as_rest(self.problem, points[-1])
+        values = self.problem.family.values(here.u)
+        if not all(low <= v <= high for v, (low, high) in zip(values, self.bounds, strict=True)):
+            return "bound"
+        self.arm.points.append(here)
+        return vanished(self.arm.points) or ("closed" if _is_closed(self.arm.points) else "")
+
+    def between(self, a: Point, b: Point) -> Steps[bool]:
+        """Locate a neutral saddle between two points; refuse a step on which the saddle is lost."""
+        before, after = saddle_quantity(a.value.monodromy), saddle_quantity(b.value.monodromy)
+        if not np.isfinite(after):
+            return False
+        if before * after < 0.0:
+            ends = yield from find_root(self.problem, (a, before), (b, after), _neutral, self.settings)
+            if ends is None:
+                self.arm.n_missed += 1
+                return True
+            (low, at_low), (high, at_high) = ends
+            values = [as_rest(self.problem, p) for p in (low, high)]
+            family = self.problem.family
+            bracket = np.abs(family.values(values[1].u) - family.values(values[0].u))
+            nearest = values[0] if abs(at_low) <= abs(at_high) else values[1]
+            if all(lo <= v <= hi for v, (lo, hi) in zip(family.values(nearest.u), self.bounds, strict=True)):
+                self.arm.special.append(SpecialPoint(NEUTRAL, family, nearest, bracket))
+        return True
+
+
+def _neutral(point: Point) -> Steps[float]:
+    return saddle_quantity(point.value.monodromy)
+    yield  # a computation that asks for nothing
+
+
+def saddle_quantity(jacobian: np.ndarray) -> float:
+    """Return the sum of the real parts of a saddle's leading eigenvalues [1/s]; NaN if it is no saddle."""
+    values = np.linalg.eigvals(jacobian)
+    if not values.real.min() < 0.0 < values.real.max():
+        return float("nan")
+    return float(sum(one.real for one in leading_of(values)))
+
+
+def as_rest(problem: HomoclinicProblem, point: Point) -> Point:
+    """Return a point of a curve of homoclinic orbits as the equilibrium and its two parameters."""
+    n = problem.system.n_states
+    keep = [*range(problem.size - n - 3, problem.size - 3), problem.size - 2, problem.size - 1]
+    residual = np.array([point.residual])
+    return Point(point.u[keep], point.tangent[keep], replace(point.value, residual=residual), point.n_iterations)
+
+
+def _is_closed(points: Sequence[Point]) -> bool:
+    last, before = points[-1].u, points[-2].u
+    return len(points) > 5 and bool(np.linalg.norm(last - points[0].u) < 0.7 * np.linalg.norm(last - before))
+
+
+def _leading(point: Point) -> np.ndarray:
+    """Return the sizes of the leading unstable and stable eigenvalue of a saddle [1/s]."""
+    return np.array([abs(one.real) for one in leading_of(np.linalg.eigvals(point.value.monodromy))])
+
+
+def vanished(points: Sequence[Point]) -> str:
+    """Return which leading eigenvalues have vanished at the end of a curve: the end's name, or an empty text."""
+    rates = np.array([_leading(one) for one in points])
+    small = rates[-1] < VANISHED * rates.max(axis=0)
+    if small.all():
+        return BT
+    return NONCENTRAL if small.any() and rates[-1].min() < VANISHED * rates[-1].max() else ""
+
+
+def meets_another(loop: Loop) -> bool:
+    """Return whether a homoclinic orbit comes near another equilibrium than its own."""
+    family, system = loop.family, loop.family.system
+    scales = np.asarray(system.scales)
+    packed = family.rows(family.unknowns(loop.saddle, loop.values)[None]).parameters[0]
+    away = np.linalg.norm(wrap_angles(loop.states - loop.saddle, system) / scales, axis=1)
+    speed = np.linalg.norm(rates_at(system, loop.states, packed) / scales, axis=1)
+    inner = (speed[1:-1] < speed[:-2]) & (speed[1:-1] < speed[2:]) & (away[1:-1] > 0.1 * away.max())
+    slow = 1 + np.flatnonzero(inner)
+    if not len(slow):
+        return False
+    found = find_equilibria(system, loop.states[slow], packed)
+    gaps = np.linalg.norm(wrap_angles(loop.states[slow] - found.states, system) / scales, axis=1)
+    return bool((found.converged & (gaps < MEETS * away.max())).any())
+
+
+def _carry_on(family: Family, arm: Arm) -> None:
+    """Carry a curve on to where leading eigenvalues vanish, by polynomials of them through its last points."""
+    rates = np.array([_leading(one) for one in arm.points])
+    size = rates.mean(axis=1) if arm.end == BT else rates[:, rates[-1].argmin()]
+    wanted = size[-1] * np.geomspace(1.0, RANGE, FITTED)
+    chosen = np.unique([int(np.abs(size - one).argmin()) for one in wanted])[::-1]
+    x, u = size[chosen], np.array([arm.points[k].u for k in chosen])
+    last = _at_zero(x, u)
+    away = np.array([_at_zero(x[:-1], u[:-1]), _at_zero(x[1:], u[1:])]) - last
+    before = arm.points[-1]
+    rows = family.rows(last[None])
+    value = replace(
+        before.value,
+        residual=np.abs(away).max(keepdims=True).ravel(),
+        images=rows.states,
+        monodromy=jacobian_at(family.system, rows.states, rows.parameters[0])[0],
+        seconds=np.inf,
+    )
+    end = Point(last, before.tangent, value, 0)
+    arm.points.append(end)
+    error = np.abs(away).max(axis=0)[-2:] * np.asarray(family.scales)
+    arm.special.append(SpecialPoint(arm.end, family, end, error))
+
+
+def _at_zero(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the value at 0 of the polynomial through points, by Lagrange's formula."""
+    weights = [np.prod([other / (other - own) for other in x if other != own]) for own in x]
+    return np.asarray(np.array(weights) @ u)
+
+
+# ---- starts ------------------------------------------------------------------------------------
+
+
+def loops_of(branches: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[Loop]:
+    """Return the last cycles of all branches that end as ``homoclinic``, as approximate homoclinic orbits.
+
+    Parameters
+    ----------
+    branches
+        Result of `dataset_of`.
+    parameters
+        Parameters of the run; the value of `second` is that of the branches.
+    second
+        Name of the second parameter.
+    bounds
+        Interval of the branches' parameter, and that of the second.
+    max_period
+        Longest period of the cycles [returns].
+    """
+    found = []
+    for one, end, family in _ends_of(branches, HOMOCLINIC, parameters, second, bounds, max_period):
+        last = one.isel(point=(int(one["n_points"]) - 1) * end, phase=0)
+        here = float(parameters[second])
+        values, limit = np.array([[float(last["parameter"]), here], [float(one["limit_value"][end]), here]])
+        saddle = one["limit_state"].values[end]
+        found.append(_cycle(family, last["section"].values, values, float(last["period_s"]), saddle, limit))
+    return found
+
+
+def saddle_nodes_of(
+    branches: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int
+) -> list[tuple[Family, np.ndarray]]:
+    """Return the saddle nodes at which branches end as ``snic``: families of equilibria and their unknowns.
+
+    They are folds of equilibria, whose curve goes on also where the saddle node is on no circle. The parameters are
+    those of `loops_of`.
+    """
+    return [
+        (family, family.unknowns(one["limit_state"].values[end], [float(one["limit_value"][end]), parameters[second]]))
+        for one, end, family in _ends_of(branches, SNIC, parameters, second, bounds, max_period)
+    ]
+
+
+def _ends_of(
+    branches: xr.Dataset, kind: str, parameters: Parameters, second: str, bounds: Bounds, max_period: int
+) -> Iterator[tuple[xr.Dataset, int, Family]]:
+    """Yield the branches that have an end of a kind, the number of this end, and the family of its equilibria."""
+    if "limit_value" not in branches or second not in parameters.names:
+        return
+    names = (str(branches.attrs["parameter"]), second)
+    (low, high), (second_low, second_high) = bounds
+    for branch, end in np.argwhere(np.isfinite(branches["limit_value"].values)).tolist():
+        one = branches.isel(branch=branch)
+        code = one[("first_end", "last_end")[end]]
+        if words_of(code)[int(code)] == kind and int(one["orbit_period"]) <= max_period:
+            own = parameters.replace(**{n: float(one[n]) for n in parameters.names if n in one})
+            scales = (high - low, second_high - second_low)
+            yield one, end, Family(parameters.model.system, 0, 1.0, own.pack(), names, scales)
+
+
+def _cycle(
+    family: Family, start: np.ndarray, values: np.ndarray, seconds: float, saddle: np.ndarray, limit: np.ndarray
+) -> Loop:
+    """Return a cycle from where it is nearest to a saddle until it is there again."""
+    system = family.system
+    packed = family.rows(family.unknowns(start, values)[None]).parameters
+    times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
+    orbit = sample(system, packed, start[None], [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL).states[0]
+    away = np.linalg.norm(wrap_angles(orbit - saddle, system) / np.asarray(system.scales), axis=1)
+    first = int(away[:-1].argmin())
+    states = np.concatenate([orbit[first:-1], orbit[: first + 1] + (orbit[-1] - orbit[0])])
+    return Loop(family, times, states, saddle, limit)
+
+
+def homoclinic_curves(loops: Sequence[Loop], bounds: Bounds, settings: Settings = SETTINGS) -> list[HomoclinicCurve]:
+    """Follow homoclinic orbits in both directions in the plane of two parameters, no curve twice.
+
+    Parameters
+    ----------
+    loops
+        Approximate homoclinic orbits, such as those of `loops_of`, or predictions from Bogdanov-Takens points.
+    bounds
+        Intervals of both parameters.
+    settings
+        Step lengths, tolerance and limits.
+
+    Returns
+    -------
+    list of HomoclinicCurve
+        Without those whose first orbit could not be refined.
+    """
+    firsts = run_together([homoclinic_point(loop, settings) for loop in loops])
+    found: list[HomoclinicCurve] = []
+    for loop, first in zip(loops, firsts, strict=True):
+        if first is None or any(_passes(curve, *first) for curve in found):
+            continue
+        problem, start = first
+        ways = [follow_homoclinic(problem, way, bounds, settings) for way in (opposite(start), start)]
+        back, ahead = run_together(ways, "following homoclinic orbits")
+        if back.end == "closed":
+            ahead = Arm([back.points[0]], end="closed")
+        points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
+        middle = _middle(problem, start)
+        special, n_missed = back.special + ahead.special, back.n_missed + ahead.n_missed
+        found.append(HomoclinicCurve(loop.family, points, (back.end, ahead.end), special, n_missed, middle))
+    return found
+
+
+def _middle(problem: HomoclinicProblem, point: Point) -> np.ndarray:
+    """Return the mean distance of an orbit's nodes from the saddle, which tells mirror images apart."""
+    parts, scales = problem.parts(point.u), np.asarray(problem.system.scales)
+    away = wrap_angles((parts.nodes - parts.saddle) * scales, problem.system) / scales
+    return np.asarray(away.mean(axis=0))
+
+
+def _passes(curve: HomoclinicCurve, problem: HomoclinicProblem, first: Point) -> bool:
+    """Return whether a curve passes through a homoclinic orbit, or starts at its mirror image's parameters."""
+    middle, here = _middle(problem, first), as_rest(problem, first).u
+    if middle @ curve.middle < 0.5 * float(np.linalg.norm(middle) * np.linalg.norm(curve.middle)):
+        return False
+    for a, b in pairwise(np.array([p.u for p in curve.points])):
+        chord = b - a
+        share = float((here - a) @ chord) / max(float(chord @ chord), 1e-300)
+        if -0.01 <= share <= 1.01 and np.linalg.norm(here - a - share * chord) < 0.02 * np.linalg.norm(chord) + 1e-6:
+            return True
+    return False
+
+
+# ---- starts at Bogdanov-Takens points ----------------------------------------------------------
+
+
+def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
+    """Predict the homoclinic orbit at a small distance from a Bogdanov-Takens point.
+
+    To leading order the orbit is the loop x = x_s + 3/2 (x_f - x_s) sech(k t)**2 about the focus x_f beside the saddle
+    x_s, with 4 k**2 = -l_u l_s. The damping, which is linear in x, does no work on it where a seventh of the trace of
+    the critical eigenvalues at x_s and six sevenths of that at x_f add up to 0 (Melnikov's integral).
+
+    Parameters
+    ----------
+    takens
+        The point, with the family of its equilibria.
+    away
+        Distance of the parameters from the point, in units of their scales.
+
+    Returns
+    -------
+    Loop or None
+        None if no direction in the plane of the parameters fulfils the condition.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)
+    pairs = [_pair_at(takens, away, angle) for angle in angles]
+    for i in range(ANGLES):
+        low, high = angles[i], angles[i + 1]
+        first, last = pairs[i], pairs[i + 1]
+        if first is None or last is None or first.work * last.work >= 0.0:
+            continue
+        while high - low > 1e-6 and first is not None:
+            middle = 0.5 * (low + high)
+            pair = _pair_at(takens, away, middle)
+            if pair is None or pair.work * first.work > 0.0:
+                low, first = middle, pair
+            else:
+                high = middle
+        return None if first is None else first.loop(takens.family)
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Saddle and focus beside a Bogdanov-Takens point [scaled], with the Jacobian at the saddle."""
+
+    saddle: np.ndarray
+    focus: np.ndarray
+    jacobian: np.ndarray  # at the saddle, scaled [1/s]
+    work: float  # of the damping on the loop about the focus, to leading order [1/s]
+    values: np.ndarray  # (2,): scaled parameters
+
+    def loop(self, family: Family) -> Loop:
+        """Return the loop of the leading order about the focus."""
+        rates = leading_of(np.linalg.eigvals(self.jacobian))
+        k = 0.5 * float(np.sqrt(rates[0].real * -rates[1].real))
+        along = self.focus - self.saddle
+        left, sizes, right = np.linalg.svd(self.jacobian)
+        across = right[:-1].T @ ((left[:, :-1].T @ along) / sizes[:-1])
+        t = np.linspace(-LOOP / k, LOOP / k, SAMPLES // 4)
+        bow = 1.5 / np.cosh(k * t) ** 2
+        states = self.saddle + bow[:, None] * along + (-2.0 * k * np.tanh(k * t) * bow)[:, None] * across
+        scales = np.asarray(family.system.scales)
+        return Loop(family, t - t[0], states * scales, self.saddle * scales, self.values * np.asarray(family.scales))
+
+
+def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
+    """Find the saddle and the focus beside a Bogdanov-Takens point in one direction of the plane of parameters."""
+    family, system, n = takens.family, takens.family.system, takens.family.system.n_states
+    scales = np.asarray(system.scales)
+    at = takens.point.u[:n]
+    values = takens.point.u[-2:] + away * np.array([np.cos(angle), np.sin(angle)])
+    packed = family.rows(np.append(at, values)[None]).parameters[0]
+    null = np.linalg.svd(family.scaled(takens.point.value.monodromy))[2][-1]
+    reach = np.outer(np.sqrt(away) * np.array([-1.0, -0.3, 0.3, 1.0]), null)
+    with np.errstate(all="ignore"):
+        found = find_equilibria(system, (at + reach) * scales, packed)
+    good = found.converged & (np.abs(found.states / scales - at).max(axis=1) < 4.0 * np.sqrt(away))
+    ends: dict[bool, tuple[np.ndarray, np.ndarray, float]] = {}
+    for state, jacobian in zip(found.states[good] / scales, found.jacobians[good], strict=True):
+        values_here = np.linalg.eigvals(jacobian)
+        critical = values_here[np.argsort(np.abs(values_here))[:2]]
+        ends[bool(np.prod(critical).real < 0.0)] = state, family.scaled(jacobian), float(critical.sum().real)
+    if len(ends) < 2:
+        return None
+    (saddle, jacobian, of_saddle), (focus, _, of_focus) = ends[True], ends[False]
+    return _Pair(saddle, focus, jacobian, (of_saddle + 6.0 * of_focus) / 7.0, values)

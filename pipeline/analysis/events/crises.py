@@ -1,0 +1,290 @@
+"""Name the crises of chaotic sets: find the unstable orbit that a set meets, and what becomes of the set beyond.
+
+The orbits are looked for: those of the located branches at the last value at which the set lives, and those that
+deflated Newton iterations find around the set. An orbit is met if the clearance between the set and its stable manifold
+is 0 at one parameter value, seen from both sides, and if the mean lifetime beyond is a power of the distance from the
+same value (see `contact`). Trajectories that leave beyond contact tell the kind of the crisis: if they do not come
+back, the set is lost (boundary crisis). If they do, it has grown (interior crisis), merged with another set, or merged
+its bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.analysis.attractors.matching import geometry_of
+from pipeline.analysis.branches.deflation import search_orbits, starts_around
+from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
+from pipeline.analysis.events.cascades import Born
+from pipeline.analysis.events.contact import (
+    SETTLE,
+    Approach,
+    Contact,
+    Effort,
+    Lifetimes,
+    Saddle,
+    Sample,
+    SectionMap,
+    contact_of,
+    count_bands,
+    lifetimes_of,
+    sample_of,
+)
+from pipeline.analysis.events.lines import at
+from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TWINS
+from pipeline.analysis.events.scene import Event, Scene, Stretch
+from pipeline.analysis.ragged import points_of_rows, rows_at
+from pipeline.analysis.sets import nearest_distances
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
+from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.layout.vocabulary import letter
+
+OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(64, 256, 3, 12, 1)
+"""Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
+
+OF_BANDS = 12
+"""Longest period of the orbits that are looked for because it is once or twice the number of bands."""
+
+SURE = 4.0
+"""Largest distance of the value from lifetimes, in units of its error."""
+
+GROWN, STRAY = 0.1, 1e-3
+"""Distance from a set, as a share of its size, beyond which points are outside; share of points that may lie there."""
+
+RETURNING, LOST = 0.5, 0.02
+"""Shares of trajectories that leave and pass the orbit again: at least, of a set that lives on; at most, of a lost one.
+"""
+
+JUMP = 5.0
+"""Ratio of a set's growth between neighbouring values to its motion from which a crisis is looked for."""
+
+
+@dataclass(frozen=True)
+class Crisis(Born):
+    """Verdict on the crisis of a chaotic set, with the law of the mean lifetimes beyond."""
+
+    period: int = 0  # of the orbit that is met
+    bands: tuple[int, int] = (0, 0)  # before and after; 0 unknown
+    twin: int = -1  # id of the set with which it merges
+    lives_beyond: bool = False  # whether the set that meets the orbit is the one on the other side
+
+
+@dataclass(eq=False)
+class Crises:
+    """The crises of the chaotic sets of a scene; each end of a set is looked at once."""
+
+    scene: Scene
+    known: dict[tuple[int, int, int], Crisis] = field(default_factory=dict)
+
+    def name(self, one: Event, why: str) -> Event:
+        """Name the end of a chaotic set by the crisis of this set, or of a set that its cells go on to, as seen from
+        the other side; add `why` else.
+        """
+        place, way = one.stretch.places[one.rises], 1 if one.rises else -1
+        tries = [self.at(one.stretch.attractor, place, way)]
+        if not tries[0].what:
+            heirs = [i for i in one.to if self._row(i, place + way) is not None][:2]
+            tries += [replace(self.at(i, place + way, -way), lives_beyond=True) for i in heirs]
+        found = next((crisis for crisis in tries if crisis.what), None)
+        if found is None:
+            return replace(one, fate=replace(one.fate, why="; ".join(dict.fromkeys([why, *(x.why for x in tries)]))))
+        fate = replace(one.fate, value=found.value, bifurcation=-1, why=found.why)
+        return replace(one, fate=fate, what=found.what, error=found.error, born=found)
+
+    def at(self, attractor: int, place: int, way: int) -> Crisis:
+        """Return the crisis in which a chaotic set at a place ends as the parameter goes on to the next place."""
+        key = attractor, place, way
+        if key not in self.known:
+            self.known[key] = self._crisis(*key)
+        return self.known[key]
+
+    def split(self, stretches: Sequence[Stretch]) -> list[Stretch]:
+        """Divide the stretches of chaotic sets where a crisis changes the size of a set or the number of its bands."""
+        found = []
+        for one in stretches:
+            parts = [one]
+            for place in self._changes(one) if SETS[one.kind] == "chaotic_set" else ():
+                if not (self.at(one.attractor, place, 1).what or self.at(one.attractor, place + 1, -1).what):
+                    continue
+                left, right = self._row(one.attractor, place), self._row(one.attractor, place + 1)
+                last = parts.pop()
+                assert left is not None
+                assert right is not None
+                parts.append(replace(last, places=(last.places[0], place), rows=(last.rows[0], left)))
+                parts.append(replace(last, places=(place + 1, last.places[1]), rows=(right, last.rows[1])))
+            found += parts
+        return found
+
+    def _changes(self, one: Stretch) -> list[int]:
+        """Return the places of a stretch beyond which the set changes its number of bands or its size."""
+        places = range(one.places[0], one.places[1] + 1)
+        if len(places) < 2:
+            return []
+        along, effort = self._map(places[0])
+        geometry, rows = along.geometry, [self._row(one.attractor, place) for place in places]
+        states = np.array([points_of_rows(self.scene.attractors)[row][-1] for row in rows if row is not None])
+        if len(states) < len(places):
+            return []
+        paths = along.paths(self.scene.along[list(places)], states, SETTLE + 8 * effort.length)[:, SETTLE:]
+        sets = [path[np.isfinite(path).all(axis=1)] for path in paths]
+        if min(map(len, sets)) < effort.length:
+            return []
+        bands = [count_bands(points, geometry) for points in sets]
+        found = []
+        for k in range(len(places) - 1):
+            size = float(geometry.distance(sets[k], sets[k][:1]).max())
+            ways = [float(nearest_distances(sets[i], sets[j], geometry).max()) for i, j in ((k, k + 1), (k + 1, k))]
+            grows = max(ways) > GROWN * size and max(ways) > JUMP * min(ways)
+            if bands[k] != bands[k + 1] or grows:
+                found.append(places[k])
+        return found
+
+    # ---- one end -------------------------------------------------------------------------------
+
+    def _crisis(self, attractor: int, place: int, way: int) -> Crisis:
+        scene, row = self.scene, self._row(attractor, place)
+        if row is None or not 0 <= place + way < len(scene.along):
+            return Crisis("", "")
+        seen, beyond = (float(x) for x in scene.along[[place, place + way]])
+        along, effort = self._map(place)
+        points = points_of_rows(scene.attractors)
+        try:
+            sample = sample_of(along, seen, points[row][-1], effort)
+        except ValueError:
+            return Crisis("", "its trajectories end")
+        met = self._met(along, effort, sample, (seen, beyond), self._orbits(along, sample, seen, effort))
+        if isinstance(met, str):
+            return Crisis("", met)
+        others = {
+            int(scene.attractors["attractor"].values[k]): points[k]
+            for k in rows_at(scene.attractors)[(int(scene.order[place]),)]
+            if k != row and SETS[int(scene.attractors["kind"].values[k])] == "chaotic_set"
+        }
+        return _judged(scene, *met, beyond, others)
+
+    def _row(self, attractor: int, place: int) -> int | None:
+        """Return the row of a chaotic set at a place; None if it is not there."""
+        ds = self.scene.attractors
+        for row in rows_at(ds)[(int(self.scene.order[place]),)] if 0 <= place < len(self.scene.order) else ():
+            name = self.scene.names.get((place, int(ds["attractor"].values[row])), int(ds["attractor"].values[row]))
+            if name == attractor and SETS[int(ds["kind"].values[row])] == "chaotic_set":
+                return row
+        return None
+
+    def _map(self, place: int) -> tuple[SectionMap, Effort]:
+        scene = self.scene
+        model = scene.base.model
+        frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
+        family = family_of(model.system, 1, frequency, packed, scene.axis, scene.scale)
+        return SectionMap(family, geometry_of(scene.attractors), PORTRAIT_RTOL), OF_MAP if model.is_map else OF_FLOW
+
+    def _orbits(self, along: SectionMap, sample: Sample, seen: float, effort: Effort) -> list[Saddle]:
+        """Return the saddle orbits at a parameter value: those of located branches, and those around the set."""
+        system = along.family.system
+        rows = along.rows(seen, sample.points[:1])
+        m = sample.n_bands
+        periods = sorted({*range(1, effort.longest + 1), *(p for p in (m, 2 * m) if p <= OF_BANDS)})
+        starts = [starts_around(sample.points[::7], effort.starts, 0, system)] * len(periods)
+        asked = np.repeat(periods, effort.starts)
+        for line in self.scene.lines:
+            for node in np.flatnonzero((line.value[:-1] - seen) * (line.value[1:] - seen) <= 0.0).tolist():
+                if line.period:
+                    starts.append(line.points[node, :1])
+                    asked = np.append(asked, line.period)
+        found = search_orbits(
+            np.concatenate(starts), asked, float(rows.frequency_hz[0]), rows.parameters[0], system, rounds=effort.rounds
+        )
+        saddles = [along.saddle(seen, one.points[0], one.period) for one in found]
+        return [one for one in saddles if one is not None]
+
+    def _met(
+        self, along: SectionMap, effort: Effort, sample: Sample, values: tuple[float, float], orbits: Sequence[Saddle]
+    ) -> tuple[Approach, Contact] | str:
+        """Return the orbit that the set meets first, or why it meets none."""
+        ds, (seen, beyond) = self.scene.located, values
+        here = Approach(along, sample, seen, orbits[0], effort).paths(seen) if orbits else np.zeros(0)
+        ways = [Approach(along, sample, seen, orbit, effort) for orbit in orbits]
+        ways = [one for one in ways if one.begin(here)]
+        there = ways[0].paths(beyond) if ways else here
+        near = [one for one in ways if one.least(beyond, there).is_beyond]
+        near.sort(key=lambda one: one.least(seen, here).least)
+        first: tuple[Approach, Contact] | None = None
+        before, earlier = seen, here
+        for one in near:
+            # where the set has grown, it crosses other orbits too: only one that it crosses before counts
+            if first is not None and not one.least(before, earlier).is_beyond:
+                continue
+            contact = contact_of(one, beyond)
+            if contact is not None and (first is None or abs(contact.value - seen) < abs(first[1].value - seen)):
+                first = one, contact
+                before = contact.value - 0.5 * contact.span * float(np.sign(beyond - seen))
+                earlier = one.paths(before)
+        return first or (
+            f"no crisis: of {len(orbits)} unstable orbits at {at(ds, seen)}, {len(ways)} lie beside the set, "
+            f"{len(near)} of them are crossed at {at(ds, beyond)}, and none is met at one value from both sides"
+        )
+
+
+def _judged(
+    scene: Scene, approach: Approach, contact: Contact, beyond: float, others: Mapping[int, np.ndarray]
+) -> Crisis:
+    """Name the crisis at a contact, if lifetimes agree and the trajectories that leave show its kind."""
+    ds, period = scene.located, approach.first.period
+    state = ", ".join(f"{x:.6g}" for x in approach.first.points[0])
+    told = (
+        f"the set meets the stable manifold of the unstable orbit of period {period} at ({state}): the clearance is 0 "
+        f"at {at(ds, contact.value)}, by lines from both sides at {at(ds, contact.living, contact.beyond)}"
+    )
+    times = lifetimes_of(approach, contact, beyond)
+    if times is None:
+        return Crisis("", f"{told}; too few trajectories leave beyond it for lifetimes")
+    listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(times.values, times.means, strict=True))
+    told += (
+        f"; mean lifetimes {listed} grow with the power -{times.exponent:.3f} ± {times.exponent_error:.3f} of the "
+        f"distance from {times.value:.10g} ± {times.value_error:.0e}"
+    )
+    far = max(abs(times.values[0] - contact.value), 1e-300)
+    if abs(times.value - contact.value) > SURE * times.value_error + contact.error or times.value_error > 0.25 * far:
+        return Crisis("", f"{told}: they do not agree with the clearance")
+    what, twin, bands = _kind(approach, contact, times, others)
+    if not what:
+        return Crisis("", f"{told}: the trajectories that leave show no kind of crisis")
+    told += f"; {bands[0]} bands before and {bands[1]} beyond" if bands[1] else ""
+    told += f"; beyond, its trajectories reach {letter(twin)}" if twin >= 0 else ""
+    error = max(contact.error, 1e-9 * scene.scale)
+    found = Crisis(what, told, contact.value, error, period=period, bands=bands, twin=twin)
+    return replace(found, exponent=times.exponent, exponent_error=times.exponent_error)
+
+
+def _kind(
+    approach: Approach, contact: Contact, times: Lifetimes, others: Mapping[int, np.ndarray]
+) -> tuple[str, int, tuple[int, int]]:
+    """Return the kind of a crisis (empty if open), the id of the set that is joined, and the numbers of bands."""
+    along, sample, effort = approach.along, approach.sample, approach.effort
+    k = next((i for i, mean in enumerate(times.means) if mean > 2 * SETTLE), 0)
+    value, length = times.values[k], max(4 * effort.length, int(32 * times.means[k]))
+    paths = approach.paths(value, length)
+    share = approach.returning(value, paths)
+    m = sample.n_bands
+    if share <= LOST:
+        return BOUNDARY, -1, (m, 0)
+    if share < RETURNING:
+        return "", -1, (m, 0)
+    geometry, size = along.geometry, approach.size
+    old = approach.paths(2.0 * contact.value - value, effort.length)[:, SETTLE:].reshape(-1, geometry.n_states)
+    new = paths[:, length // 2 :].reshape(-1, geometry.n_states)
+    new = new[np.isfinite(new).all(axis=1)]
+    after = count_bands(paths[int(np.isfinite(paths).all(axis=2).sum(axis=1).argmax())], geometry)
+    outside = new[nearest_distances(new, old, geometry) > GROWN * size]
+    if len(outside) <= STRAY * len(new):
+        return (BANDS, -1, (m, after)) if after < m else ("", -1, (m, after))
+    for number, points in others.items():
+        here = along.paths(2.0 * contact.value - value, points[-effort.lanes :], effort.length)[:, SETTLE:]
+        here = here.reshape(-1, geometry.n_states)
+        away = nearest_distances(outside, here[np.isfinite(here).all(axis=1)], geometry)
+        if (away > GROWN * size).mean() <= STRAY:
+            return TWINS, number, (m, after)
+    return INTERIOR, -1, (m, after)

@@ -1,0 +1,1 @@
+"""Analyse the transfer operator of the section map."""

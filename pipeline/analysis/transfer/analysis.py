@@ -1,0 +1,431 @@
+"""Analyse the transfer operator of a run's section map: slow sets, committors, passage times and rates of escape.
+
+Schema
+------
+Rows are sets (dim ``set``, see `pipeline.analysis.ragged`); the boxes of a set are its samples (dim ``sample``). Steps
+are drive periods or returns.
+
+============================== ================= ==========================================================
+variable                       dims              meaning
+============================== ================= ==========================================================
+``n_pairs``, ``n_boxes``       parameters        pairs of sections, and boxes in which a pair begins
+``outside``, ``unknown``       parameters        shares of pairs that end outside the grid, or in a box in
+                                                 which no pair begins
+``n_closed``                   parameters        closed sets, which no path leaves
+``eigenvalue``                 parameters, mode  real and imaginary part of the slow eigenvalues, on the one
+``eigenvalue_imaginary``                         closed set; NaN where several sets are closed
+``width``                      parameters, axis  width of the boxes along each state
+``is_closed``, ``measure``     set               1 if no path leaves it; share of the stationary measure
+                                                 (NaN: each closed set has its own)
+``share``                      set               mean committor over all boxes: of a closed set, its share of
+                                                 the sampled states
+``kept``, ``escape_rate``      set               share of its measure that stays in a step; rate of escape per
+                                                 step, with ``_low``, ``_high`` and ``_coarse``
+``passage``                    set, target       mean steps from its core to the core of another set of the
+                                                 same parameter point, with ``_low``, ``_high``, ``_coarse``
+``place``                      sample, axis      centre of a box
+``density``                    sample            stationary measure of a box, within its set
+``committor``, ``is_core``     sample            probability to reach the core of its set before the others
+============================== ================= ==========================================================
+
+Intervals are percentiles of resamples: of whole cells if there are enough, else of stretches of cells. Sets and cores
+stay those of all cells. ``_coarse`` is the number on boxes of twice the width: its distance from the number itself
+shows the error of the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy.sparse import csr_array
+
+from pipeline.analysis.intervals import lifetime_interval
+from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, inputs_at, point_dims
+from pipeline.analysis.ragged import N_POINTS, ROW_SIZE, SAMPLE, SET, rows_at
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import Row, Words, aligned, number, points_of, with_interval
+from pipeline.analysis.transfer.ulam import (
+    OUTSIDE,
+    Chain,
+    Grid,
+    chain_of,
+    closed_classes,
+    committors,
+    conditioned,
+    lasting,
+    memberships,
+    passage_times,
+    quasi_stationary,
+    slow_eigenvalues,
+    stationary,
+)
+from pipeline.layout.vocabulary import letter, model_of
+from pipeline.products.product import Table
+from pipeline.products.transfer import TransferOptions
+from pipeline.specification.problems import unknown_name
+
+MOST_SETS = 16
+"""Most sets of a parameter point: closed sets with the largest shares."""
+
+MODES = 8
+"""Slow eigenvalues that are kept."""
+
+PAIRS_IN_BOX = 25
+UNITS = 50
+"""Least number of resampled units; fewer cells are cut into stretches."""
+
+MANY_UNKNOWN = 0.01
+"""Share of pairs that end in boxes without a pair, above which the table warns."""
+
+
+def needs_pairs(run: OpenRun, options: TransferOptions) -> None:
+    """Raise ValueError unless the run is a sweep with pairs of sections, and the options name its states."""
+    names = run.model.state_names
+    asked = [s.strip() for s in options.states.split(",") if s.strip()]
+    for name in (*asked, *options.low, *options.high):
+        if name not in names:
+            raise ValueError(unknown_name("state", name, names))
+    if run.spec.continuation is not None:
+        raise ValueError("transfer needs a sweep: in a continuation, sections belong to moving parameters.")
+    if not _has_starts(run) and run.spec.integration.n_keep < 2:
+        raise ValueError("n_keep = 1 leaves no pair of sections; keep 2 or more, or take n_transient = 0.")
+    for name in options.low.keys() & options.high.keys():
+        if options.low[name] >= options.high[name]:
+            raise ValueError(f"low and high of {name}: {options.low[name]:g} is not below {options.high[name]:g}.")
+
+
+def _has_starts(run: OpenRun) -> bool:
+    """Return whether initial states lie one step before the first stored section."""
+    return run.spec.integration.n_transient == 0 and run.spec.motion.system.section is None
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Successive sections at one parameter point."""
+
+    before: np.ndarray  # (pair, state)
+    after: np.ndarray  # (pair, state); NaN if the cell diverged
+    unit: np.ndarray  # (pair,): number of the resampled unit
+
+
+def pairs_of(run: OpenRun, cells: PointCells) -> Pairs:
+    """Return the pairs of successive sections of the cells of a parameter point.
+
+    A cell that diverged has no sections, and counts only if it did so in its first step.
+    """
+    section = cells.section
+    if _has_starts(run):
+        section = np.concatenate([inputs_at(run, cells).initial_states[:, None], section], axis=1)
+    before, after = section[:, :-1], section[:, 1:]
+    n_cells, n = before.shape[:2]
+    parts = max(1, -(-UNITS // n_cells))
+    unit = np.arange(n_cells)[:, None] * parts + np.arange(n) * parts // n
+    known = np.isfinite(before).all(axis=2)
+    known &= np.isfinite(after).all(axis=2) | (cells.n_periods == 1)[:, None]
+    return Pairs(before[known], after[known], unit[known])
+
+
+def grid_of(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: TransferOptions) -> Grid:
+    """Return even boxes over the range of all states, or over that of the options."""
+    both = np.concatenate([pairs.before, pairs.after])
+    low, high = (np.array([f(both[:, i]) for i in range(len(names))]) for f in (np.nanmin, np.nanmax))
+    circle = np.array(angles)
+    free = circle & [name not in options.low and name not in options.high for name in names]
+    margin = 1e-9 * np.maximum(high - low, 1e-9)
+    low, high = np.where(free, -np.pi, low - margin), np.where(free, np.pi, high + margin)
+    for k, name in enumerate(names):
+        low[k], high[k] = options.low.get(name, low[k]), options.high.get(name, high[k])
+    bins = options.bins or max(2, int((len(pairs.before) / PAIRS_IN_BOX) ** (1.0 / len(names))))
+    return Grid(low, high, np.full(len(names), bins), circle)
+
+
+@dataclass(frozen=True)
+class Sets:
+    """Slow sets of a chain."""
+
+    of_box: np.ndarray  # (box,): number of the set of each box, -1 none
+    cores: list[np.ndarray]  # positions of boxes
+    density: np.ndarray  # (box,): stationary measure
+    n_closed: int
+    values: np.ndarray  # (mode,): slow eigenvalues
+    reached: np.ndarray  # (box, set): committors
+
+
+def sets_of_chain(chain: Chain, options: TransferOptions) -> Sets:
+    """Find the closed sets of a chain, or, if there are not two of them, its almost invariant sets."""
+    n, p = len(chain.boxes), chain.p
+    last = lasting(p)
+    density, values = np.zeros(n), np.zeros(0, complex)
+    if not len(last):
+        return Sets(np.full(n, -1), [], density, 0, values, np.zeros((n, 0)))
+    stays = conditioned(p[last][:, last])
+    classes = sorted(closed_classes(stays), key=len, reverse=True)
+    for own in classes:
+        density[last[own]] = stationary(stays[own][:, own])
+    closed = [last[own] for own in classes]
+    if len(closed) > 1:
+        cores = closed
+    else:
+        only = classes[0]
+        values, vectors = slow_eigenvalues(stays[only][:, only], min(max(MODES, options.sets), len(only)))
+        k = min(options.sets, len(values))
+        belongs = memberships(values[:k], vectors[:, :k]).argmax(axis=1) if k > 1 else np.zeros(len(only), int)
+        parts = [closed[0][belongs == j] for j in range(k)]
+        cores = [_core(part, density, options.core) for part in parts if density[part].sum() > 0.0]
+    reached = committors(p, cores)
+    if len(cores) > MOST_SETS:
+        kept = np.sort(np.argsort(-reached.mean(axis=0), kind="stable")[:MOST_SETS])
+        cores, reached = [cores[k] for k in kept], reached[:, kept]
+    order = np.argsort([float(chain.boxes[core].mean()) for core in cores], kind="stable")
+    cores, reached = [cores[k] for k in order], reached[:, order]
+    of_box = np.where(reached.max(axis=1) > 0.0, reached.argmax(axis=1), -1)
+    n_closed = sum(bool(np.allclose(p[own].sum(axis=1), 1.0)) for own in closed)
+    return Sets(of_box, cores, density, n_closed, values, reached)
+
+
+def _core(part: np.ndarray, density: np.ndarray, share: float) -> np.ndarray:
+    """Return the boxes of highest density that hold a share of the measure of a set."""
+    order = part[np.argsort(-density[part], kind="stable")]
+    held = np.cumsum(density[order])
+    return np.sort(order[: int(np.searchsorted(held, share * held[-1] * (1.0 - 1e-12))) + 1])
+
+
+def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
+    """Return kept measure, rate of escape and mean passage times of the sets of a chain."""
+    n = len(sets.cores)
+    found = {"kept": np.full(n, np.nan), "escape_rate": np.full(n, np.nan), "passage": np.full((n, MOST_SETS), np.nan)}
+    for k in range(n):
+        own = np.flatnonzero(sets.of_box == k)
+        inner = p[own][:, own]
+        rate, _ = quasi_stationary(inner)
+        found["escape_rate"][k] = max(-np.log(rate), 0.0) if rate > 0.0 else np.inf
+        weight = sets.density[own]
+        if weight.sum() > 0.0:
+            found["kept"][k] = float(weight @ np.asarray(inner.sum(axis=1))) / float(weight.sum())
+    for k in range(n):
+        steps = passage_times(p, sets.cores[k])
+        for j in range(n):
+            weight = sets.density[sets.cores[j]]
+            if j != k and weight.sum() > 0.0:
+                found["passage"][j, k] = float(weight @ steps[sets.cores[j]]) / float(weight.sum())
+    return found
+
+
+def coarsened(chain: Chain, grid: Grid, sets: Sets) -> tuple[Chain, Sets]:
+    """Return the chain on boxes of twice the width; each is in the set and the core that have most of its pairs."""
+    halved = tuple((grid.places_of(chain.boxes) // 2).T)
+    boxes, to = np.unique(np.ravel_multi_index(halved, tuple(-(-grid.bins // 2))), return_inverse=True)
+    n, entries = len(boxes), chain.counts.tocoo()
+    counts = csr_array((entries.data, (to[entries.row], to[entries.col])), shape=(n, n))
+    counts.sum_duplicates()
+    weight = np.asarray(chain.counts.sum(axis=1)) + chain.out
+
+    def most(label: np.ndarray) -> np.ndarray:
+        weights = np.zeros((n, int(label.max(initial=-1)) + 2))
+        np.add.at(weights, (to, label + 1), weight)
+        return np.asarray(weights.argmax(axis=1) - 1)
+
+    in_core = np.full(len(chain.boxes), -1)
+    for k, core in enumerate(sets.cores):
+        in_core[core] = k
+    core_of, density = most(in_core), np.bincount(to, sets.density, n)
+    cores = [np.flatnonzero(core_of == k) for k in range(len(sets.cores))]
+    merged = Sets(most(sets.of_box), cores, density, sets.n_closed, sets.values, sets.reached)
+    return Chain(boxes, counts, np.bincount(to, chain.out, n), chain.unknown), merged
+
+
+def intervals_of(
+    boxes: tuple[np.ndarray, np.ndarray], unit: np.ndarray, chain: Chain, sets: Sets, options: TransferOptions
+) -> dict[str, np.ndarray]:
+    """Return the ends of the intervals of rates and passage times, from resampled units."""
+    rng, n_units = np.random.default_rng(options.seed), int(unit.max()) + 1
+    there = np.unique(unit)
+    drawn: dict[str, list[np.ndarray]] = {"escape_rate": [], "passage": []}
+    for _ in range(options.resamples):
+        weights = np.bincount(rng.choice(there, len(there)), minlength=n_units)[unit].astype(np.float64)
+        found = numbers_of(chain_of(*boxes, weights).p, sets)
+        for name, rows in drawn.items():
+            rows.append(found[name])
+    tail = 50.0 * (1.0 - options.confidence)
+    ends: dict[str, np.ndarray] = {}
+    for name, rows in drawn.items():
+        for end, percent in (("low", tail), ("high", 100.0 - tail)):
+            ends[f"{name}_{end}"] = np.percentile(np.stack(rows), percent, axis=0, method="nearest")
+    for k in range(len(sets.cores)):
+        own = sets.cores[k] if sets.n_closed > 1 else np.flatnonzero(sets.of_box == k)
+        stayed, left = float(chain.counts[own][:, own].sum()), float((chain.counts.sum(axis=1) + chain.out)[own].sum())
+        if stayed and left - stayed < 0.5:  # never left: the bound of a lifetime without an event
+            ends["escape_rate_high"][k] = 1.0 / lifetime_interval(0, stayed, options.confidence)[0]
+    return ends
+
+
+def transfer(run: OpenRun, options: TransferOptions) -> xr.Dataset:
+    """Estimate the transfer operator at each parameter point, see the module's schema."""
+    cube, model = run.cube(), model_of(run.cube())
+    asked = [s.strip() for s in options.states.split(",") if s.strip()] or list(model.state_names)
+    columns = [model.state_names.index(name) for name in asked]
+    angles = [model.is_angle[i] for i in columns]
+    dims = point_dims(cube)
+    parts = []
+    for cells in cells_at_points(cube):
+        pairs = pairs_of(run, cells)
+        pairs = Pairs(pairs.before[:, columns], pairs.after[:, columns], pairs.unit)
+        parts.append(_point(pairs, asked, angles, options))
+    return _dataset(cube, dims, asked, parts, options)
+
+
+def _point(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: TransferOptions) -> dict[str, Any]:
+    """Return all variables of one parameter point."""
+    if not len(pairs.before):
+        nothing = Sets(np.zeros(0, int), [], np.zeros(0), 0, np.zeros(0, complex), np.zeros((0, 0)))
+        empty = Chain(np.zeros(0, int), csr_array((0, 0)), np.zeros(0), 0.0)
+        unsized = np.full(len(names), np.nan)
+        return _variables(empty, nothing, {}, np.zeros((0, len(names))), 0) | {"width": unsized}
+    grid = grid_of(pairs, names, angles, options)
+    boxes = grid.box_of(pairs.before), grid.box_of(pairs.after)
+    chain = chain_of(*boxes)
+    sets = sets_of_chain(chain, options)
+    found = numbers_of(chain.p, sets) | intervals_of(boxes, pairs.unit, chain, sets, options)
+    coarse = numbers_of((merged := coarsened(chain, grid, sets))[0].p, merged[1])
+    found |= {f"{name}_coarse": coarse[name] for name in ("escape_rate", "passage")}
+    n_pairs = int((boxes[0] != OUTSIDE).sum())
+    variables = _variables(chain, sets, found, grid.centres_of(chain.boxes), n_pairs)
+    return variables | {"width": (grid.high - grid.low) / grid.bins}
+
+
+_REALS = ("escape_rate", "escape_rate_low", "escape_rate_high", "escape_rate_coarse", "kept")
+_PASSAGES = ("passage", "passage_low", "passage_high", "passage_coarse")
+
+
+def _variables(
+    chain: Chain, sets: Sets, found: Mapping[str, np.ndarray], centres: np.ndarray, n_pairs: int
+) -> dict[str, Any]:
+    n = len(sets.cores)
+    order = [np.flatnonzero(sets.of_box == k) for k in range(n)]
+    boxes = np.concatenate([np.zeros(0, int), *order])
+    is_core = np.zeros(len(chain.boxes), np.int8)
+    is_core[np.concatenate([np.zeros(0, int), *sets.cores])] = 1
+    values = np.full(MODES, complex(np.nan, np.nan))
+    values[: len(sets.values[:MODES])] = sets.values[:MODES]
+    measures = np.array([sets.density[own].sum() for own in order])
+    of_box = np.concatenate([[0.0], measures])[sets.of_box + 1]
+    density = np.divide(sets.density, of_box, out=np.zeros_like(sets.density), where=of_box > 0.0)
+    own = sets.reached[np.arange(len(chain.boxes)), sets.of_box] if n else np.zeros(len(chain.boxes))
+    return {
+        "n_pairs": n_pairs,
+        "n_boxes": len(chain.boxes),
+        "outside": float(chain.out.sum()) / max(n_pairs, 1),
+        "unknown": chain.unknown,
+        "n_closed": sets.n_closed,
+        "eigenvalue": values.real,
+        "eigenvalue_imaginary": values.imag,
+        ROW_SIZE: n,
+        "is_closed": np.array([sets.n_closed > 1] * n, np.int8),
+        "measure": np.full(n, np.nan) if sets.n_closed > 1 else measures / max(measures.sum(), 1e-300),
+        "share": sets.reached.mean(axis=0) if n else np.zeros(0),
+        **{name: found.get(name, np.zeros(0)) for name in _REALS},
+        **{name: found.get(name, np.zeros((0, MOST_SETS))) for name in _PASSAGES},
+        N_POINTS: np.array([len(part) for part in order], np.int64),
+        "place": centres[boxes],
+        "density": density[boxes],
+        "committor": own[boxes],
+        "is_core": is_core[boxes],
+    }
+
+
+_UNITS = {"escape_rate": "1/step", "passage": "steps"}
+
+
+def _dataset(
+    cube: xr.Dataset,
+    dims: Sequence[str],
+    names: Sequence[str],
+    parts: Sequence[dict[str, Any]],
+    options: TransferOptions,
+) -> xr.Dataset:
+    shape = tuple(cube.sizes[d] for d in dims)
+    own_dims = {"eigenvalue": ("mode",), "eigenvalue_imaginary": ("mode",), "width": ("axis",)}
+    on_sets = ("is_closed", "measure", "share", *_REALS, N_POINTS)
+    on_boxes = ("density", "committor", "is_core")
+    variables: dict[str, Any] = {}
+    for name in parts[0]:
+        rows = [np.asarray(part[name]) for part in parts]
+        units = {"units": next((u for key, u in _UNITS.items() if name.startswith(key)), "1")}
+        if name in on_sets:
+            variables[name] = (SET, np.concatenate(rows), units)
+        elif name in _PASSAGES:
+            variables[name] = ((SET, "target"), np.concatenate(rows), units)
+        elif name in on_boxes:
+            variables[name] = (SAMPLE, np.concatenate(rows), units)
+        elif name == "place":
+            variables[name] = ((SAMPLE, "axis"), np.concatenate(rows), {})
+        else:
+            table = np.stack(rows).reshape(*shape, *rows[0].shape)
+            variables[name] = ((*dims, *own_dims.get(name, ())), table, units)
+    model = model_of(cube)
+    coords = coordinates_of(cube, dims) | {"axis": list(names)}
+    ds = xr.Dataset(variables, coords=coords)
+    ds = ds.assign_coords(axis_units=("axis", [model.state(name).unit for name in names]))
+    kept = ("model", "parameters", "noise", "title", "source")
+    about = {name: cube.attrs[name] for name in kept if name in cube.attrs}
+    return ds.assign_attrs({**about, "confidence": options.confidence, "core": options.core})
+
+
+def transfer_table(ds: xr.Dataset) -> Table:
+    """Return a row for each set of each parameter point: measure, share, escape, and passages to other sets."""
+    dims = [str(d) for d in ds[ROW_SIZE].dims]
+    rows, lines = [], []
+    for at, where in points_of(ds, dims):
+        one = ds.isel(at)
+        index = tuple(at[d] for d in dims)
+        here = list(_rows(ds, rows_at(ds)[index], where))
+        rows += here
+        head = ", ".join(f"{d} {v:g}" for d, v in where.items())
+        lines.append(f"{head}{': ' if head else ''}{_summary(one, len(here))}")
+        lines += aligned([_words(row) for row in here])
+    return Table(rows, lines)
+
+
+def _summary(one: xr.Dataset, n: int) -> str:
+    pairs, boxes, closed = (int(one[name]) for name in ("n_pairs", "n_boxes", "n_closed"))
+    text = f"{pairs} pairs in {boxes} boxes; "
+    if not n:
+        return f"{text}no set: every path leaves the grid or the sampled boxes"
+    text += f"{closed} closed sets" if closed > 1 else f"{n} almost invariant sets"
+    if np.isfinite(one["eigenvalue"].values[:2]).all() and closed < 2:
+        text += f", second eigenvalue {complex(one['eigenvalue'].values[1], one['eigenvalue_imaginary'].values[1]):.4g}"
+    for name, words in (("outside", "leave the grid"), ("unknown", "end in boxes that no pair leaves")):
+        if float(one[name]) > (MANY_UNKNOWN if name == "unknown" else 0.0):
+            text += f"; {100 * float(one[name]):.2g} % of pairs {words}"
+    return text
+
+
+def _rows(ds: xr.Dataset, here: range, where: Row) -> Iterator[Row]:
+    for k, i in enumerate(here):
+        row: Row = {**where, "set": letter(k), "boxes": int(ds[N_POINTS][i])}
+        row |= {name: float(ds[name][i]) for name in ("measure", "share", *_REALS)}
+        for j in range(len(here)):
+            if j != k:
+                row |= {f"{name}_{letter(j)}": float(ds[name][i, j]) for name in _PASSAGES}
+        yield row
+
+
+def _words(row: Row) -> Words:
+    words = {
+        "set": str(row["set"]),
+        "boxes": str(row["boxes"]),
+        "measure": number(row["measure"], ".4g"),
+        "share": number(row["share"], ".4g"),
+        "escape per step": with_interval(row, ("escape_rate", "escape_rate_low", "escape_rate_high"), ".3g"),
+        "coarser": number(row["escape_rate_coarse"], ".3g"),
+    }
+    for name in [name.removeprefix("passage_low_") for name in row if name.startswith("passage_low_")]:
+        if np.isfinite(row[f"passage_{name}"]):
+            ends = [f"passage{end}_{name}" for end in ("", "_low", "_high")]
+            words[f"steps to {name}"] = with_interval(row, ends, ".4g")
+            words["coarser "] = number(row[f"passage_coarse_{name}"], ".4g")
+    return words
