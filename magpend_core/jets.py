@@ -108,8 +108,8 @@ class Series:
             for _ in range(int(exponent)):
                 found = found * self
             return found
-        found = power(self, exponent)
-        return found
+        root: Series = power(self, exponent)
+        return root
 
     __radd__, __rmul__ = __add__, __mul__
 

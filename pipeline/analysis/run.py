@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import xarray as xr
@@ -42,3 +42,9 @@ class OpenRun(Protocol):
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of another analysis of this run, computed now or read if it is stored."""
+
+    def with_values(self, values: Sequence[float]) -> OpenRun:
+        """Return the run beside this one that has further values of the one swept parameter; compute what it lacks.
+
+        Without any values it is the run beside as it is, or this run if there is none.
+        """

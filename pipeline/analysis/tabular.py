@@ -171,6 +171,12 @@ def with_error(value: float, error: float, most: int = 6) -> str:
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
+def value_with_error(value: float, error: float) -> str:
+    """Format a value with its error, to the first digit of the error, with at most 12 decimals."""
+    digits = int(np.clip(np.ceil(-np.log10(error)), 0, 12))
+    return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.0e}"
+
+
 def axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
     """Format the axis values of some table rows as ranges, such as "1 to 1.4, 2 to 2.2"."""
     axis = ds[dim].values.astype(np.float64)

@@ -105,7 +105,10 @@ def check_target(path: str | None, option: str) -> None:
 
 def tell(table: Table, csv: str | None, as_json: str | None) -> None:
     """Print a table as text, CSV or JSON, and write it to the files that `csv` and `as_json` name."""
-    tell_data(json_rows(table), [table.csv().rstrip("\n")] if csv == PRINTED else table.lines, as_json)
+    from pipeline.layout.writing import json_value
+
+    data = json_rows(table) if table.graph is None else json_value(table.graph)
+    tell_data(data, [table.csv().rstrip("\n")] if csv == PRINTED else table.lines, as_json)
     if csv not in (None, "-"):
         from pipeline.layout.writing import write_atomically
 

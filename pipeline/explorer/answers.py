@@ -12,6 +12,7 @@ from typing import Any
 
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.diagram import diagram
+from pipeline.explorer.data.events import event_orbit, events
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import orbit
 from pipeline.explorer.data.overlays import attractors, branches, curves, disturbances
@@ -29,7 +30,7 @@ from pipeline.store.run import RunDirectory
 
 LOG = logging.getLogger(__name__)
 
-_AT, _NUMBERS = "at.", ("cell", "point", "curve")
+_AT, _NUMBERS = "at.", ("cell", "point", "curve", "event")
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ ANSWERS: dict[str, Answer] = {
         Answer("diagram", _diagram, ("x", "y", "at")),
         Answer("curves", curves, ("x", "at")),
         Answer("branches", branches, ("x", "y", "at")),
+        Answer("events", events, ("x", "at")),
+        Answer("event-orbit", event_orbit, ("x", "at", "event"), integrates=True),
         Answer("attractors", attractors, ("at",)),
         Answer("disturbances", disturbances, ("at",)),
         Answer("orbit", _orbit, integrates=True),

@@ -20,6 +20,7 @@ _FLIPPED = ("jump_rises", "rises_before", "rises_after", "rises")
 _ERRORS = {
     "bracket": "value",
     "value_error": "value",
+    "jump_value_error": "jump_value",
     "deviation": "value",
     "special_first_error": "special_first",
     "special_second_error": "special_second",

@@ -52,6 +52,14 @@ class AttractorOptions(IdentifyOptions):
     )
 
 
+class HysteresisOptions(Options):
+    """Options for finding hysteresis."""
+
+    events: bool = option(
+        False, "Name the events at which branches fall off an attractor; follows branches, as analyse events does."
+    )
+
+
 IDENTIFIED = Analysis(
     "identified",
     "Find the attractors of each parameter point on its own.",
@@ -78,11 +86,11 @@ ATTRACTORS = Analysis(
 HYSTERESIS = Analysis(
     "hysteresis",
     "List where a continuation follows different attractors upwards and downwards, and where it jumps.",
-    Options,
+    HysteresisOptions,
     compute="pipeline.analysis.attractors.hysteresis:hysteresis",
     table="pipeline.analysis.attractors.hysteresis:hysteresis_table",
     needs="pipeline.analysis.attractors.hysteresis:needs_directions",
-    builds_on=("attractors",),
+    builds_on=("attractors", "events"),
     figure="attractors",
 )
 

@@ -12,6 +12,12 @@ class EventOptions(BranchOptions):
     """Options for naming the events of attractors."""
 
     at: dict[str, float] = option({}, "Value of a further axis of the run.")
+    refine: float = option(
+        0.0,
+        "Interval in which an event may stay undecided, in the unit of the swept parameter. Further values are run "
+        "in DIR-refined until all are as short; 0 runs none.",
+        ge=0.0,
+    )
 
 
 EVENTS = Analysis(
@@ -28,4 +34,5 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
+    version=3,
 )

@@ -151,11 +151,14 @@ class Table:
         Lines to print.
     nothing : str
         Reason for an empty result, if that is an error of the command; else empty.
+    graph : dict, optional
+        Node-link data that take the place of the rows in JSON.
     """
 
     rows: Sequence[Mapping[str, Any]]
     lines: Sequence[str]
     nothing: str = ""
+    graph: Mapping[str, Any] | None = None
 
     def csv(self) -> str:
         """Return the table's rows as CSV text, with NaN as empty fields."""

@@ -10,11 +10,13 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.analysis.events.names import RANGE_END
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.layout.conventions import shown_unit
@@ -75,6 +77,7 @@ SHOWN = {
     "attractors": ("Attractors", ""),
     "hysteresis": ("Hysteresis", "Jumps of the branches: the parameter values, and the attractors before and after"),
     "basins": ("Basins", "Attractors on which the initial states of the grid end"),
+    "events": ("Events", "Where attractors begin, change and end"),
     "branches": ("Bifurcations", "Located bifurcations"),
     "curves": ("Curves of bifurcations", "Points of codimension two on the curves of bifurcations"),
     "orbits": ("Periodic orbits", "All periodic orbits found at a parameter point, stable or not"),
@@ -303,6 +306,8 @@ def _suits(shown: Shown, name: str) -> bool:
     if name == "basins":
         return sum(map(is_grid_dim, shown.starts)) >= 2
     known = name in shown.computed or bool(stored_options(shown.run, name))
+    if name == "events" and len(_long_axes(shown)) == 1:
+        return True
     return known or name in ("branches", "chaos") or (name == "spectrum" and bool(shown.computed))
 
 
@@ -342,11 +347,13 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     unit = shown_unit(found[path].attrs) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
     rows = [_with_letters(row, axis) for row in shown_table(name, found).rows]
+    if name == "events":
+        rows = [{"event": row["sentence"], "evidence": row["evidence"]} for row in rows if row["what"] != RANGE_END]
     # the settled options, so that a page made from the stored result is the same
     options = settled_options(name, found.attrs)
     command = command_of(f"analyse {name}", options, shown.directory)
     if rows:
-        yield grid_of(rows, SHOWN[name][1], command)
+        yield replace(grid_of(rows, SHOWN[name][1], command), stacked=name == "events")
     else:
         yield Note("Nothing of this kind was found.", command)
     drawn = ANALYSES[name].figure

@@ -22,7 +22,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +32,7 @@ from pipeline.layout.own_words import in_own_words, rate_attribute
 from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.product import Analysis, Options, Table, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
+from pipeline.runs.extend import refine
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
 from pipeline.runs.versions import OF_ATTRACTORS, attractor_options, current, key_of
@@ -87,6 +88,18 @@ class AnalysedRun(RunDirectory):
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of an analysis of this run, computed now or read if it is stored."""
         return derive(self, name, options)
+
+    def with_values(self, values: Sequence[float]) -> AnalysedRun:
+        """Return the run beside this one that has further values of the swept parameter, see `extend.refine`; its
+        attractors are sought with the same options.
+        """
+        beside = refine(self, values, workers=self.workers, where=self.where, echo=self.echo)
+        if beside is self:
+            return self
+        found = AnalysedRun.of(beside, self.echo, workers=self.workers, where=self.where)
+        if attractor_options(found) != attractor_options(self):
+            _keep(found, attractor_options(self))
+        return found
 
 
 def derive(

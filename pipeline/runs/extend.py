@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pipeline.layout.cells import CellMap
 from pipeline.layout.evaluation import check_starts, with_sizes
@@ -29,11 +32,15 @@ from pipeline.runs.zoom import Widening, derived_toml, widened
 from pipeline.specification.files import find_spec
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
+from pipeline.specification.tables import FREQUENCY, RATES
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files
 from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import is_run
+
+if TYPE_CHECKING:
+    from pipeline.compute.clients import Where
 
 
 @dataclass(frozen=True)
@@ -294,6 +301,110 @@ def _record(extension: Extension, files: Files) -> None:
         "reused": sum(taken.values()),
     }
     files.write(EXTENDED, canonical(content).encode())
+
+
+# ---- further values ----------------------------------------------------------------------------
+
+
+def refine(
+    source: str | Path | RunDirectory,
+    values: Sequence[float],
+    *,
+    workers: int | None = None,
+    where: Where | None = None,
+    echo: Echo = print,
+) -> RunDirectory:
+    """Return the run beside a run that also has further values of its swept parameter, and compute what that lacks.
+
+    The run beside has the name ``NAME-refined``, the specification of the run with all further values so far, and the
+    bytes that a run of this specification from nothing has. Cells are copied where that is possible: in a continuation
+    up to the first further value. If it is killed at any moment, the next call completes it.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run; it is only read.
+    values
+        Further values, a frequency in Hz. Without any, the result is the run beside as it is, completed; the run itself
+        if there is none.
+    workers, where, echo
+        See `pipeline.runs.run.carry_out`.
+
+    Raises
+    ------
+    SpecError
+        If the run does not sweep one parameter alone.
+    RefusedError
+        If ``NAME-refined`` exists and is another run.
+    """
+    run = RunDirectory.open(source)
+    place = _place_of_further(run)
+    ((key, axis),) = run.spec.axes.items()
+    _finish_exchange(place, echo)
+    own = axis.given()
+    how: dict[str, Any] = {"workers": workers, "where": where, "echo": echo}
+    more = RATES[run.spec.rate].given(np.array(values)) if key == FREQUENCY else np.array(values)
+    if not is_run(open_files(place)):
+        return _refined(run, np.union1d(own, more), place, (), **how) if len(more) else run
+    old = RunDirectory.open(place)
+    had = old.spec.axes[key].given()
+    if not set(own.tolist()) <= set(had.tolist()) or _but_axes(old.spec) != _but_axes(run.spec):
+        raise RefusedError(f"{place}: exists, and is not {run.name} with further values of {key}; move it away.")
+    if not old.complete:
+        old = _refined(run, had, place, (), **how)
+    wanted = np.union1d(had, more)
+    if len(wanted) == len(had):
+        return old
+    aside = _aside(place)
+    _refined(run, wanted, _beside(place), (old,), **how)
+    _exchange(place, _beside(place), lambda line: None)
+    shutil.rmtree(aside)
+    return RunDirectory.open(place)
+
+
+def _place_of_further(run: RunDirectory) -> Path:
+    """Return the folder of a run's further values; raise SpecError or RefusedError if it can have none."""
+    if len(run.spec.axes) != 1:
+        raise SpecError(
+            f"{run.name}: sweeps {', '.join(run.spec.axes) or 'nothing'}, and further values are those of one swept "
+            "parameter; make a run that sweeps one: magpend zoom."
+        )
+    if run.info.files.local is None:
+        raise RefusedError(f"{run.name}: further values are run in a folder beside it; copy the run to this machine.")
+    folder = run.info.files.local.resolve()
+    return folder.with_name(f"{folder.name}-refined")
+
+
+def _but_axes(spec: Spec) -> Mapping[str, Any]:
+    return {name: table for name, table in spec.as_dict().items() if name != "axes"}
+
+
+def _refined(
+    run: RunDirectory,
+    values: np.ndarray,
+    place: Path,
+    others: Sequence[RunDirectory],
+    *,
+    workers: int | None,
+    where: Where | None,
+    echo: Echo,
+) -> RunDirectory:
+    """Compute a run with other values of its swept parameter in a folder; cells of the run and of others are copied."""
+    from pipeline.compute.clients import Where
+
+    (key,) = run.spec.axes
+    word = run.spec.rate if key == FREQUENCY else key
+    spec = widened(run.spec, Widening({word: {"values": values.tolist()}}))
+    text = derived_toml("Refined", f"run {run.info.name}, digest {run.info.digest}", spec)
+    identity = identity_here(spec, make_plan(spec))
+    files = open_files(place)
+    if is_run(files) and RunDirectory.open(files).info.digest != digest_of(identity):
+        shutil.rmtree(place)  # left by a refinement that was killed
+    fitting, _ = _fitting([*others, run], spec, identity)
+    sources = [(one.info.files.place, one.info.digest) for one in fitting]
+    there = replace(where or Where(), place=files.place)
+    carry_out(spec, text, files, workers=workers, where=there, echo=echo, sources=sources)
+    return RunDirectory.open(place)
 
 
 # ---- in place ----------------------------------------------------------------------------------

@@ -14,8 +14,11 @@ import xarray as xr
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Words, aligned, counted, unit_of, values
-from pipeline.products.product import Options, Table
+from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, unit_of, value_with_error, values, words_of
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import parameter_name
+from pipeline.products.attractors import HysteresisOptions
+from pipeline.products.product import Table
 
 
 def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
@@ -82,7 +85,7 @@ def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     along = ids[path].values if path in ids.coords else np.arange(ids.sizes[path])
     return (
         result.assign(_loops(present, differs, along, order, ids))
-        .assign(_jumps(values, direction, along))
+        .assign(_jumps(values, direction, along, str(ids[path].attrs.get("units", "1")) if path in ids.coords else "1"))
         .transpose(*dims, ...)
         .assign_attrs(path=path)
     )
@@ -113,7 +116,7 @@ def _loops(
     n = present.shape[-1]
 
     def counts(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.array([(a[i][s:e] & ~b[i][s:e]).sum(axis=0) for i, s, e in rows], np.int64).reshape(-1, n)
+        return np.array([(a[i][s:e] & ~b[i][s:e]).sum(axis=0) for i, s, e in rows], np.int64).reshape(len(rows), n)
 
     units = {"units": ids[order[-1]].attrs.get("units", "1")} if order[-1] in ids.coords else {"units": "1"}
     loops: dict[str, Any] = {
@@ -145,7 +148,7 @@ def _loops(
     return loops
 
 
-def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict[str, Any]:
+def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray, unit: str) -> dict[str, Any]:
     found: dict[tuple[int, int, int, int, int], int] = {}
     for index in np.ndindex(*values.shape[:-2]):
         for branch, word in enumerate(direction):
@@ -168,24 +171,68 @@ def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict
         "jump_to_id": (rows[:, 4].astype(np.int32), "attractor after"),
         "jump_count": (counts, "branches"),
     }
-    return {name: ("jump", data, {"units": "1", "long_name": text}) for name, (data, text) in texts.items()}
+    units = {"jump_from": unit, "jump_to": unit}
+    return {
+        name: ("jump", data, {"units": units.get(name, "1"), "long_name": text}) for name, (data, text) in texts.items()
+    }
 
 
-def needs_directions(run: OpenRun, options: Options) -> None:
+def needs_directions(run: OpenRun, options: HysteresisOptions) -> None:
     """Raise ValueError unless the run is a continuation both up and down its parameter."""
     check_directions(run.cube())
+    if options.events and len(run.spec.axes) > 1:
+        raise ValueError(f"--events: events lie along one parameter, and the run sweeps {', '.join(run.spec.axes)}.")
 
 
-def hysteresis(run: OpenRun, options: Options) -> xr.Dataset:
-    """Compute the hysteresis loops of a run and the jumps between its attractors."""
-    return find_hysteresis(run.cube(), run.derive("attractors"))
+def hysteresis(run: OpenRun, options: HysteresisOptions) -> xr.Dataset:
+    """Compute the hysteresis loops of a run and the jumps between its attractors, with their events if asked for."""
+    found = find_hysteresis(run.cube(), run.derive("attractors"))
+    if not options.events:
+        return found
+    return with_events(found, run.derive("events", parameter=parameter_name(found.attrs["path"])))
+
+
+def with_events(ds: xr.Dataset, events: xr.Dataset) -> xr.Dataset:
+    """Add to each jump the event at which its attractor ends: where branches fall off.
+
+    Parameters
+    ----------
+    ds
+        Result of `find_hysteresis`.
+    events
+        Result of the analysis ``events`` along its path.
+
+    Returns
+    -------
+    Dataset
+        With ``jump_event`` (number of the event), ``jump_what`` (its name), ``jump_value`` and ``jump_value_error``
+        (its parameter value). If the attractor does not end between the two values of a jump, the number is -1 and the
+        name ``none``: branches leave an attractor that others stay on, or that goes on in another stretch.
+    """
+    rises, ids, ends = (events[name].values for name in ("rises", "attractor", "seen"))
+    jumps = zip(*(ds[f"jump_{name}"].values for name in ("direction", "from_id", "from")), strict=True)
+    numbers = []
+    for direction, i, x in jumps:
+        own = np.flatnonzero((rises == (direction > 0)) & (ids == i) & (ends == x))
+        numbers.append(int(own[0]) if own.size else -1)
+    known = np.array(numbers, np.int64)
+    names = words_of(events["what"])
+    columns = {"what": np.where(known >= 0, events["what"].values[known] + 1, 0) if len(events["what"]) else known + 1}
+    for name in ("value", "value_error"):
+        columns[name] = np.append(events[name].values, np.nan)[known]
+    added: dict[str, Any] = {f"jump_{name}": ("jump", column) for name, column in columns.items()}
+    found = ds.assign({"jump_event": ("jump", known), **added})
+    found["jump_what"].attrs = {"long_name": "event at which the attractor ends", **code_flags(["none", *names])}
+    for name in ("jump_value", "jump_value_error"):
+        found[name].attrs = {"units": events["value"].attrs["units"], "long_name": "parameter value of the event"}
+    return found
 
 
 def hysteresis_table(ds: xr.Dataset) -> Table:
     """Return the table of hysteresis. It has one row per kind of jump between two attractors, and text lines about the
     loops.
     """
-    names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
+    names = [f"jump_{name}" for name in ("from", "to", "from_id", "to_id", "count", "what", "value", "value_error")]
     jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
     rows = [
         {"direction": "up" if one["jump_direction"] > 0 else "down"}
@@ -201,6 +248,7 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
             "to": f"{r['to']:g}",
             "ids": f"{r['from_id']} -> {r['to_id']}",
             "branches": str(r["count"]),
+            "event": _event_words(r) if "what" in r else None,
         }
         for r in rows
     ]
@@ -211,6 +259,12 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
         *aligned(words),
     ]
     return Table(rows, lines)
+
+
+def _event_words(row: Row) -> str:
+    if not np.isfinite(row["value"]):
+        return plain(row["what"])
+    return f"{plain(row['what'])} at {value_with_error(row['value'], row['value_error'])}"
 
 
 def _loop_words(loop: xr.Dataset, unit: str) -> Words:

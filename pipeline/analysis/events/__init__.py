@@ -12,8 +12,9 @@ orbit.
 
 Schema
 ------
-Dims ``event``, ``outcome``, ``doubling`` and ``stretch``: neighbouring parameter values at which an attractor has one
-kind and period.
+Dims ``event``, ``outcome``, ``doubling``, ``stretch`` (neighbouring parameter values at which an attractor has one kind
+and period) and ``end``: the first and the last value of a stretch. Stretches are the nodes of a graph, whose edges are
+the events: ``stretch_of`` leads to each ``to_stretch``.
 
 ============================== ================= ==========================================================
 variable                       dims              meaning
@@ -33,6 +34,9 @@ variable                       dims              meaning
 ``n_cells``                    event             cells of the attractor at ``seen``
 ``to_attractor``, ``to_cells`` event, outcome    ids on which they end at ``beyond`` (-1: none, -2: they
                                                  diverge), with their numbers, the largest first
+``stretch_of``                 event             stretch that ends
+``stretch_after``              event             stretch of the same attractor beyond a change; -1 none
+``to_stretch``                 event, outcome    stretches on which the cells go on; -1 none, -2 they diverge
 ``doublings``, ``ratio``       event, doubling   of a cascade: doublings, and the ratio of the last intervals
 ``met_period``, ``exponent``,  event             of a crisis: period of the unstable orbit that is met, exponent of
 ``exponent_error``                               the mean lifetimes beyond
@@ -41,5 +45,8 @@ variable                       dims              meaning
 ``evidence``                   event             what decided the event, or what was tried
 ``stretch_attractor``, ...     stretch           ``_set``, ``_period``, ``_low``, ``_high``: the range, up to
                                                  its events where they are decided
+``stretch_side``               stretch, end      class of motion, if the model has a classifier
+``stretch_fraction``,          stretch, end      basin fraction with its 95 % interval; NaN in continuations
+``_low``, ``_high``
 ============================== ================= ==========================================================
 """

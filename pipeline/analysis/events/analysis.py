@@ -16,10 +16,12 @@ from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises, Crisis
+from pipeline.analysis.events.graph import at_ends
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.events.names import CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
-from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, select_points, start_dims
@@ -75,6 +77,8 @@ def needs_one_axis(run: OpenRun, options: EventOptions) -> None:
 
 def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     """Name the events at the ends of all attractors of a run along a parameter."""
+    if options.refine:
+        return refined(run, options)
     found, axis = run.derive("attractors"), axis_name(options.parameter)
     located = run.derive("branches", **options.part(BranchOptions))
     part = choose(found, options.at, (axis, *start_dims(found)), f"events lie along {parameter_name(axis)}")
@@ -217,7 +221,7 @@ def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -
     """
     ds = scene.attractors
     ids = outcomes(ds).transpose(scene.axis, ...).values[scene.order]
-    here = np.isin(ids[place], [i for (p, i), name in scene.names.items() if (p, name) == (place, attractor)])
+    here = np.isin(ids[place], scene.ids_of(attractor, place))
     if "direction" in ds.coords and start_dims(ds) == ["branch"]:
         here &= ds["direction"].values == ("up" if rises else "down")
     counts = Counter(scene.names.get((beyond, i), i) for i in ids[beyond][here].tolist())
@@ -357,9 +361,20 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
     doublings = [one.born.doublings if one.born else () for one in named]
     variables["to_attractor"] = (("event", "outcome"), _padded(to[0], -1).astype(int), {"long_name": "ids beyond"})
     variables["to_cells"] = (("event", "outcome"), _padded(to[1], 0).astype(int), {"long_name": "their cells"})
+    ends = [_stretches_beyond(stretches, one, b) for one, b in zip(named, beyond, strict=True)]
+    variables["to_stretch"] = (("event", "outcome"), _padded(ends, -1).astype(int), {"long_name": "their stretches"})
+    after = [stretches.index(one.after) if one.after else -1 for one in named]
+    variables["stretch_of"] = ("event", np.array([stretches.index(one.stretch) for one in named], int))
+    variables["stretch_after"] = ("event", np.array(after, int))
     variables["doublings"] = (("event", "doubling"), _padded(doublings, np.nan), unit)
     kept = {name: located.attrs[name] for name in ("parameter", "parameter_units", "model") if name in located.attrs}
     return xr.Dataset(variables | _bars(scene, stretches, named), attrs=kept)
+
+
+def _stretches_beyond(stretches: Sequence[Stretch], event: Event, beyond: int) -> list[int]:
+    """Return the stretches on which the cells of an event go on; -1 none, -2 they diverge."""
+    there = {one.attractor: k for k, one in enumerate(stretches) if one.places[0] <= beyond <= one.places[1]}
+    return [DIVERGED if i == DIVERGED else there.get(i, -1) for i in event.to]
 
 
 def _padded(rows: Sequence[Sequence[float]], fill: float) -> np.ndarray:
@@ -391,7 +406,11 @@ def _bars(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) ->
         "low": ([end(one, False) for one in stretches], unit),
         "high": ([end(one, True) for one in stretches], unit),
     }
-    return {f"stretch_{name}": ("stretch", np.array(found), attrs) for name, (found, attrs) in columns.items()}
+    bars: dict[str, object] = {
+        f"stretch_{name}": ("stretch", np.array(found), attrs) for name, (found, attrs) in columns.items()
+    }
+    places = [[(place, scene.ids_of(one.attractor, place)) for place in one.places] for one in stretches]
+    return bars | at_ends(scene.attractors, scene.axis, scene.order, [one.rows for one in stretches], places)
 
 
 def _is_own(ds: xr.Dataset, fate: Fate) -> int:

@@ -61,3 +61,7 @@ class Scene:
     def scale(self) -> float:
         """Length of the axis."""
         return float(np.ptp(self.along))
+
+    def ids_of(self, attractor: int, place: int) -> list[int]:
+        """Return the ids that an attractor has at a place."""
+        return [i for (p, i), name in self.names.items() if (p, name) == (place, attractor)]

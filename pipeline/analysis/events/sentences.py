@@ -6,9 +6,20 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
+from pipeline.analysis.events.graph import graph_of
 from pipeline.analysis.events.names import BANDS, BOUNDARY, CASCADE, CRISES, LIVES_ON, RANGE_END, TWINS, UNDECIDED
 from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.tabular import MOST_ROWS, Row, counted, plain, values
+from pipeline.analysis.tabular import (
+    MOST_ROWS,
+    Row,
+    Words,
+    aligned,
+    counted,
+    plain,
+    value_with_error,
+    values,
+    with_interval,
+)
 from pipeline.layout.vocabulary import letter, parameter_name
 from pipeline.products.product import Table
 
@@ -25,7 +36,8 @@ def events_table(ds: xr.Dataset) -> Table:
     """Return the table of events: a row for each, with its sentence and evidence.
 
     ``value`` and ``value_error`` have the unit of the swept parameter; ``seen`` and ``beyond`` are the values of the
-    run between which cells leave the attractor, ``to_attractor`` is the id on which most of them go on.
+    run between which cells leave the attractor, ``to_attractor`` is the id on which most of them go on. In JSON the
+    table is a graph, see `pipeline.analysis.events.graph`.
     """
     rows = [_row(ds, k) for k in range(ds.sizes["event"])]
     own = [row for row in rows if row["what"] not in (RANGE_END, LIVES_ON)]
@@ -39,7 +51,33 @@ def events_table(ds: xr.Dataset) -> Table:
     for end in dict.fromkeys(x for x, _ in bounds):
         ids = ", ".join(letter(i) for x, i in bounds if x == end)
         lines.append(f"the range ends at {parameter_name(str(ds.attrs['parameter']))} = {end:.10g}: {ids}")
-    return Table(rows, lines, "" if rows else "no cell ends on an attractor")
+    if ds.attrs.get("refined"):
+        more = f"{counted(int(ds.attrs['n_further']), 'further value')} of {parameter_name(str(ds.attrs['parameter']))}"
+        lines.append(f"rests on {more} in {ds.attrs['refined']}, whose letters these are")
+    graph = graph_of(ds, rows)
+    nodes = [node for node in graph["nodes"] if "attractor" in node]
+    length = max(node["high"] for node in nodes) - min(node["low"] for node in nodes) if nodes else 1.0
+    digits = int(9 - np.floor(np.log10(length or 1.0)))
+    lines += aligned([_node_words(node, str(ds.attrs["parameter_units"]), digits) for node in nodes[:MOST_ROWS]])
+    return Table(rows, lines, "" if rows else "no cell ends on an attractor", graph)
+
+
+def _node_words(node: Row, unit: str, digits: int) -> Words:
+    """Return a line on an attractor: where it lives, and its basin fractions at both ends."""
+    words = {"attractor": f"{node['name']} ({_own(node)})"}
+    for end, head in (("low", "from"), ("high", "to")):
+        words[head + ("" if unit == "1" else f" {unit}")] = f"{round(node[end], digits) + 0.0:.10g}"
+    for end, head in (("low", "first"), ("high", "last")):
+        if f"{end}_side" in node:
+            words[f"{head} side"] = plain(node[f"{end}_side"])
+        if f"{end}_fraction" in node:
+            names = [f"{end}_fraction{name}" for name in ("", "_low", "_high")]
+            words[f"{head} fraction"] = with_interval(node, names, ".4f")
+    return words
+
+
+def _own(row: Row) -> str:
+    return f"period {row['period']}" if row["period"] else plain(row["set"])
 
 
 def _row(ds: xr.Dataset, k: int) -> Row:
@@ -55,7 +93,7 @@ def _row(ds: xr.Dataset, k: int) -> Row:
 def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[float]) -> str:
     name, unit = parameter_name(str(ds.attrs["parameter"])), str(ds.attrs["parameter_units"])
     unit = "" if unit == "1" else f" {unit}"
-    own, way = f"period {row['period']}" if row["period"] else plain(row["set"]), "rises" if row["rises"] else "falls"
+    own, way = _own(row), "rises" if row["rises"] else "falls"
     who, seen, beyond = f"{letter(row['attractor'])} ({own})", row["seen"], row["beyond"]
     cells = f"; {_going_on(row['attractor'], to)}" if to else ""
     if row["what"] == RANGE_END:
@@ -65,7 +103,7 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
     if row["what"] == UNDECIDED:
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
-    at = f"{name} = {_with_error(row['value'], row['value_error'])}{unit}"
+    at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
     if row["period_after"] >= 0 and row["what"] in CRISES:
         return f"{who} changes at {at} as it {way}: {_crisis(row)}"
     if row["period_after"] >= 0:
@@ -127,9 +165,3 @@ def _going_on(attractor: int, to: dict[int, int]) -> str:
     if len(parts) == 1:
         return f"its cells {parts[0][0]}"
     return "of its cells " + ", ".join(f"{n} {text}" for text, n in parts)
-
-
-def _with_error(value: float, error: float) -> str:
-    """Format a value with its error, to the digit of the error."""
-    digits = int(np.clip(np.ceil(-np.log10(error)), 0, 12))
-    return f"{round(value, digits) + 0.0:.{digits}f} ± {error:.0e}"

@@ -80,6 +80,7 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
     known = {
         "curves": True,
         "branches": view["has"]["branches"],
+        "events": view["has"]["events"],
         "attractors": view["has"]["attractors"],
         "disturbances": bool(run.kept_each("resilience") or run.kept_each("edge")),
     }

@@ -115,14 +115,20 @@ def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
     source = explored if explored.curves is None else ExploredRun.of(explored.curves)
     parameters, clock_hz = _parameters_at(source, found.isel(curve=curve, point=point))
     state, period = found["section"].values[curve, point], int(found["orbit_period"][curve])
-    ends = section_map(parameters.pack()[None], np.array([clock_hz]), state[None], period, system=source.model.system)
+    return packed_orbit(source, parameters, clock_hz, state, period, NAMES[CURVE_KINDS[int(found["kind"][curve])]])
+
+
+def packed_orbit(
+    run: ExploredRun, parameters: Parameters, clock_hz: float, state: np.ndarray, period: int, kind: str
+) -> bytes:
+    """Integrate the orbit at a bifurcation; return it packed for the page."""
+    ends = section_map(parameters.pack()[None], np.array([clock_hz]), state[None], period, system=run.model.system)
     seconds = np.cumsum(ends.times[0])
     multipliers = np.linalg.eigvals(ends.derivatives[0])
     arrays = orbit_series(parameters, clock_hz, state, period, float(seconds[-1]), rtol=TOLERANCE, atol=TOLERANCE)
     images = np.concatenate([state[None], ends.images[0, : period - 1]])
     arrays = {**arrays, "section": images, "section_times": np.concatenate([[0.0], seconds])}
-    kind = NAMES[CURVE_KINDS[int(found["kind"][curve])]]
-    return pack_arrays(arrays, _attrs(source, parameters, clock_hz, period, multipliers, kind))
+    return pack_arrays(arrays, _attrs(run, parameters, clock_hz, period, multipliers, kind))
 
 
 def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float]:
@@ -136,7 +142,7 @@ def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float
 def _attrs(
     run: ExploredRun, parameters: Parameters, clock_hz: float, period: int, multipliers: np.ndarray, kind: str
 ) -> dict[str, Any]:
-    """Return what the page shows beside the orbit at a point of a bifurcation curve."""
+    """Return what the page shows beside the orbit at a bifurcation."""
     unknown = dict.fromkeys(
         ("cell", "at", "motion", "attractor", "share", "low", "high", "stability", "evidence", "exponents", "start")
     )
@@ -145,7 +151,7 @@ def _attrs(
         "parameters": parameters.as_dict(),
         "frequency": clock_hz if run.model.clock_hz is None else None,
         "status": "periodic",
-        "status_meaning": f"an orbit on a curve of bifurcations: {kind}",
+        "status_meaning": f"an orbit at a bifurcation: {kind}",
         "kind": f"{kind}, period {period}",
         "stable": None,
         "multipliers": parts_of(multipliers),

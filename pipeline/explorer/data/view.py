@@ -212,6 +212,7 @@ def _has(run: ExploredRun) -> dict[str, bool]:
         "attractors": run.kept("attractors") is not None,
         "branches": run.kept("branches") is not None,
         "curves": run.bifurcation_curves() is not None,
+        "events": bool(run.kept_each("events")),
         "basins": run.kept("basins") is not None,
         "lyapunov": any(str(n).startswith("lyapunov") for n in run.cube().data_vars) or run.kept("chaos") is not None,
         "drawing": run.model.drawing is not None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -83,6 +83,32 @@ class DatasetAccessor:
         from magpend._runs import table
 
         return table(self._ds)
+
+    def graph(self) -> dict[str, Any]:
+        """Return the events of attractors as a graph, as ``magpend analyse events --json`` writes it.
+
+        Returns
+        -------
+        dict
+            Node-link data: ``nodes`` are attractors with one kind and period, with their range and basin fractions;
+            ``edges`` are events, each with its ``sentence``.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is not the result of `magpend.events`.
+
+        Examples
+        --------
+        >>> networkx.node_link_graph(run.events().magpend.graph(), edges="edges")         # doctest: +SKIP
+        """
+        from magpend._runs import shown
+        from pipeline.layout.writing import json_value
+
+        graph = shown(self._ds).graph
+        if graph is None:
+            raise ValueError("ds.magpend.graph: the Dataset is not the result of events.")
+        return dict(json_value(graph))
 
     def sets(self) -> xr.Dataset:
         """Return the sets of a result that has one row for each set at each parameter point.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from magpend._methods import AnalysisMethod
-from pipeline.products.attractors import AttractorOptions
+from pipeline.products.attractors import AttractorOptions, HysteresisOptions
 from pipeline.products.backbone import BackboneOptions
 from pipeline.products.basins import BasinOptions
 from pipeline.products.branches import (
@@ -22,7 +22,7 @@ from pipeline.products.chaos import ChaosOptions, DimensionOptions
 from pipeline.products.events import EventOptions
 from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.noise import DensityOptions, EscapeOptions
-from pipeline.products.product import Options
+from pipeline.products.product import Options, Table
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
@@ -75,7 +75,7 @@ class Run(RunDirectory):
 
     attractors = AnalysisMethod(AttractorOptions)
     basins = AnalysisMethod(BasinOptions)
-    hysteresis = AnalysisMethod(Options)
+    hysteresis = AnalysisMethod(HysteresisOptions)
     settling = AnalysisMethod(Options)
     chaos = AnalysisMethod(ChaosOptions)
     dimension = AnalysisMethod(DimensionOptions)
@@ -497,11 +497,16 @@ def table(found: xr.Dataset) -> pd.DataFrame:
     """
     import pandas as pd
 
+    return pd.DataFrame(shown(found).rows)
+
+
+def shown(found: xr.Dataset) -> Table:
+    """Return the table of an analysis' result; raise ValueError if the Dataset is none of an analysis with a table."""
     name = str(found.attrs.get("derived_product", ""))
     if name not in ANALYSES or not ANALYSES[name].table:
         known = ", ".join(key for key, analysis in ANALYSES.items() if analysis.table)
         raise ValueError(f"the Dataset is not the result of an analysis that has a table ({known}).")
-    return pd.DataFrame(shown_table(name, found).rows)
+    return shown_table(name, found)
 
 
 def _tree_of(run: Run, chunks: Any, check: bool | None) -> xr.DataTree:

@@ -3,7 +3,7 @@
 /** What is kept in the address. */
 export const KEPT = ["x", "y", "at", "colour", "window", "selected", "plane", "panel", "overlays", "hidden"];
 
-const OVERLAYS = ["branches", "exponents", "fractions"];
+const OVERLAYS = ["branches", "events", "exponents", "fractions"];
 
 /** Name of the colouring in which all points are alike. */
 export const ONE = "one";
@@ -19,8 +19,8 @@ export function defaults(view) {
   const path = view.axes.find((axis) => axis.path) ?? view.axes[0];
   return {
     x: path?.name ?? null, y: view.verticals[0].name, at: atFor(view, path?.name, {}), colour: firstColour(view),
-    window: null, selected: null, curvePoint: null, plane: null, panel: null, hidden: {},
-    overlays: { branches: view.has.branches, exponents: view.has.lyapunov, fractions: view.has.attractors },
+    window: null, selected: null, curvePoint: null, eventPoint: null, plane: null, panel: null, hidden: {},
+    overlays: { branches: view.has.branches, events: Boolean(view.has.events), exponents: view.has.lyapunov, fractions: view.has.attractors },
   };
 }
 

@@ -4,6 +4,7 @@ import { defaults, fromAddress, keepAddress } from "./address.js";
 import { told } from "./axes.js";
 import { Curves } from "./curves.js";
 import { Diagram } from "./diagram.js";
+import { Events } from "./events.js";
 import { el } from "./dom.js";
 import { scaled } from "./gestures.js";
 import { Legend } from "./legend.js";
@@ -91,6 +92,7 @@ function build(source, host, view, messages, page) {
   };
   const diagram = new Diagram(state, source, view, reader, host.wheelAlways);
   const curves = new Curves(state, source, view, diagram, reader);
+  const events = new Events(state, source, view, diagram, reader);
   const doing = doings({ state, source, view, diagram, curves, messages });
   const toolbar = new Toolbar(state, view, source.formats ?? ["csv"], doing);
   toolbar.curves = curves;
@@ -98,14 +100,14 @@ function build(source, host, view, messages, page) {
   if (source.notice) messages.note(source.notice);
   else if (view.cells.pending) messages.note(pendingOf(view), () => host.reload());
   const plane = new ParameterPlane(state, source, view), dark = themeSwitch();
-  const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, curves.element, plane.element, messages.facts);
+  const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, events.element, curves.element, plane.element, messages.facts);
   const right = el("div", { class: "side-column" });
   const layout = el("div", { class: "layout" }, left, right);
   root.replaceChildren(
     header(view, toolbar.helpButton, dark.element), messages.banner, messages.notes, messages.progress, tabs(state, root, left, right), layout, messages.line,
   );
   const panels = mountPanels(state, source, right, view);
-  page.ends.push(keepAddress(state, view, host.place), dark.forget, ...[diagram, curves, toolbar, legend, plane, panels].map((part) => () => part.destroy()));
+  page.ends.push(keepAddress(state, view, host.place), dark.forget, ...[diagram, events, curves, toolbar, legend, plane, panels].map((part) => () => part.destroy()));
   host.shown(Object.assign(page, { state, source, diagram }));
   diagram.load();
 }

@@ -259,6 +259,7 @@ export class Diagram {
     }
     ctx.restore();
     paintFrame(ctx, box, colours);
+    this.events?.paint(ctx, box, this.window, colours);
   }
 
   axes() {
@@ -358,10 +359,11 @@ export class Diagram {
     this.hovered = found;
     this.repaintUpper();
     const special = place && this.branches ? bifurcationAt(this.box, this.window, this.branches.points, ...place) : null;
-    this.tip.hidden = !found && !special;
+    const event = place ? this.events?.at(this.box, this.window, ...place) : null;
+    this.tip.hidden = !found && !special && !event;
     if (this.tip.hidden) return;
-    const lines = special ? [`${special.kind}: ${this.horizontal.label} = ${told(special.x * this.horizontal.factor, 0)} ${unitOf(this.horizontal)}`] : [];
-    if (found) lines.push(...this.described(found));
+    const lines = event ? [event.sentence] : special ? [`${special.kind}: ${this.horizontal.label} = ${told(special.x * this.horizontal.factor, 0)} ${unitOf(this.horizontal)}`] : [];
+    if (found && !event) lines.push(...this.described(found));
     this.tip.replaceChildren(...lines.map((text) => el("div", { text })));
     const right = place[0] > this.width / 2;
     this.tip.style.left = right ? "auto" : `${place[0] + 16}px`;
@@ -386,6 +388,8 @@ export class Diagram {
 
   async select(px, py) {
     if (!this.data) return;
+    const event = this.events?.at(this.box, this.window, px, py);
+    if (event) return this.events.choose(event);
     const found = await this.nearestTo(px, py, 24);
     if (found) this.choose(found);
   }

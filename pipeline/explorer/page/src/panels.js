@@ -29,7 +29,7 @@ class Panels {
     this.liveNote = el("p", { class: "hint", role: "status", hidden: true });
     element.replaceChildren(this.hint, this.liveNote, this.grid);
     this.build();
-    this.forget = [state.on(["selected"], () => this.select()), state.on(["curvePoint"], () => this.selectOnCurve())];
+    this.forget = [state.on(["selected"], () => this.select()), state.on(["curvePoint"], () => this.selectOnCurve()), state.on(["eventPoint"], () => this.selectAtEvent())];
     if (this.live) this.forget.push(this.live.on((status) => this.showLive(status)));
     this.select();
   }
@@ -113,18 +113,30 @@ class Panels {
 
   /** Show the orbit at a point of a bifurcation curve. */
   async selectOnCurve() {
-    const { curvePoint } = this.state.get(), asked = ++this.asked;
-    if (!curvePoint) return;
+    const { curvePoint } = this.state.get();
+    if (curvePoint) await this.showLocated(this.source.curveOrbit(curvePoint), `curve-${curvePoint.curve}-${curvePoint.point}`);
+  }
+
+  /** Show the orbit at the bifurcation of an event. */
+  async selectAtEvent() {
+    const { eventPoint } = this.state.get();
+    if (eventPoint) await this.showLocated(this.source.eventOrbit(eventPoint), `event-${eventPoint.event}`);
+    else if (this.grid.dataset.shown?.startsWith("event-")) await this.select();
+  }
+
+  /** Show an orbit that is no cell's, once it is there. */
+  async showLocated(coming, name) {
+    const asked = ++this.asked;
     this.grid.setAttribute("aria-busy", "true");
     if (this.grid.hidden) this.say("Integrating the orbit …");
     try {
-      const packed = await this.source.curveOrbit(curvePoint);
+      const packed = await coming;
       if (asked !== this.asked) return;
       this.own = null;
       this.reveal(true);
       this.display(new Orbit(packed, this.view.model), false);
       this.plane.show(this.orbit, true);
-      this.grid.dataset.shown = `curve-${curvePoint.curve}-${curvePoint.point}`;
+      this.grid.dataset.shown = name;
     } catch (error) {
       if (asked === this.asked) this.say(error.message);
     } finally {

@@ -113,6 +113,10 @@ export class ExportSource {
     return this.answer("branches", `y=${y}&${placeKey(this.described.axes, at, x)}`);
   }
 
+  events({ x, at }) {
+    return this.answer("events", placeKey(this.described.axes, at, x));
+  }
+
   attractors({ at }) {
     return this.answer("attractors", placeKey(this.described.axes, at));
   }

@@ -60,6 +60,16 @@ export class RunSource {
     return this.json("branches", { x, y, at });
   }
 
+  /** Events of attractors along the horizontal axis. */
+  events({ x, at }) {
+    return this.json("events", { x, at });
+  }
+
+  /** The orbit at the bifurcation of an event. */
+  eventOrbit({ x, at, event }) {
+    return this.packed("event-orbit", { x, at, event });
+  }
+
   orbit({ cell, point }) {
     return this.packed("orbit", { cell, point });
   }

@@ -55,7 +55,7 @@ export class Toolbar {
 
   showToggles() {
     const { overlays } = this.state.get(), { has } = this.view;
-    const known = [["branches", "Branches", has.branches], ["exponents", "Exponents", this.curves?.has("exponents")], ["fractions", "Fractions", this.curves?.has("fractions")]];
+    const known = [["branches", "Branches", has.branches], ["events", "Events", has.events], ["exponents", "Exponents", this.curves?.has("exponents")], ["fractions", "Fractions", this.curves?.has("fractions")]];
     const entries = known.filter(([, , there]) => there).map(([key, text]) => {
       const id = freshId("toggle");
       const box = el("input", { type: "checkbox", id, name: key, on: { change: () => this.state.set({ overlays: { ...this.state.get().overlays, [key]: box.checked } }) } });
