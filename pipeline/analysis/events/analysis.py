@@ -17,6 +17,7 @@ from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
+from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
@@ -300,8 +301,12 @@ def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> B
     """Judge the end of a chaotic set or a torus, given the fate of the orbit beyond."""
     along, geometry, all_points = scene.along, geometry_of(scene.attractors), points_of_rows(scene.attractors)
     points = all_points[stretch.rows[way > 0]]
-    if SETS[stretch.kind] == "chaotic_set":
-        bracket = float(along[place + way]), float(along[place])
+    bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
+    if may_pass(scene.located, fate.bifurcation, is_torus):
+        frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
+        family = family_of(scene.base.model.system, 1, frequency, packed, scene.axis, scene.scale)
+        return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
+    if not is_torus:
         return cascade_of(scene.located, fate, bracket, points, geometry)
     if stretch.places[0] == stretch.places[1]:
         return Born("", "one value of the run shows the torus; two are needed to see it shrink")
@@ -372,6 +377,9 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
         "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
+        "exponent": ([one.born.exponent if one.born else np.nan for one in named], "exponent of laminar lengths", {}),
+        "exponent_error": ([one.born.exponent_error if one.born else np.nan for one in named], "its error", {}),
+        "rotation": ([one.born.rotation if one.born else "" for one in named], "p/q of a locked orbit", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {

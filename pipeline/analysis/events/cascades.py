@@ -46,6 +46,9 @@ class Born:
     error: float = np.nan
     doublings: tuple[float, ...] = ()
     ratio: float = np.nan
+    exponent: float = np.nan  # of the lengths of laminar phases over the distance from the event
+    exponent_error: float = np.nan
+    rotation: str = ""  # p/q of the orbit to which a torus locks
 
 
 def cascade_of(

@@ -6,5 +6,10 @@ from pipeline.analysis.branches.kinds import KINDS, LIMITS
 
 UNDECIDED, RANGE_END, LIVES_ON, CASCADE = "not_decided", "range_end", "lives_on", "cascade"
 
-NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE)
+INTERMITTENCY = {kind: f"intermittency_{kind}" for kind in ("i", "ii", "iii")}
+"""Names of intermittency by its type."""
+
+LOCKING = "locking"
+
+NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *INTERMITTENCY.values(), LOCKING)
 """Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""

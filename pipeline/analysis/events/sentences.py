@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
-from pipeline.analysis.events.names import CASCADE, LIVES_ON, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import CASCADE, INTERMITTENCY, LIVES_ON, LOCKING, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tabular import MOST_ROWS, Row, counted, plain, values
 from pipeline.layout.vocabulary import letter, parameter_name
@@ -14,7 +14,8 @@ from pipeline.products.product import Table
 
 _NAMES = (
     *("attractor", "set", "period", "period_after", "rises", "what", "criticality", "value", "value_error", "seen"),
-    *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "evidence"),
+    *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "exponent"),
+    *("exponent_error", "rotation", "evidence"),
 )
 
 _LIMITS = {"homoclinic": "homoclinic end (HOM) at a saddle", "snic": "saddle node on a circle (SNIC)"}
@@ -79,6 +80,12 @@ def _reason(row: Row, doublings: list[float]) -> str:
     if what == CASCADE:
         listed = ", ".join(f"{x:.7g}" for x in doublings)
         return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    if what in INTERMITTENCY.values():
+        scaled = f"lengths of laminar phases scale with the exponent {row['exponent']:.2f} ± {row['exponent_error']:.1g}"
+        return f"intermittency of type {what.rpartition('_')[2].upper()} at {_ghost(row)}; {scaled}"
+    if what == LOCKING:
+        locks = f"it locks to the orbit of rotation number {row['rotation']}" if row["rotation"] else "it locks"
+        return f"{locks} at {_ghost(row)}"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
@@ -104,6 +111,12 @@ def _reason(row: Row, doublings: list[float]) -> str:
     }
     verb = "exchanges stability with" if what == TRANSCRITICAL else "meets"
     return f"{head}, {told.get((what, own), f'it {verb} the {kind}{of}')}"
+
+
+def _ghost(row: Row) -> str:
+    """Name the bifurcation at which an orbit ends that a set beyond passes slowly."""
+    kind = {"intermittency_ii": "subcritical Neimark-Sacker (NS)", "intermittency_iii": "subcritical doubling (PD)"}
+    return f"the {kind.get(str(row['what']), 'fold (LP)')} of the orbit of branch {row['branch']}"
 
 
 def _going_on(attractor: int, to: dict[int, int]) -> str:
