@@ -19,7 +19,8 @@ EVENTS = Analysis(
     """Name the bifurcation at which each attractor begins, changes its period and ends along the swept parameter.
 
     Follows the branch of each orbit from the last value at which cells end on it. Ends of chaotic sets and tori are
-    named where doublings or a Neimark-Sacker point prove them; all others are not decided.""",
+    named where doublings, a Neimark-Sacker point, or slow passages near an orbit beyond prove them (intermittency,
+    locking); all others are not decided.""",
     EventOptions,
     compute=f"{_ROOM}:events",
     table="pipeline.analysis.events.sentences:events_table",

@@ -3,8 +3,8 @@
 An attractor that is a closed orbit or an equilibrium lives where its branch is stable. From the last parameter value
 at which cells end on it, its branch is followed until it loses stability (`lines`). So the event is the first
 located bifurcation on the branch of that very orbit, wherever it lies on the grid of parameter values; where the
-branch gives no reason, the event is not decided. `analysis` joins attractors and branches, `cascades` decides ends of
-chaotic sets and tori, `sentences` has the table.
+branch gives no reason, the event is not decided. `analysis` joins attractors and branches, `cascades` and `passages`
+decide ends of chaotic sets and tori, `grazing` those of orbits that touch a surface, `sentences` has the table.
 
 Ids that lie on one stable piece of a branch are one attractor and have the least of their ids, since ids of
 equilibria rest on distance alone. Nothing is looked for between neighbouring values at which cells end on the same
@@ -34,6 +34,9 @@ variable                       dims              meaning
 ``to_attractor``, ``to_cells`` event, outcome    ids on which they end at ``beyond`` (-1: none, -2: they
                                                  diverge), with their numbers, the largest first
 ``doublings``, ``ratio``       event, doubling   of a cascade: doublings, and the ratio of the last intervals
+``exponent``,                  event             exponent of the lengths of laminar phases over the distance from
+``exponent_error``                               the event, and its error
+``rotation``                   event             p/q of the orbit to which a torus locks, in turns of the section
 ``evidence``                   event             what decided the event, or what was tried
 ``stretch_attractor``, ...     stretch           ``_set``, ``_period``, ``_low``, ``_high``: the range, up to
                                                  its events where they are decided

@@ -14,11 +14,13 @@ from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
+from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Line, Orbit, at, crossing_at, follow, lines_of, places_of
+from pipeline.analysis.events.names import GRAZING, LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.events.passages import may_pass, passage_of
-from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
@@ -187,10 +189,8 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
             if why:
                 fates[one, rises] = (Fate(np.nan, why=why),) * 2
                 continue
-            frequency, packed = parameters_at(ds.isel({scene.axis: int(scene.order[place])}), scene.base)
-            family = family_of(scene.base.model.system, one.period, frequency, packed, scene.axis, scene.scale)
             asked.append((one, rises))
-            orbits.append(Orbit(family, points[row][0], value_of(family, frequency, packed)))
+            orbits.append(Orbit(_family(scene, place, one.period), points[row][0], float(scene.along[place])))
     for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
         if found is None:
             fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
@@ -246,7 +246,7 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     if fate.limit:
         return replace(event, what=fate.limit, error=max(fate.error, LOCATED * scene.scale))
     if fate.bifurcation < 0:
-        return event
+        return _touching(scene, event)
     ds, k = scene.located, fate.bifurcation
     sides = ds["n_unstable_before"].values[k], ds["n_unstable_after"].values[k]
     if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
@@ -256,6 +256,27 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     error = max(float(ds["bracket"].values[k]), (AT_BRANCH_POINT if crosses else LOCATED) * scene.scale)
     what = crossing_at(ds, scene.lines, k) if crosses else KINDS[int(ds["kind"].values[k])]
     return replace(event, what=what, error=error)
+
+
+def _family(scene: Scene, place: int, period: int) -> Family:
+    """Return the family of orbits of a period at the parameters of a place on the axis."""
+    frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
+    return family_of(scene.base.model.system, period, frequency, packed, scene.axis, scene.scale)
+
+
+def _touching(scene: Scene, event: Event) -> Event:
+    """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
+    fate = event.fate
+    line = next((line for line in scene.lines if line.branch == fate.branch), None)
+    if line is None or fate.node not in (0, len(line.value) - 1):
+        return event
+    family = _family(scene, event.stretch.places[event.rises], line.period)
+    found = grazing_of(line, fate.node, family)
+    if found is None:
+        return event
+    value, error, why = found
+    fate = replace(fate, value=value, why=f"{fate.why}; {why}")
+    return replace(event, fate=fate, what=GRAZING, error=max(error, LOCATED * scene.scale))
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:
@@ -303,8 +324,7 @@ def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> B
     points = all_points[stretch.rows[way > 0]]
     bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
     if may_pass(scene.located, fate.bifurcation, is_torus):
-        frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
-        family = family_of(scene.base.model.system, 1, frequency, packed, scene.axis, scene.scale)
+        family = _family(scene, place, 1)
         return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
     if not is_torus:
         return cascade_of(scene.located, fate, bracket, points, geometry)

@@ -9,7 +9,7 @@ UNDECIDED, RANGE_END, LIVES_ON, CASCADE = "not_decided", "range_end", "lives_on"
 INTERMITTENCY = {kind: f"intermittency_{kind}" for kind in ("i", "ii", "iii")}
 """Names of intermittency by its type."""
 
-LOCKING = "locking"
+LOCKING, GRAZING = "locking", "grazing"
 
-NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *INTERMITTENCY.values(), LOCKING)
+NAMES = (UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *INTERMITTENCY.values(), LOCKING, GRAZING)
 """Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""

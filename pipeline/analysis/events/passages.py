@@ -5,12 +5,11 @@ orbit has been: intermittency of type I, II or III (Pomeau and Manneville, Commu
 that passes slowly where two orbits have met in a fold locks onto them. With d the distance from the bifurcation, the
 passages through the channel of a fold take d**-1/2; near an orbit that repels with the rate d they take 1/d.
 
-The mean length of the laminar phases depends on where trajectories come back to the channel, for types II and III
-(Elaskar and del Rio, New Advances on Chaotic Intermittency and its Applications, 2017). So the length that is fitted
-here is that of the phase in which a laminar instant lies: the mean square of the lengths over their mean. Its exponent
-is -1/2 for type I. It is -1 for types II and III if some arrivals come as near to the orbit as to any other place in
-the channel on a line through it.
-
+The mean length of the laminar phases depends on where trajectories come back to the channel (Elaskar and del Rio, New
+Advances on Chaotic Intermittency and its Applications, 2017). A ratio of the means of two powers, l**m and l**(m - 1),
+does so less: of type I with m = 6 it is near to the longest passage, which has the exponent -1/2. For types II and III
+m = 2, the length of the phase in which a laminar instant lies: its exponent is -1 if arrivals on a line through the
+orbit are spread evenly near it.
 """
 
 from __future__ import annotations
@@ -44,6 +43,9 @@ TRAJECTORIES = 32
 MEASURED = {FOLD: (10, 4096), TORUS: (6, 16384), DOUBLING: (6, 16384)}
 """Numbers of distances, each half of the one before, and of the sections of each trajectory."""
 
+POWERS = {FOLD: 6, TORUS: 2, DOUBLING: 2}
+"""Powers m in the ratio of means that is the length of laminar phases."""
+
 GATE, OF_GAP = 0.1, 0.25
 """Largest distance from the orbit in a laminar phase: as a share of the extent of the set, and at most as a share of
 the least distance between two section points of the orbit.
@@ -61,6 +63,9 @@ GROUPS = 8
 AGREES, LARGEST_ERROR = 0.12, 0.1
 """Largest deviation of an exponent from the expected one beyond its error, and largest error."""
 
+REGULAR = 0.2
+"""Largest spread of the lengths of laminar phases on a torus; on chaotic sets it is larger."""
+
 WHOLE = 0.1
 """Largest distance of the turns over the period of an orbit from a whole number, on a torus that passes it."""
 
@@ -70,12 +75,13 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Phases:
-    """Laminar phases at some distances from a bifurcation: their length, its relative error and their number."""
+    """Laminar phases at some distances from a bifurcation: length, its relative error, number and spread."""
 
     distance: np.ndarray
     length: np.ndarray
     error: np.ndarray
     number: np.ndarray
+    spread: np.ndarray  # standard deviation of the lengths over their mean, seen from laminar instants
 
 
 def may_pass(ds: xr.Dataset, k: int, is_torus: bool) -> bool:
@@ -126,7 +132,7 @@ def passage_of(
     distances = abs(bracket[1] - value) * 0.5 ** np.arange(n_values)
     values = value + np.sign(bracket[1] - value) * distances
     sections = _sections(family, values, points, n_sections)
-    found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry)
+    found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
     fitted = scaling(found, kind, len(ghost))
     born = replace(_judged(found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
     if born.what != LOCKING or fitted is None:
@@ -144,6 +150,10 @@ def _judged(
     lengths, away = found.length[chosen], found.distance[chosen]
     told += f"; lengths of laminar phases near it from {lengths[0]:.3g} to {lengths[-1]:.3g} sections at distances from"
     told += f" {away[0]:.2g} to {away[-1]:.2g}: exponent {exponent:.3f} ± {error:.1g}"
+    if (is_regular := bool(found.spread[chosen].max() <= REGULAR)) != is_torus:
+        return Born(
+            "", f"{told}; they are {'all as long, as those of a torus' if is_regular else 'as uneven as of chaos'}"
+        )
     expected = EXPONENTS[kind]
     if error > LARGEST_ERROR or abs(exponent - expected) > max(AGREES, error):
         return Born("", f"{told}, and {expected:g} is expected")
@@ -178,7 +188,7 @@ def _sections(family: Family, values: np.ndarray, points: np.ndarray, n: int) ->
 
 
 def phases(
-    sections: np.ndarray, ghost: np.ndarray, gate: float, distances: np.ndarray, geometry: Geometry
+    sections: np.ndarray, ghost: np.ndarray, gate: float, distances: np.ndarray, geometry: Geometry, power: int
 ) -> Phases:
     """Measure the lengths of the laminar phases of trajectories: of their stays near an orbit.
 
@@ -194,20 +204,24 @@ def phases(
         Distances from the bifurcation.
     geometry
         Geometry of the states.
+    power
+        The power m of `POWERS`.
     """
     rows = []
     for one in sections:
-        near = np.min([geometry.distance(one, point) for point in ghost], axis=0) <= gate
-        lengths = [_runs(row) for row in near]
-        groups = [np.concatenate(lengths[i::GROUPS]) for i in range(GROUPS)]
-        ratios = np.array([_length(group) for group in groups])
-        every = np.concatenate(lengths)
-        length = _length(every)
+        near = np.zeros(one.shape[:-1], bool)
+        for point in ghost:
+            near |= geometry.distance(one, point) <= gate
+        stays = [_runs(row) for row in near]
+        groups = [_ratio(np.concatenate(stays[i::GROUPS]), power) for i in range(GROUPS)]
+        every = np.concatenate(stays)
+        length, middle = _ratio(every, power), _ratio(every, 2)
         # a length is a whole number of sections
-        spread = float(np.std(ratios)) / np.sqrt(GROUPS - 1.0) + 0.5
-        rows.append((length, spread / length if length else np.nan, len(every)))
-    length, error, number = np.array(rows).T
-    return Phases(distances, length, error, number)
+        error = float(np.std(groups)) / np.sqrt(GROUPS - 1.0) + 0.5
+        spread = np.sqrt(max(_ratio(every, 3) / middle - 1.0, 0.0))
+        rows.append((length, error / length, spread, len(every)))
+    length, error, spread, number = np.array(rows).T
+    return Phases(distances, length, error, number, spread)
 
 
 def _runs(near: np.ndarray) -> np.ndarray:
@@ -219,15 +233,16 @@ def _runs(near: np.ndarray) -> np.ndarray:
     return np.asarray(ends - begins[: len(ends)], np.float64)
 
 
-def _length(lengths: np.ndarray) -> float:
-    return float((lengths**2).sum() / lengths.sum()) if len(lengths) else 0.0
+def _ratio(lengths: np.ndarray, power: int) -> float:
+    """Return the mean of a power of some lengths over that of the power before it; NaN without lengths."""
+    return float((lengths**power).sum() / (lengths ** (power - 1)).sum()) if len(lengths) else np.nan
 
 
 def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.ndarray] | None:
     """Fit the exponent of the lengths over the distances, with its error, at the nearest distances that serve.
 
     Passages through a channel of finite length, beyond a fold, lack a constant number of sections, which is fitted too.
-    Else the difference between the exponents of the nearer and the farther half is part of the error. Return also the
+    Else the difference between the exponents without the farthest and without the nearest one is part of the error. Return also the
     numbers of the distances; None if there are too few.
     """
     longest = OF_SECTIONS * MEASURED[kind][1]
@@ -240,8 +255,8 @@ def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.nda
     slope, own = _fit(terms, y, error)
     if kind == FOLD:
         return slope, own, chosen
-    half = len(x) // 2
-    near, far = (_fit(terms[:, part], y[part], error[part])[0] for part in (slice(half, None), slice(half)))
+    parts = slice(1, None), slice(-1)
+    near, far = (_fit(terms[:, part], y[part], error[part])[0] for part in parts)
     return slope, float(np.hypot(own, near - far)), chosen
 
 

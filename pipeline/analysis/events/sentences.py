@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
-from pipeline.analysis.events.names import CASCADE, INTERMITTENCY, LIVES_ON, LOCKING, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import CASCADE, GRAZING, INTERMITTENCY, LIVES_ON, LOCKING, RANGE_END, UNDECIDED
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tabular import MOST_ROWS, Row, counted, plain, values
 from pipeline.layout.vocabulary import letter, parameter_name
@@ -77,15 +77,10 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
 def _reason(row: Row, doublings: list[float]) -> str:
     """Name the event and say what the attractor meets, in words."""
     what, own, other = row["what"], bool(row["is_own"]), row["other_branch"]
-    if what == CASCADE:
-        listed = ", ".join(f"{x:.7g}" for x in doublings)
-        return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
-    if what in INTERMITTENCY.values():
-        scaled = f"lengths of laminar phases scale with the exponent {row['exponent']:.2f} ± {row['exponent_error']:.1g}"
-        return f"intermittency of type {what.rpartition('_')[2].upper()} at {_ghost(row)}; {scaled}"
-    if what == LOCKING:
-        locks = f"it locks to the orbit of rotation number {row['rotation']}" if row["rotation"] else "it locks"
-        return f"{locks} at {_ghost(row)}"
+    if what in (CASCADE, LOCKING, *INTERMITTENCY.values()):
+        return _end_of_set(row, doublings)
+    if what == GRAZING:
+        return "grazing, it begins to touch a surface of impacts or switches"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
@@ -113,10 +108,23 @@ def _reason(row: Row, doublings: list[float]) -> str:
     return f"{head}, {told.get((what, own), f'it {verb} the {kind}{of}')}"
 
 
-def _ghost(row: Row) -> str:
-    """Name the bifurcation at which an orbit ends that a set beyond passes slowly."""
-    kind = {"intermittency_ii": "subcritical Neimark-Sacker (NS)", "intermittency_iii": "subcritical doubling (PD)"}
-    return f"the {kind.get(str(row['what']), 'fold (LP)')} of the orbit of branch {row['branch']}"
+def _end_of_set(row: Row, doublings: list[float]) -> str:
+    """Name the end of a chaotic set or of a torus, in words."""
+    what = str(row["what"])
+    if what == CASCADE:
+        listed = ", ".join(f"{x:.7g}" for x in doublings)
+        return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    kinds = {
+        INTERMITTENCY["ii"]: "subcritical Neimark-Sacker point (NS)",
+        INTERMITTENCY["iii"]: "subcritical doubling (PD)",
+    }
+    ghost = f"the {kinds.get(what, 'fold (LP)')} of the orbit of branch {row['branch']}"
+    if what == LOCKING:
+        of = f" as {row['rotation']}" if row["rotation"] else ""
+        return f"it locks{of} at {ghost}"
+    exponent = f"{row['exponent']:.2f} ± {row['exponent_error']:.1g}"
+    name = plain(what).rpartition(" ")[2].upper()
+    return f"intermittency of type {name} at {ghost}, laminar lengths scale with the exponent {exponent}"
 
 
 def _going_on(attractor: int, to: dict[int, int]) -> str:
