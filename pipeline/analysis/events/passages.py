@@ -51,7 +51,7 @@ GATE, OF_GAP = 0.1, 0.25
 the least distance between two section points of the orbit.
 """
 
-LEAST_LENGTH, OF_SECTIONS = 10.0, 1.0 / 12.0
+LEAST_LENGTH, OF_SECTIONS = 20.0, 1.0 / 12.0
 """Lengths that are fitted: at least these periods of the orbit, and at most this share of the sections."""
 
 LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 100, 4, 6
@@ -60,7 +60,7 @@ LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 100, 4, 6
 GROUPS = 8
 """Groups of trajectories whose spread gives the error of a length."""
 
-AGREES, LARGEST_ERROR = 0.12, 0.1
+AGREES, LARGEST_ERROR = 0.12, 0.15
 """Largest deviation of an exponent from the expected one beyond its error, and largest error."""
 
 REGULAR = 0.2
@@ -242,8 +242,8 @@ def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.nda
     """Fit the exponent of the lengths over the distances, with its error, at the nearest distances that serve.
 
     Passages through a channel of finite length, beyond a fold, lack a constant number of sections, which is fitted too.
-    Else the difference between the exponents without the farthest and without the nearest one is part of the error. Return also the
-    numbers of the distances; None if there are too few.
+    The difference between the exponents without the farthest and without the nearest distance is part of the error.
+    Return also the numbers of the distances; None if there are too few.
     """
     longest = OF_SECTIONS * MEASURED[kind][1]
     serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= LEAST_PHASES)
@@ -253,8 +253,6 @@ def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.nda
     x, y, error = np.log(found.distance[chosen]), np.log(found.length[chosen]), found.error[chosen]
     terms = np.stack([x, np.ones_like(x), 1.0 / found.length[chosen]] if kind == FOLD else [x, np.ones_like(x)])
     slope, own = _fit(terms, y, error)
-    if kind == FOLD:
-        return slope, own, chosen
     parts = slice(1, None), slice(-1)
     near, far = (_fit(terms[:, part], y[part], error[part])[0] for part in parts)
     return slope, float(np.hypot(own, near - far)), chosen
