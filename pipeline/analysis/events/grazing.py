@@ -28,6 +28,9 @@ SAMPLES = 4000
 CORNER = 3.0
 """Change of a rate between two instants, in units of those before and after, from which on it is a jump: an impact."""
 
+ROUNDED = 1e-9
+"""Values of the surface's function, in units of its range, that are 0 at neighbouring instants: sliding, or at rest."""
+
 NODES, APART = 30, 2.0
 """Last points of a branch that are looked at, and the least ratio of the heights of those that are used."""
 
@@ -119,7 +122,13 @@ def _peaks(family: Family, point: Point) -> list[float]:
 
 
 def _peak(h: np.ndarray, rate: np.ndarray, step: float) -> float:
-    """Return the highest maximum below 0 of a function at equal steps, without those at jumps of its rate."""
+    """Return the highest maximum below 0 of a function at equal steps, without those at jumps of its rate.
+
+    NaN if there is none, or if the function stays at 0 for a while.
+    """
+    on = np.abs(h) <= ROUNDED * np.ptp(h)
+    if (on[:-2] & on[1:-1] & on[2:]).any():
+        return np.nan
     jump = np.abs(np.diff(rate))
     usual = np.maximum(np.append(jump[1:], 0.0), np.append(0.0, jump[:-1]))
     at = np.flatnonzero((rate[:-1] > 0.0) & (rate[1:] <= 0.0) & (jump <= CORNER * usual))

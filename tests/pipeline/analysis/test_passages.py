@@ -23,14 +23,11 @@ STUART = magpend.model(
     "x' = x*(1 - R) - w*y + F*cos(omega*t)\ny' = y*(1 - R) + w*x + F*sin(omega*t)\nR = x**2 + y**2",
     name="stuart", w=1.0, F=0.2,
 )  # fmt: skip
-PHASE = magpend.model(
-    "th' = th + O - K*sin(th)",
-    name="phase",
-    kind="map",
-    states={"th": {"unit": "rad", "on_circle": True}},
-    O=1.0,
-    K=0.9,
-)
+# polar coordinates: th' = th + O - K sin th, r' = sqrt(r)
+RING = magpend.model(
+    "x' = G*(x*cos(a) - y*sin(a))\ny' = G*(x*sin(a) + y*cos(a))\na = O - K*y/sqrt(R)\nG = R**(-0.25)\nR = x**2 + y**2",
+    name="ring", kind="map", O=1.0, K=0.6,
+)  # fmt: skip
 
 LONG = {"n_transient": 2000, "n_keep": 200}
 
@@ -97,22 +94,21 @@ def test_events__tongue_of_stuart_landau(tmp_path):
 @pytest.mark.slow
 def test_events__tongues_of_the_circle_map(tmp_path):
     """The tongue 0/1 ends at O = K; the edges of 1/2 are the folds of the map's second iterate."""
-    values = [0.5, 0.8, 1.0, 1.2, 2.9, 2.95, 3.141, 3.33, 3.38]
-    run = sweep(PHASE, tmp_path, {"th": (-3, 3)}, {"n_transient": 3000, "n_keep": 300}, O=values)
-    table = run.table("events")
-    edges = of(table, "locking")
+    starts = {"x": (0.5, 1.5), "y": (-1.0, 1.0)}
+    run = sweep(RING, tmp_path, starts, O=[0.4, 0.55, 0.6543, 0.7071, 2.9817, 3.0213, 3.14, 3.2519, 3.3031])
+    edges = of(run.table("events"), "locking")
 
     def second(y):
         th, o = y
-        one = th + o - 0.9 * np.sin(th)
-        slope = (1.0 - 0.9 * np.cos(th)) * (1.0 - 0.9 * np.cos(one))
-        return [one + o - 0.9 * np.sin(one) - th - 2.0 * np.pi, slope - 1.0]
+        one = th + o - 0.6 * np.sin(th)
+        slope = (1.0 - 0.6 * np.cos(th)) * (1.0 - 0.6 * np.cos(one))
+        return [one + o - 0.6 * np.sin(one) - th - 2.0 * np.pi, slope - 1.0]
 
-    halves = sorted({round(fsolve(second, [th, o])[1], 10) for o in (3.0, 3.3) for th in np.linspace(0.1, 6.2, 9)})
-    halves = [x for x in halves if 2.9 < x < 3.4]
+    halves = {round(fsolve(second, [th, o])[1], 8) for o in (3.0, 3.3) for th in np.linspace(0.1, 6.2, 9)}
+    halves = sorted(x for x in halves if 2.9 < x < 3.4)
     assert len(halves) == 2
     assert [x[4] for x in edges] == ["0/1", "1/2", "1/2"]
-    assert [x[0] for x in edges] == pytest.approx([0.9, *halves], abs=1e-8)
+    assert [x[0] for x in edges] == pytest.approx([0.6, *halves], abs=1e-8)
 
 
 @pytest.mark.slow
