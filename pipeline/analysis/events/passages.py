@@ -150,10 +150,8 @@ def _judged(
     lengths, away = found.length[chosen], found.distance[chosen]
     told += f"; lengths of laminar phases near it from {lengths[0]:.3g} to {lengths[-1]:.3g} sections at distances from"
     told += f" {away[0]:.2g} to {away[-1]:.2g}: exponent {exponent:.3f} ± {error:.1g}"
-    if (is_regular := bool(found.spread[chosen].max() <= REGULAR)) != is_torus:
-        return Born(
-            "", f"{told}; they are {'all as long, as those of a torus' if is_regular else 'as uneven as of chaos'}"
-        )
+    if (found.spread[chosen].max() <= REGULAR) != is_torus:
+        return Born("", f"{told}, but they are {'uneven, as in chaos' if is_torus else 'equally long, as on a torus'}")
     expected = EXPONENTS[kind]
     if error > LARGEST_ERROR or abs(exponent - expected) > max(AGREES, error):
         return Born("", f"{told}, and {expected:g} is expected")

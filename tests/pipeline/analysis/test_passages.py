@@ -8,7 +8,7 @@ from scipy.optimize import brentq, fsolve
 
 import magpend
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD
-from pipeline.analysis.events import passages
+from pipeline.analysis.events import grazing, passages
 from pipeline.analysis.events.passages import Phases, phases, rotation_of, scaling
 from pipeline.analysis.sets import Geometry
 
@@ -143,7 +143,7 @@ def test_scaling__refuses_the_other_law(kind, exponent):
         found = Phases(d, length, np.full(6, 0.02), np.full(6, 500), np.full(6, 0.5))
         slope, error, chosen = scaling(found, kind, 1)
         assert slope == pytest.approx(other, abs=3e-3)
-        assert len(chosen) >= 5
+        assert len(chosen) >= passages.LEAST_VALUES
         told = passages._judged(found, (slope, error, chosen), kind, "", 0.0, False)
         assert bool(told.what) == (other == exponent)
         assert not passages._judged(found, (slope, error, chosen), kind, "", 0.0, True).what
@@ -155,3 +155,24 @@ def test_rotation_of__turns_of_the_section():
     for turn, text in ((0.4 + 1e-3, "2/5"), (0.33, "")):
         points = np.stack([np.cos(2 * np.pi * turn * n), -np.sin(2 * np.pi * turn * n)], axis=-1)[None]
         assert rotation_of(points, 5, Geometry((False, False), (1.0, 1.0))) == text
+
+
+def test_peak__is_smooth_and_below_zero():
+    """A bounce at the surface and a crossing are no peaks; a stay on the surface leaves none."""
+    t = np.linspace(0.0, 4.0, 401)
+    smooth, bounce = -0.1 - (t - 1.003) ** 2, -0.5 * np.abs(t - 3.004) - 1e-6
+    h, rate = np.where(t < 2.0, smooth, bounce), np.where(t < 2.0, -2.0 * (t - 1.003), -0.5 * np.sign(t - 3.004))
+    assert grazing._peak(h, rate, 0.01) == pytest.approx(-0.1, abs=1e-12)
+    assert np.isnan(grazing._peak(np.sin(t), np.cos(t), 0.01))
+    assert np.isnan(grazing._peak(np.where(t > 3.5, 0.0, h), rate, 0.01))
+
+
+def test_touch__extrapolates_and_refuses():
+    """Peaks -(c - x) - (c - x)**2 reach 0 at c; orbits that stay away, or of which one side is unknown, do not."""
+    away = 1e-3 * 0.4 ** np.arange(7)[::-1]
+    peaks = -away - away**2
+    value, error, used = grazing._touch(2.0 - away, peaks)
+    assert abs(value - 2.0) <= max(error, 1e-12)
+    assert len(used) == grazing.ORBITS
+    assert grazing._touch(2.0 - away, peaks - 0.1) is None
+    assert grazing._touch(2.0 - away, [np.nan] * 7) is None
