@@ -14,11 +14,13 @@ orbit are spread evenly near it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import gcd
 
 import numpy as np
 import xarray as xr
+from scipy.optimize import least_squares
 
 from magpend_core.defaults import MOST_STEPS
 from magpend_core.extension import more_sections
@@ -51,7 +53,7 @@ GATE, OF_GAP = 0.1, 0.25
 the least distance between two section points of the orbit.
 """
 
-LEAST_LENGTH, OF_SECTIONS = 20.0, 1.0 / 12.0
+LEAST_LENGTH, OF_SECTIONS = 10.0, 1.0 / 12.0
 """Lengths that are fitted: at least these periods of the orbit, and at most this share of the sections."""
 
 LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 100, 4, 6
@@ -210,7 +212,8 @@ def phases(
         near = np.zeros(one.shape[:-1], bool)
         for point in ghost:
             near |= geometry.distance(one, point) <= gate
-        stays = [_runs(row) for row in near]
+        # at the ends of a channel some points of the orbit are near and others are not
+        stays = [stay[stay >= 2 * len(ghost)] for stay in map(_runs, near)]
         groups = [_ratio(np.concatenate(stays[i::GROUPS]), power) for i in range(GROUPS)]
         every = np.concatenate(stays)
         length, middle = _ratio(every, power), _ratio(every, 2)
@@ -239,7 +242,6 @@ def _ratio(lengths: np.ndarray, power: int) -> float:
 def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.ndarray] | None:
     """Fit the exponent of the lengths over the distances, with its error, at the nearest distances that serve.
 
-    Passages through a channel of finite length, beyond a fold, lack a constant number of sections, which is fitted too.
     The difference between the exponents without the farthest and without the nearest distance is part of the error.
     Return also the numbers of the distances; None if there are too few.
     """
@@ -248,20 +250,35 @@ def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.nda
     chosen = np.flatnonzero(serves)[-MOST_VALUES:]
     if len(chosen) < LEAST_VALUES:
         return None
+    law = passage if kind == FOLD else straight
     x, y, error = np.log(found.distance[chosen]), np.log(found.length[chosen]), found.error[chosen]
-    terms = np.stack([x, np.ones_like(x), 1.0 / found.length[chosen]] if kind == FOLD else [x, np.ones_like(x)])
-    slope, own = _fit(terms, y, error)
+    slope, own = _fit(law, x, y, error)
     parts = slice(1, None), slice(-1)
-    near, far = (_fit(terms[:, part], y[part], error[part])[0] for part in parts)
+    near, far = (_fit(law, x[part], y[part], error[part])[0] for part in parts)
     return slope, float(np.hypot(own, near - far)), chosen
 
 
-def _fit(terms: np.ndarray, y: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """Return the coefficient of the first term of a weighted linear fit, and its error."""
-    design = (terms / error).T
-    found, rest, *_ = np.linalg.lstsq(design, y / error)
-    excess = max(1.0, float(rest.sum()) / max(len(y) - len(terms), 1))
-    return float(found[0]), float(np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0]))
+def straight(u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the length over that of the distance: a straight line."""
+    return np.asarray(u[1] + u[0] * x)
+
+
+def passage(u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the length of the passage from -c to c of y' = d + y**2, with d**-1/2 for any power.
+
+    It is 2 d**-1/2 atan(c d**-1/2); the powers of d and the two factors are fitted.
+    """
+    return np.asarray(u[1] + u[0] * x + np.log(np.arctan(np.exp(u[2] + u[0] * x))))
+
+
+def _fit(law: Callable[..., np.ndarray], x: np.ndarray, y: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """Fit a law to the logarithms of lengths; return the exponent, its first coefficient, and its error."""
+    slope = -0.5 if law is passage else -1.0
+    rise = [1.0 - slope * float(x.mean())] if law is passage else []  # a channel of some length, at the middle
+    start = np.array([slope, float((y - slope * x).mean()), *rise])
+    found = least_squares(lambda u: (law(u, x) - y) / error, start, x_scale="jac")
+    excess = max(1.0, 2.0 * found.cost / max(len(x) - len(start), 1))
+    return float(found.x[0]), float(np.sqrt(excess * np.linalg.pinv(found.jac.T @ found.jac)[0, 0]))
 
 
 def rotation_of(trajectories: np.ndarray, period: int, geometry: Geometry) -> str:
