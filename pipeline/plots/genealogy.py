@@ -35,7 +35,7 @@ _MARK: dict[str, Any] = {"markersize": 5.0, "markerfacecolor": "white", "markere
 _OTHERS = {
     CASCADE: ("*", "", "end of a cascade"),
     **{name: ("h", kind.upper(), f"intermittency {kind.upper()}") for kind, name in INTERMITTENCY.items()},
-    LOCKING: ("d", "", "locking"),
+    LOCKING: (">", "", "locking"),
     GRAZING: ("<", "", "grazing"),
 }
 """Marker, label and name of the events that are no bifurcations of a branch."""

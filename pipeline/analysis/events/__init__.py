@@ -34,8 +34,8 @@ variable                       dims              meaning
 ``to_attractor``, ``to_cells`` event, outcome    ids on which they end at ``beyond`` (-1: none, -2: they
                                                  diverge), with their numbers, the largest first
 ``doublings``, ``ratio``       event, doubling   of a cascade: doublings, and the ratio of the last intervals
-``exponent``,                  event             exponent of the lengths of laminar phases over the distance from
-``exponent_error``                               the event, and its error
+``exponent``,                  event             minus the power of the distance from the event with which the
+``exponent_error``                               lengths of laminar phases grow, and its error
 ``rotation``                   event             p/q of the orbit to which a torus locks, in turns of the section
 ``evidence``                   event             what decided the event, or what was tried
 ``stretch_attractor``, ...     stretch           ``_set``, ``_period``, ``_low``, ``_high``: the range, up to

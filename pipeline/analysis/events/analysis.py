@@ -397,7 +397,11 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
         "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
-        "exponent": ([one.born.exponent if one.born else np.nan for one in named], "exponent of laminar lengths", {}),
+        "exponent": (
+            [one.born.exponent if one.born else np.nan for one in named],
+            "minus the power of the distance with which laminar phases grow",
+            {},
+        ),
         "exponent_error": ([one.born.exponent_error if one.born else np.nan for one in named], "its error", {}),
         "rotation": ([one.born.rotation if one.born else "" for one in named], "p/q of a locked orbit", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),

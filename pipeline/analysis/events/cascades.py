@@ -46,7 +46,7 @@ class Born:
     error: float = np.nan
     doublings: tuple[float, ...] = ()
     ratio: float = np.nan
-    exponent: float = np.nan  # of the lengths of laminar phases over the distance from the event
+    exponent: float = np.nan  # minus the power of the distance with which laminar phases grow
     exponent_error: float = np.nan
     rotation: str = ""  # p/q of the orbit to which a torus locks
 

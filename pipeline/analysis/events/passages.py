@@ -121,7 +121,7 @@ def passage_of(
     Returns
     -------
     Born
-        With the exponent of the length and its error.
+        With the exponent of the length and its error: 1/2 or 1, if it is named.
     """
     value, kind = float(ds["value"].values[k]), KINDS[int(ds["kind"].values[k])]
     degree = "" if kind == FOLD else "subcritical "
@@ -158,7 +158,7 @@ def _judged(
     if error > LARGEST_ERROR or abs(exponent - expected) > max(AGREES, error):
         return Born("", f"{told}, and {expected:g} is expected")
     what = LOCKING if is_torus else INTERMITTENCY[TYPES[kind]]
-    return Born(what, told, value, exponent=exponent, exponent_error=error)
+    return Born(what, told, value, exponent=-exponent, exponent_error=error)
 
 
 def _gate(points: np.ndarray, ghost: np.ndarray, geometry: Geometry) -> float:

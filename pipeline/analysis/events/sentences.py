@@ -80,7 +80,7 @@ def _reason(row: Row, doublings: list[float]) -> str:
     if what in (CASCADE, LOCKING, *INTERMITTENCY.values()):
         return _end_of_set(row, doublings)
     if what == GRAZING:
-        return "grazing, it begins to touch a surface of impacts or switches"
+        return "grazing, a peak of it begins to touch a surface of impacts or switches"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
@@ -122,9 +122,9 @@ def _end_of_set(row: Row, doublings: list[float]) -> str:
     if what == LOCKING:
         of = f" as {row['rotation']}" if row["rotation"] else ""
         return f"it locks{of} at {ghost}"
-    exponent = f"{row['exponent']:.2f} ± {row['exponent_error']:.1g}"
+    power = f"-{row['exponent']:.2f} ± {row['exponent_error']:.1g} of the distance"
     name = plain(what).rpartition(" ")[2].upper()
-    return f"intermittency of type {name} at {ghost}, laminar lengths scale with the exponent {exponent}"
+    return f"intermittency of type {name} at {ghost}, laminar phases grow with the power {power}"
 
 
 def _going_on(attractor: int, to: dict[int, int]) -> str:

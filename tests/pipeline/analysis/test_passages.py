@@ -48,9 +48,9 @@ def of(table, what):
 
 NORMAL = {
     # the window of period 3 opens at 1 + sqrt(8)
-    "intermittency_i": (LOGISTIC, {"x": (0.1, 0.9)}, {"r": np.linspace(3.8231, 3.8381, 6)}, 1.0 + np.sqrt(8.0), -0.5),
-    "intermittency_ii": (SPIRAL, {"x": (-0.05, 0.05), "y": (-0.05, 0.05)}, {"e": [-0.031, -0.01, 0.011]}, 0.0, -1.0),
-    "intermittency_iii": (FLIP, {"x": (-0.05, 0.05)}, {"e": [-0.031, -0.01, 0.011]}, 0.0, -1.0),
+    "intermittency_i": (LOGISTIC, {"x": (0.1, 0.9)}, {"r": np.linspace(3.8231, 3.8381, 6)}, 1.0 + np.sqrt(8.0), 0.5),
+    "intermittency_ii": (SPIRAL, {"x": (-0.05, 0.05), "y": (-0.05, 0.05)}, {"e": [-0.031, -0.01, 0.011]}, 0.0, 1.0),
+    "intermittency_iii": (FLIP, {"x": (-0.05, 0.05)}, {"e": [-0.031, -0.01, 0.011]}, 0.0, 1.0),
 }
 
 
@@ -111,16 +111,46 @@ def test_events__tongues_of_the_circle_map(tmp_path):
     assert [x[0] for x in edges] == pytest.approx([0.6, *halves], abs=1e-8)
 
 
+def second_touch(zeta=0.1, w=0.9, r=0.7):
+    """Drive at which the orbit of two drive periods with one impact at x = 1 touches it a second time.
+
+    Between impacts x is a damped oscillation beside the forced one; its later peak is 1.
+    """
+    wd, period = np.sqrt(1.0 - zeta**2), 4.0 * np.pi / w
+
+    def flight(v, force, phase, t):
+        z = force * np.exp(1j * (w * t + phase)) / (1.0 - w**2 + 2j * zeta * w)
+        z0 = force * np.exp(1j * phase) / (1.0 - w**2 + 2j * zeta * w)
+        a, b = 1.0 - z0.real, (-r * v - (1j * w * z0).real + zeta * (1.0 - z0.real)) / wd
+        e, c, s = np.exp(-zeta * t), np.cos(wd * t), np.sin(wd * t)
+        return (
+            e * (a * c + b * s) + z.real,
+            e * ((wd * b - zeta * a) * c - (zeta * b + wd * a) * s) + (1j * w * z).real,
+        )
+
+    def equations(u):
+        v, phase, force, t = u
+        ends, touches = flight(v, force, phase, period), flight(v, force, phase, t)
+        return [ends[0] - 1.0, ends[1] - v, touches[0] - 1.0, touches[1]]
+
+    v, phase = 1.01126, 0.11873  # of the orbit at A = 0.47
+    times = np.linspace(0.3, period - 0.3, 2000)
+    first = times[flight(v, 0.47, phase, times)[0].argmax()]
+    return fsolve(equations, [v, phase, 0.47, first], xtol=1e-13)[2]
+
+
 @pytest.mark.slow
 def test_events__grazing_of_the_impact_oscillator(tmp_path):
-    """The linear oscillator touches the stop where its amplitude equals the gap."""
+    """The linear oscillator touches the stop where its amplitude equals the gap; orbits with an impact touch again."""
     model = magpend.load_model("impact")
-    starts = {"x": (-0.9, 0.9), "v": (-0.5, 0.5)}
-    run = sweep(
-        model, tmp_path, starts, {"n_transient": 300, "n_keep": 40}, n=6, omega=[0.9], A=np.linspace(0.25, 0.28, 4)
-    )
-    ((value, error, *_),) = of(run.table("events", parameter="A"), "grazing")
-    assert abs(value - np.hypot(1.0 - 0.81, 2.0 * 0.1 * 0.9)) <= error < 1e-7
+    starts, settings = {"x": (-0.9, 0.9), "v": (-0.5, 0.5)}, {"n_transient": 300, "n_keep": 40}
+    run = sweep(model, tmp_path, starts, settings, omega=[0.9], A=[0.25, 0.26, 0.478, 0.482, 0.487])
+    touches = of(run.table("events", parameter="A"), "grazing")
+    known = [np.hypot(1.0 - 0.81, 2.0 * 0.1 * 0.9), second_touch()]
+    assert known[1] == pytest.approx(0.4846395885, abs=1e-9)
+    for x in known:
+        assert any(abs(value - x) <= error < 1e-8 for value, error, *_ in touches)
+    assert len(touches) == 2
 
 
 LINE = Geometry((False,), (1.0,))
