@@ -399,7 +399,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
         "exponent": (
             [one.born.exponent if one.born else np.nan for one in named],
-            "minus the power of the distance with which laminar phases grow",
+            "minus the power of the distance with which phases grow",
             {},
         ),
         "exponent_error": ([one.born.exponent_error if one.born else np.nan for one in named], "its error", {}),
