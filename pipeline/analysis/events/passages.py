@@ -39,11 +39,8 @@ TYPES = {FOLD: "i", TORUS: "ii", DOUBLING: "iii"}
 EXPONENTS = {FOLD: -0.5, TORUS: -1.0, DOUBLING: -1.0}
 """Exponents of the length over the distance from the bifurcation."""
 
-TRAJECTORIES = 32
-"""Trajectories at each distance at which laminar phases are measured."""
-
-MEASURED = {FOLD: (10, 4096), TORUS: (6, 16384), DOUBLING: (6, 16384)}
-"""Numbers of distances, each half of the one before, and of the sections of each trajectory."""
+MEASURED = {FOLD: (10, 16, 4096), TORUS: (6, 32, 16384), DOUBLING: (6, 32, 16384)}
+"""Numbers of distances, each half of the one before, of trajectories at each, and of their sections."""
 
 POWERS = {FOLD: 6, TORUS: 2, DOUBLING: 2}
 """Powers m in the ratio of means that is the length of laminar phases."""
@@ -56,7 +53,7 @@ the least distance between two section points of the orbit.
 LEAST_LENGTH, OF_SECTIONS = 10.0, 1.0 / 12.0
 """Lengths that are fitted: at least these periods of the orbit, and at most this share of the sections."""
 
-LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 100, 4, 6
+LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 60, 4, 6
 """Least number of laminar phases at a value, and numbers of values that are fitted, the nearest ones."""
 
 GROUPS = 8
@@ -130,10 +127,9 @@ def passage_of(
         return Born("", told)
     ghost = ds["bifurcation_section"].values[k]
     ghost = ghost[np.isfinite(ghost).all(axis=-1)]
-    n_values, n_sections = MEASURED[kind]
-    distances = abs(bracket[1] - value) * 0.5 ** np.arange(n_values)
+    distances = abs(bracket[1] - value) * 0.5 ** np.arange(MEASURED[kind][0])
     values = value + np.sign(bracket[1] - value) * distances
-    sections = _sections(family, values, points, n_sections)
+    sections = _sections(family, values, points, *MEASURED[kind][1:])
     found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
     fitted = scaling(found, kind, len(ghost))
     born = replace(_judged(found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
@@ -168,9 +164,9 @@ def _gate(points: np.ndarray, ghost: np.ndarray, geometry: Geometry) -> float:
     return float(min([GATE * extent, *(OF_GAP * gaps)]))
 
 
-def _sections(family: Family, values: np.ndarray, points: np.ndarray, n: int) -> np.ndarray:
+def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int, n: int) -> np.ndarray:
     """Integrate trajectories of a set at some values of the parameter, shape (value, trajectory, section, state)."""
-    starts = points[np.linspace(0, len(points) - 1, TRAJECTORIES).astype(int)]
+    starts = points[np.linspace(0, len(points) - 1, many).astype(int)]
     unknowns = [family.unknowns(state, [value]) for value in values for state in starts]
     rows = family.rows(np.array(unknowns))
     found = more_sections(
@@ -184,7 +180,7 @@ def _sections(family: Family, values: np.ndarray, points: np.ndarray, n: int) ->
         max_steps_per_period=MOST_STEPS,
         system=family.system,
     )
-    return np.asarray(found.section[:, 0].reshape(len(values), TRAJECTORIES, n, -1))
+    return np.asarray(found.section[:, 0].reshape(len(values), many, n, -1))
 
 
 def phases(
@@ -245,7 +241,7 @@ def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.nda
     The difference between the exponents without the farthest and without the nearest distance is part of the error.
     Return also the numbers of the distances; None if there are too few.
     """
-    longest = OF_SECTIONS * MEASURED[kind][1]
+    longest = OF_SECTIONS * MEASURED[kind][2]
     serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= LEAST_PHASES)
     chosen = np.flatnonzero(serves)[-MOST_VALUES:]
     if len(chosen) < LEAST_VALUES:
