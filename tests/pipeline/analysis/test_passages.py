@@ -61,7 +61,7 @@ def test_events__intermittency(name, tmp_path):
     table = sweep(model, tmp_path, starts, **axes).table("events")
     ((value, error, found, spread, _),) = of(table, name)
     assert abs(value - known) <= error < 1e-8
-    assert abs(found - exponent) <= 2.0 * spread < 0.2
+    assert abs(found - exponent) <= 2.0 * spread <= 2.0 * passages.LARGEST_ERROR
     assert not (table["what"] == "not_decided").any()
 
 
