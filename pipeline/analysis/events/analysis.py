@@ -341,6 +341,8 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
     beyond = [other.stretch for other in named if other.stretch.attractor == heir]
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
+    if any(SETS[other.kind] == "chaotic_set" for other in beyond):
+        return f"{letter(heir)} is a chaotic set: whether the torus breaks up into it is not looked for"
     if len(one.to) > 1:
         return "its cells do not all go on to the same attractor"
     return "its cells do not go on to an orbit whose end is located and whose cells go on to it"
