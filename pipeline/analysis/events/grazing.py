@@ -114,7 +114,7 @@ def _peaks(family: Family, point: Point) -> list[float]:
     drive = Drive(np.array([seconds]) if is_flow else np.full(family.period, 1.0 / frequency))
     orbit = sample(system, packed, rows.states, [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
     values, rates = surfaces_at(system, np.mod(times, 1.0 / frequency), orbit.states[0], packed[0], frequency)
-    found = []
+    found: list[float] = []
     for h, rate in zip(values.T, rates.T, strict=True):
         extent = max(float(np.ptp(h)), 1e-300)
         found += [_peak(sign * h, sign * rate, times[1]) / extent for sign in (1.0, -1.0)]
