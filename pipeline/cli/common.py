@@ -57,12 +57,29 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
     from pipeline.specification.problems import SpecError
 
     found, problems = {}, []
-    for text in texts:
+    for text in [part for given in texts for part in given.split(",")]:
         name, _, value = text.partition("=")
         try:
             found[name.strip()] = float(value)
         except ValueError:
             problems.append(f"{option} {text}: must be NAME=VALUE with a number, such as {example}.")
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def read_ranges(option: str, texts: list[str]) -> dict[str, tuple[float, float]]:
+    """Parse texts of the form ``NAME=LOW:HIGH`` into pairs by name; raise a `SpecError` that lists invalid texts."""
+    from pipeline.specification.problems import SpecError
+
+    found, problems = {}, []
+    for text in [part for given in texts for part in given.split(",")]:
+        name, _, ends = text.partition("=")
+        try:
+            low, high = map(float, ends.split(":"))
+            found[name.strip()] = low, high
+        except ValueError:
+            problems.append(f"{option} {text}: must be NAME=LOW:HIGH with two numbers, such as x=-2:2.")
     if problems:
         raise SpecError(problems)
     return found

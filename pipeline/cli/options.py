@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 from pipeline.cli import console, outputs
-from pipeline.cli.common import read_pairs
+from pipeline.cli.common import read_pairs, read_ranges
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -162,7 +162,7 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
     elif kind is bool:
         flag = f"{flag}/--no-{flag[2:]}" if default else flag
     elif get_origin(kind) is dict:
-        declared |= {"metavar": "NAME=VALUE"}
+        declared |= {"metavar": "NAME=LOW:HIGH" if _of_ranges(kind) else "NAME=VALUE"}
         kind = list[str]
     elif get_origin(kind) is tuple:
         declared |= {"metavar": "LOW HIGH" if float in get_args(kind) else "A B"}
@@ -181,8 +181,12 @@ def _shown(default: Any) -> str:
 
 def _value(info: FieldInfo, flag: str, value: Any) -> Any:
     if get_origin(kind_of(info)) is dict:
-        return read_pairs(flag, value, "frequency=2.2")
+        return read_ranges(flag, value) if _of_ranges(kind_of(info)) else read_pairs(flag, value, "frequency=2.2")
     return value
+
+
+def _of_ranges(kind: Any) -> bool:
+    return get_origin(get_args(kind)[1]) is tuple
 
 
 def _own(command: Command) -> list[inspect.Parameter]:

@@ -18,6 +18,8 @@ from pipeline.layout.writing import write_atomically
 if TYPE_CHECKING:
     import xarray as xr
 
+    from pipeline.plots.style import DataFigure
+
 File = Annotated[Path, typer.Argument(metavar="FILE", help="Recording: .tdms, .lvm, .csv or .mat.")]
 Window = Annotated[
     tuple[float, float] | None,
@@ -96,15 +98,42 @@ def spectrum(
         )
         tell(spectrum_table(found), csv, as_json)
         if out is not None:
-            from pipeline.plots import save_data, save_figure
             from pipeline.plots.spectrum import plot_spectrum
 
-            figure = plot_spectrum(found, axis=axis)
-            say = console.note if as_json or csv else console.result
-            say(f"figure: {save_figure(figure, out)}")
-            say(f"data: {save_data(figure, out)}")
+            _save(plot_spectrum(found, axis=axis), out, as_json or csv)
     except ValueError as error:
         raise SpecError(f"{file}: {error}") from None
+
+
+def analyse(
+    file: File,
+    mapping: Annotated[Path, typer.Option(metavar="MAP", help=MAPPING)],
+    channel: Annotated[str, typer.Option(help="Measured quantity; by default the first.")] = "",
+    window: Window = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the surrogates.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
+    csv: Csv = None,
+    as_json: Json = None,
+) -> None:
+    """Measure period, largest exponent, dimension and recurrences of a recording, each with an interval.
+
+    A result that noise or length forbid is not decided, and the table says why. The figure shows the delay portrait,
+    the return map of the maxima, the divergence of neighbours, the correlation sums and the recurrences.
+    """
+    from pipeline.analysis.series.analysis import series_of, series_table
+    from pipeline.specification.problems import SpecError
+
+    if out is not None:
+        check_figure_path(out)
+    try:
+        found = series_of(_read(file, mapping, window), channel, seed=seed)
+    except ValueError as error:
+        raise SpecError(f"{file}: {error}") from None
+    tell(series_table(found), csv, as_json)
+    if out is not None:
+        from pipeline.plots.series import plot_series
+
+        _save(plot_series(found), out, as_json or csv)
 
 
 def convert(
@@ -240,6 +269,15 @@ def _tell(ds: xr.Dataset, as_json: str | None) -> None:
     tell_data(told, [*quantities.lines, *findings.lines], as_json)
 
 
+def _save(figure: DataFigure, out: Path, others: str | None) -> None:
+    """Write a figure and its data; their paths are notes if another output is printed."""
+    from pipeline.plots import save_data, save_figure
+
+    say = console.note if others else console.result
+    say(f"figure: {save_figure(figure, out)}")
+    say(f"data: {save_data(figure, out)}")
+
+
 def _draw(ds: xr.Dataset, out: Path, as_json: str | None) -> None:
     from pipeline.plots import save_figure
     from pipeline.rig.recordings.figure import plot_recording
@@ -248,5 +286,5 @@ def _draw(ds: xr.Dataset, out: Path, as_json: str | None) -> None:
     say(f"figure: {save_figure(plot_recording(ds), out)}")
 
 
-for _command in (drawing(show), drawing(spectrum), convert, drive, simulate):
+for _command in (drawing(show), drawing(spectrum), drawing(analyse), convert, drive, simulate):
     add_command(recordings_app, _command)

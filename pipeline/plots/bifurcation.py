@@ -342,10 +342,17 @@ class Diagram:
             "cells": self.survey.cells,
             **{f"absent_{k.replace(' ', '_')}": v for k, v in self.survey.absent.items()},
         }
-        dims = ("layer", self.parameter)
-        drawn = drawn.assign({name: (dims, values) for name, values in counts.items() if values.any()})
-        drawn = drawn.assign_coords({self.parameter: axis.variable, **fixed_of(self.view.ds)})
+        # a parameter may be called x or y, as the drawn points are
+        fixed = {_free(name, drawn): variable for name, variable in fixed_of(self.view.ds).items()}
+        along = _free(self.parameter, drawn)
+        drawn = drawn.assign({name: (("layer", along), values) for name, values in counts.items() if values.any()})
+        drawn = drawn.assign_coords({along: xr.Variable((along,), axis.values, axis.attrs), **fixed})
         return drawn.assign_attrs(title="bifurcation diagram", parameter=self.parameter)
+
+
+def _free(name: str, ds: xr.Dataset) -> str:
+    """Return the name of a parameter among some variables, changed if one of them has it."""
+    return f"{name}_parameter" if name in ds.variables else name
 
 
 def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:

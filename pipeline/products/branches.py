@@ -44,6 +44,24 @@ class BranchOptions(AlongOptions):
         "branches; up to --period, or the longest period of the run's orbits, at most 4.",
         ge=0,
     )
+    start: dict[str, float] = option(
+        {}, "Also start from the orbit or equilibrium near a state, such as x=0.1,v=0; the parameter may be among them."
+    )
+    start_period: int = option(
+        1,
+        "Period of the orbit at --start; 0, and a flow without a section, take an equilibrium.",
+        unit="drive periods or returns",
+        ge=0,
+    )
+    all_equilibria: int = option(
+        0,
+        "Number of parameter values, evenly spaced, at which all equilibria of a flow in the box --within are found, "
+        "as starts.",
+        ge=0,
+    )
+    within: dict[str, tuple[float, float]] = option(
+        {}, "Range of a state for --all-equilibria, such as x=-2:2; of an angle by default the full turn."
+    )
 
 
 class CurveOptions(BranchOptions, PlaneOptions):
@@ -94,7 +112,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=2,
+    version=3,
 )
 
 CURVES = Analysis(

@@ -116,9 +116,9 @@ def _exact(model: type[BaseModel], name: str, value: Any) -> Any:
     kind = model.model_fields[name].annotation if name in model.model_fields else None
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)
-    if isinstance(value, list) and "tuple" in str(kind):
-        return tuple(value)
-    return dict(value) if isinstance(value, Mapping) else value
+    if isinstance(value, Mapping):
+        return {key: tuple(v) if isinstance(v, list) and "tuple" in str(kind) else v for key, v in value.items()}
+    return tuple(value) if isinstance(value, list) and "tuple" in str(kind) else value
 
 
 def problems_of(error: ValidationError, model: type[BaseModel], prefix: str) -> list[str]:

@@ -10,14 +10,13 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
+from pipeline.analysis.branches.completeness import counted_lines, searched_lines
 from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LABELS, LIMITS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, values, words_of
-from pipeline.layout.own_words import RATE, dims_in_own_words
+from pipeline.analysis.tabular import Row, Words, aligned, counted, values
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
-from pipeline.specification.tables import FREQUENCY
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -28,9 +27,12 @@ NO_LENGTH = 1e-9
 
 def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
     """Fill in the parameter interval of the branches from the run's swept axis; raise SpecError if it is empty."""
+    from pipeline.analysis.branches.asked import check_asked
+
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
     low, high = interval_of(run, parameter, options.low, options.high)
+    check_asked(run, options, (low, high))
     return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
 
 
@@ -46,6 +48,7 @@ def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
 
 def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
+    from pipeline.analysis.branches.asked import count_equilibria, counted_variables, given_starts
     from pipeline.analysis.branches.dataset import dataset_of
     from pipeline.analysis.branches.exploring import Scope, explore
     from pipeline.analysis.branches.searching import places_of, searched_variables
@@ -54,7 +57,10 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     cube, parameter = run.cube(), axis_name(options.parameter)
     interval = low, high = _ends(options)
     base = parameters_of(cube)
+    given, missed = given_starts(run, options, interval)
+    counted = count_equilibria(run, options, interval)
     starts, left_out = attracting(run.derive("attractors"), base, parameter, interval, options.max_period)
+    starts = [*given, *starts, *(start for one in counted for start in one.starts)]
     longest = options.max_period or max([LEAST_PERIOD, *(s.family.period for s in starts)])
     if options.recurrences:
         found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
@@ -70,8 +76,8 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     followed = explore(starts, scope)
     if starts and not followed:
         left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
-    return dataset_of(followed, parameter, base, left_out).assign(
-        searched_variables(searched, followed, periods, base.model)
+    return dataset_of(followed, parameter, base, [*missed, *left_out]).assign(
+        searched_variables(searched, followed, periods, base.model) | counted_variables(counted, base.model)
     )
 
 
@@ -156,12 +162,21 @@ def branches_table(ds: xr.Dataset) -> Table:
     """
     rows = table_of(ds)
     if not ds.sizes["branch"]:
-        lines = ["no branch: no closed orbit to begin with", *searched_lines(ds), *_left_out(ds)]
+        lines = ["no branch: no closed orbit to begin with", *counted_lines(ds), *searched_lines(ds), *_left_out(ds)]
         return Table(rows, lines, _why_none(ds))
     head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
     return Table(
-        rows, [*lines, *_unbounded(ds), *_detached(ds), *searched_lines(ds), *_listed(ds, "stuck"), *_left_out(ds)]
+        rows,
+        [
+            *lines,
+            *_unbounded(ds),
+            *_detached(ds),
+            *counted_lines(ds),
+            *searched_lines(ds),
+            *_listed(ds, "stuck"),
+            *_left_out(ds),
+        ],
     )
 
 
@@ -187,7 +202,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
     for k in np.argsort(ds["value"].values, kind="stable"):
         one = ds.isel(bifurcation=int(k))
         branch, told = int(one["of_branch"]), values(one, "kind", "criticality", "bifurcation_side")
-        below, above = _unstable(one, told["kind"])
+        below, above = _unstable(one, _turns(ds, int(k)))
         rows.append(
             {
                 parameter: float(one["value"]),
@@ -303,11 +318,19 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     return {parameter_name(name): float(variable.values[branch]) for name, variable in found.items()}
 
 
-def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
+def _turns(ds: xr.Dataset, k: int) -> bool:
+    """Return whether the branch turns at a bifurcation: a fold, or a pitchfork whose other branch is not known."""
+    one = ds.isel(bifurcation=k)
+    kind, branch, after = values(one, "kind")["kind"], int(one["of_branch"]), max(int(one["after"]), 0)
+    before, beyond = ds["parameter"].values[branch, after : after + 2] - float(one["value"])
+    return kind == FOLD or (kind in (BRANCHING, PITCHFORK) and before * beyond > 0.0)
+
+
+def _unstable(one: xr.Dataset, turns: bool) -> tuple[str, str]:
     """Return the numbers of unstable multipliers below and above a bifurcation, as texts."""
     before, after = int(one["n_unstable_before"]), int(one["n_unstable_after"])
     rises = bool(one["rises_before"])
-    if kind == FOLD:
+    if turns:
         both = f"{min(before, after)}|{max(before, after)}"
         return (both, "none") if rises else ("none", both)
     return (str(before), str(after)) if rises else (str(after), str(before))
@@ -411,40 +434,6 @@ def _detached(ds: xr.Dataset) -> list[str]:
             what = f"period {int(ds['orbit_period'][i])}, branch {i}{_at(ds, i)}"
             lines.append(f"  {what}: {line.min():.7f} to {line.max():.7f}")
     return lines
-
-
-_VERDICTS = {
-    "agrees": "as if none is missing",
-    "missing": "orbits are missing",
-    "diverged": "says nothing: cells diverged",
-    "unfinished": "says nothing: cells are unfinished",
-    "flow": "says nothing of a flow",
-}
-
-
-def searched_lines(ds: xr.Dataset) -> list[str]:
-    """Return text lines on the points at which all orbits were searched; none if there was no search."""
-    if "searched_value" not in ds:
-        return []
-    word = str(ds.attrs.get(RATE, FREQUENCY))
-    dims = {n: str(n).removeprefix("searched_") for n in ds.data_vars if str(n).startswith("searched_")}
-    dims["searched_value"] = str(ds.attrs["parameter"])
-    names = {n: parameter_name(dims_in_own_words([dim], word)[0]) for n, dim in dims.items()}
-    rows = []
-    for k in range(ds.sizes["searched"]):
-        one = ds.isel(searched=k)
-        told = {words_of(ds["index_verdict"])[code] for code in one["index_verdict"].values.tolist()}
-        counts = zip(ds["times"].values.tolist(), one["n_orbits"].values, one["index_sum"].values, strict=True)
-        rows.append(
-            {
-                **{name: f"{float(one[n]):.7g}" for n, name in names.items()},
-                **{f"period {p}": f"{n} ({total:+d})" for p, n, total in counts},
-                "coverage": f"{float(one['coverage']):.0%}" if np.isfinite(one["coverage"]) else "?",
-                "sum": _VERDICTS["missing" if "missing" in told else told.pop()],
-            }
-        )
-    head = ["", "all orbits searched: their number and, in brackets, the sum of their indices"]
-    return [*head, *aligned(rows)]
 
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:

@@ -273,15 +273,33 @@ def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int
     """Count the unstable multipliers at each point of a branch with some bifurcations.
 
     Near a bifurcation rounding decides on which side of the circle a multiplier lies. There a point has the number of
-    the nearest point up to the next bifurcation where it is certain.
+    the nearest point up to the next bifurcation where it is certain. Where none is, as at the end of a branch just
+    beyond a bifurcation, the number follows from that on the bifurcation's other side.
     """
     counts, margins = [n_unstable(point) for point in points], np.array([_margin(point) for point in points])
     places = sorted({0, len(points), *(one.after + 1 for one in found)})
+    unsure = []
     for first, last in pairwise(places):
         sure = first + np.flatnonzero(margins[first:last] > CERTAIN)
         for i in first + np.flatnonzero(margins[first:last] <= CERTAIN) if len(sure) else ():
             counts[i] = counts[sure[np.argmin(np.abs(sure - i))]]
+        unsure += [] if len(sure) else [(first, last)]
+    for first, last in unsure:
+        for beside, place in ((first - 1, first), (last, last)):
+            known = [one for one in found if one.after + 1 == place]
+            is_sure = 0 <= beside < len(points) and not any(a <= beside < b for a, b in unsure)
+            if is_sure and len(known) == 1:
+                counts[first:last] = [_beyond(known[0], points[beside], counts[beside])] * (last - first)
     return counts
+
+
+def _beyond(one: Bifurcation, point: Point, count: int) -> int:
+    """Return the number of unstable multipliers on the other side of a bifurcation, from a point on one side."""
+    change = _CHANGES.get(one.kind, 1)
+    values = np.linalg.eigvals(point.value.monodromy)
+    critical = values[np.argmin(np.abs(values - one.critical_multiplier))]
+    is_unstable = critical.real > 0.0 if point.value.is_rest else abs(critical) > 1.0
+    return count - change if is_unstable else count + change
 
 
 def settle_sides(points: Sequence[Point], found: Sequence[Bifurcation]) -> None:

@@ -181,7 +181,7 @@ def _iterate(
             break
         matrices = ends.derivatives[going] * scales / scales[:, None] - np.eye(len(scales))
         steps = _newton(matrices, mismatch[going])
-        steps *= _stretch(state[rows], periods[rows], steps, known, system)[:, None]
+        steps *= stretch(state[rows], periods[rows], steps, known, system)[:, None]
         longest = np.abs(steps).max(axis=1, keepdims=True)
         steps *= np.minimum(1.0, LONGEST_STEP / np.maximum(longest, LONGEST_STEP * 1e-9))
         state[rows] = wrap_angles(state[rows] + steps * scales, system)
@@ -193,7 +193,7 @@ def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
     return np.array([np.linalg.lstsq(a, -b, rcond=None)[0] for a, b in zip(matrices, mismatch, strict=True)])
 
 
-def _stretch(
+def stretch(
     states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
 ) -> np.ndarray:
     """Return the factor by which deflation stretches each Newton step, to keep it away from the orbits that are

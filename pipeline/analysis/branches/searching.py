@@ -9,8 +9,8 @@ orbits are missing; an equal sum does not prove that none is, as the two orbits 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -136,19 +136,33 @@ def places_of(
     """
     low, high = interval
     values = low + (high - low) * (np.arange(n) + 0.5) / max(n, 1)
-    dims = [d for d in split_dims(cube["status"])[0] if d != parameter]
     places = []
-    for index in np.ndindex(*(cube.sizes[d] for d in dims)):
-        cells = cube.isel(dict(zip(dims, index, strict=True)))
-        where = {d: float(cells.coords[d]) for d in dims}
-        frequency, packed = parameters_at(cells.isel({parameter: 0}, missing_dims="ignore"), parameters)
-        family = family_of(parameters.model.system, 1, frequency, packed, parameter, high - low)
+    for cells, where, family in rows_of(cube, parameters, parameter, high - low):
         seen, reach, hindrance = sections_of(cells), _reach(cells, parameters), _hindrance(cells, parameters)
         for value in values.tolist():
-            row = family.rows(family.unknowns(np.zeros(family.system.n_states), [value])[None])
-            there = family_of(family.system, 1, float(row.frequency_hz[0]), row.parameters[0], parameter, high - low)
+            there = family_at(family, value)
             places.append(Place(there, value, where, seen, reach, hindrance))
     return places
+
+
+def rows_of(
+    cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float
+) -> Iterator[tuple[xr.Dataset, dict[str, float], Family]]:
+    """Yield, for each point of the run's axes other than a parameter, its cells, its values and a family of period
+    1.
+    """
+    dims = [d for d in split_dims(cube["status"])[0] if d != parameter]
+    for index in np.ndindex(*(cube.sizes[d] for d in dims)):
+        cells = cube.isel(dict(zip(dims, index, strict=True)))
+        frequency, packed = parameters_at(cells.isel({parameter: 0}, missing_dims="ignore"), parameters)
+        family = family_of(parameters.model.system, 1, frequency, packed, parameter, scale)
+        yield cells, {d: float(cells.coords[d]) for d in dims}, family
+
+
+def family_at(family: Family, value: float) -> Family:
+    """Return a family whose fixed parameters, too, have a value of the free one."""
+    row = family.rows(family.unknowns(np.zeros(family.system.n_states), [value])[None])
+    return replace(family, frequency_hz=float(row.frequency_hz[0]), parameters=row.parameters[0])
 
 
 def _reach(cells: xr.Dataset, parameters: Parameters) -> np.ndarray:

@@ -12,7 +12,8 @@ from magpend_core.models.model import Model, Parameters, Quantity, State
 from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
-from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, searched_lines
+from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of
+from pipeline.analysis.branches.completeness import searched_lines
 from pipeline.analysis.branches.kinds import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.analysis.run import OpenRun

@@ -183,7 +183,7 @@ def spectrum_of(
     channel = channel or names[0]
     if channel not in names:
         raise ValueError(f"channel {channel!r} is not there; it has {', '.join(names)}.")
-    pieces, rate = _pieces(ds, channel)
+    pieces, rate = pieces_of(ds, channel)
     nperseg = nperseg or max(len(piece) for piece in pieces) // SEGMENTS
     long = [piece for piece in pieces if len(piece) >= nperseg >= 4]
     if not long:
@@ -211,7 +211,7 @@ def spectrum_of(
     return result.assign_coords(own).assign_attrs({**told_by(ds.attrs), **attrs})
 
 
-def _pieces(ds: xr.Dataset, channel: str) -> tuple[list[Array], float]:
+def pieces_of(ds: xr.Dataset, channel: str) -> tuple[list[Array], float]:
     """Return the stretches of a series without gaps, and its samples per second."""
     time, values = (np.asarray(ds[name].values, np.float64) for name in ("time", channel))
     piece = ds["piece"].values if "piece" in ds else np.zeros(len(time), int)

@@ -33,6 +33,7 @@ from pipeline.analysis.chaos.dimensions import correlation_dimension as correlat
 from pipeline.analysis.chaos.dimensions import kaplan_yorke_dimension as kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
+from pipeline.analysis.series.analysis import series_of as series_of
 from pipeline.analysis.spectrum.estimate import spectrum_of as spectrum_of
 from pipeline.compute.simulate import simulate as simulate
 from pipeline.explorer.notebook import explorer as explorer

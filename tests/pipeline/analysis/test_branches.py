@@ -445,6 +445,15 @@ def test_watch__neutral_saddle():
     branch = Branch(family(1.0, [0.2, 0.4], "frequency", 1.0), points, ones, ("bound", "bound"))
     assert (one.n_unstable_before, one.n_unstable_after) == (0, 1)
     assert counts_of(branch.points, ones) == [0, 0, 0, 1, 1]
+    # a branch that ends just beyond it has no point that is certain: the number changes by one
+    for moduli, counts in (((0.9, 0.97, 1.0 - 1e-9), [0, 0, 1]), ((1.1, 1.03, 1.0 + 1e-9), [1, 1, 0])):
+        points = [point_of(np.diag([mu, 0.1])) for mu in moduli]
+        ones = [Bifurcation("branch_point", point_of(np.diag([1.0, 0.1])), 0.0, 0, 0, True, after=1)]
+        Branch(branch.family, points, ones, ("bound", "bound"))
+        assert (ones[0].n_unstable_before, ones[0].n_unstable_after) == (counts[1], counts[2])
+        assert counts_of(points, ones) == counts
+        ones[0].after = 0
+        assert counts_of(points[::-1], ones) == counts[::-1]
     # two in one step, from 0 to 3: the pair that a torus changes and the fold's one
     points = [point_of(np.diag([mu, nu, xi])) for mu, nu, xi in ((0.9, 0.9, 0.9), (1.1, 1.1, 1.1))]
     two = [Bifurcation(kind, points[0], 0.0, 3, 3, True, after=0) for kind in ("fold", "neimark_sacker")]

@@ -7,11 +7,11 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from pipeline.analysis.branches.deflation import (
     FoundOrbit,
-    _stretch,
     coverage,
     expected_index,
     index_sums,
     search_orbits,
+    stretch,
 )
 from tests.core.cells import scipy_end
 
@@ -82,7 +82,7 @@ def test_stretch__is_newtons_method_for_the_deflated_function():
     x = np.array([0.8, -0.6])
     step = -np.linalg.solve(derivative(plain, x), plain(x))
     expected = -np.linalg.solve(derivative(deflated, x), deflated(x))
-    factor = _stretch(x[None], np.array([1]), step[None], known, DUFFING.system)
+    factor = stretch(x[None], np.array([1]), step[None], known, DUFFING.system)
     np.testing.assert_allclose(factor[0] * step, expected, rtol=1e-6)
 
 

@@ -171,3 +171,26 @@ def test_recordings_spectrum__finds_lines_and_counts_orders_from_the_drive(main,
     assert f"{0.02**2 / 2:.4g} at 4" in out
     code, _, err = main(*words, "--channel", "psi3")
     assert (code, "'psi3'" in err, "psi2" in err) == (2, True, True)
+
+
+@pytest.mark.slow
+def test_recordings_analyse__tells_the_period_and_draws(main, tmp_path):
+    rng = np.random.default_rng(3)
+    t = np.arange(2000) / 50.0
+    columns = [
+        t,
+        *(np.sin(2 * np.pi * 1.25 * t + p) + 0.02 * rng.normal(size=len(t)) for p in (0.3, 1.0)),
+        5.0 * (t % 0.8 < 0.4),
+    ]
+    table = pd.DataFrame(dict(zip(("time", "a", "b", "coil"), columns, strict=True)))
+    table.to_csv(tmp_path / "sines.csv", index=False)
+    (tmp_path / "sines.toml").write_text(SINES)
+    words = ("recordings", "analyse", "sines.csv", "--mapping", "sines.toml")
+    code, out, err = main(*words, "--channel", "psi2", "--out", "sines.png", "--csv", "rows.csv")
+    assert code == 0, err
+    assert "psi2: periodic" in out
+    assert (tmp_path / "sines.png").stat().st_size > 20_000
+    rows = pd.read_csv(tmp_path / "rows.csv").set_index("quantity")
+    assert rows.loc["period", "low"] <= 0.8 <= rows.loc["period", "high"]
+    code, _, err = main(*words, "--channel", "psi3")
+    assert (code, "'psi3'" in err) == (2, True)

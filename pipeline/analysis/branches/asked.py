@@ -1,0 +1,227 @@
+"""Start branches where a user asks for it: at a given state, or at all equilibria of a box of states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from magpend_core.equilibria import find_equilibria
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.models.text import TextModel
+from magpend_core.models.text.intervals import Rates
+from magpend_core.orbits import wrap_angles
+from magpend_core.pointwise import jacobian_at
+from pipeline.analysis.branches.boxes import Box, enclose_equilibria, search_equilibria
+from pipeline.analysis.branches.deflation import expected_index, search_orbits
+from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.problems import Family, parameter_units
+from pipeline.analysis.branches.searching import family_at, rows_of
+from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.run import OpenRun
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
+from pipeline.products.branches import BranchOptions
+from pipeline.specification.problems import SpecError, unknown_name
+
+COUNTS = ("proved", "border", "undecided", "jumps", "no_text")
+"""Values of `box_verdict`: why the number of equilibria is proved, or is not."""
+
+
+def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, float]) -> None:
+    """Raise SpecError unless the options on starts name all states, with numbers in their bounds."""
+    model = run.model
+    if options.start:
+        _check_start(model, options, interval)
+    if options.all_equilibria or options.within:
+        if not has_equilibria(model):
+            raise SpecError(
+                f"--all-equilibria: {model.name} is no flow without a drive; --isolas finds all its orbits."
+            )
+        if not options.all_equilibria:
+            raise SpecError("--within is the box of --all-equilibria; give that, too, such as --all-equilibria 1.")
+        problems = _box_problems(model, options.within)
+        if problems:
+            raise SpecError(problems)
+
+
+def has_equilibria(model: Model) -> bool:
+    """Return whether a model is a flow without a drive."""
+    return model.autonomous and not model.is_map
+
+
+def _check_start(model: Model, options: BranchOptions, interval: tuple[float, float]) -> None:
+    name, states = parameter_name(options.parameter), model.state_names
+    known = (*states, name)
+    problems = [f"--start: {unknown_name('state', one, known)}" for one in options.start if one not in known]
+    if missing := [state for state in states if state not in options.start]:
+        problems.append(f"--start: give all states; missing: {', '.join(missing)}.")
+    low, high = interval
+    value = options.start.get(name, low)
+    if not low <= value <= high:
+        problems.append(f"--start: {name} = {value:g} is outside of {low:g} to {high:g}; change --from and --to.")
+    if 0 < options.max_period < options.start_period:
+        problems.append(f"--start-period {options.start_period} is above --period {options.max_period}; raise that.")
+    if options.start_period == 0 and not has_equilibria(model):
+        problems.append(f"--start-period 0: {model.name} has no equilibria; its orbits have period 1 or more.")
+    if problems:
+        raise SpecError(problems)
+
+
+def _box_problems(model: Model, within: Mapping[str, tuple[float, float]]) -> list[str]:
+    problems = [
+        f"--within: {unknown_name('state', n, model.state_names)}" for n in within if n not in model.state_names
+    ]
+    for state, is_angle in zip(model.state_names, model.is_angle, strict=True):
+        if state not in within:
+            if not is_angle:
+                problems.append(f"--within: no range of {state}; add {state}=LOW:HIGH.")
+            continue
+        low, high = within[state]
+        if not low < high:
+            problems.append(f"--within {state}={low:g}:{high:g} is empty; give the lesser number first.")
+    return problems
+
+
+def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, float]) -> tuple[list[Start], list[str]]:
+    """Return the orbit or equilibrium near the state of --start at each point of the run's other axes, and a text line
+    for each point without one.
+    """
+    if not options.start:
+        return [], []
+    cube, base, name = run.cube(), parameters_of(run.cube()), axis_name(options.parameter)
+    own = base[name] if name in base.names else interval[0]
+    default = own if interval[0] <= own <= interval[1] and name not in cube.dims else interval[0]
+    value = options.start.get(parameter_name(name), default)
+    state = np.array([options.start[state] for state in run.model.state_names])
+    rests = has_equilibria(run.model) and (run.model.crossing is None or not options.start_period)
+    period, starts, lines = (0 if rests else options.start_period), [], []
+    for _, where, family in rows_of(cube, base, name, interval[1] - interval[0]):
+        there = family_at(family, value)
+        near, own_period = _closed_near(there, state, period)
+        if near is None:
+            what = f"no orbit of period {period}" if period else "no equilibrium"
+            at = "".join(f", {parameter_name(n)} {v:g}" for n, v in {name: value, **where}.items())
+            lines.append(f"start{at}: Newton's method found {what} from there")
+        else:
+            starts.append(Start(_family(there, own_period), near, value))
+    return starts, lines
+
+
+def _closed_near(family: Family, state: np.ndarray, period: int) -> tuple[np.ndarray | None, int]:
+    """Return a point of the orbit or equilibrium that Newton's method finds from a state, and its least period."""
+    if not period:
+        found = find_equilibria(family.system, state[None], family.parameters, max_iterations=100)
+        return (wrap_angles(found.states[0], family.system) if found.converged[0] else None), 0
+    orbits = search_orbits(
+        state[None], np.array([period]), family.frequency_hz, family.parameters, family.system, rounds=0
+    )
+    return (orbits[0].points[0], orbits[0].period) if orbits else (None, period)
+
+
+def _family(one: Family, period: int) -> Family:
+    return family_of(one.system, period, one.frequency_hz, one.parameters, one.free[0], one.scales[0])
+
+
+# ---- all equilibria ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """All equilibria of a box at one parameter point, and whether their number is proved."""
+
+    family: Family  # of period 1, with the parameter's value among its parameters
+    value: float
+    where: Mapping[str, float]
+    states: np.ndarray  # (n, n_states)
+    verdict: str  # of `COUNTS`
+
+    @property
+    def starts(self) -> list[Start]:
+        """The equilibria as starts of branches."""
+        return [Start(_family(self.family, 0), state, self.value) for state in self.states]
+
+    @property
+    def jacobians(self) -> np.ndarray:
+        """Jacobians at the equilibria [1/s per unit of the states], (n, n_states, n_states)."""
+        n = self.family.system.n_states
+        if not len(self.states):
+            return np.zeros((0, n, n))
+        return np.asarray(jacobian_at(self.family.system, self.states, self.family.parameters))
+
+    @property
+    def n_stable(self) -> int:
+        """Number of equilibria whose eigenvalues all have negative real parts."""
+        return int((np.linalg.eigvals(self.jacobians).real < 0.0).all(axis=1).sum())
+
+    @property
+    def index_sum(self) -> int:
+        """Sum of the signs of det(-J)."""
+        return int(np.sign(np.linalg.det(-self.jacobians)).sum())
+
+
+def count_equilibria(run: OpenRun, options: BranchOptions, interval: tuple[float, float]) -> list[Counted]:
+    """Find all equilibria of the box at some values of the parameter, for all points of the run's other axes."""
+    n, (low, high) = options.all_equilibria, interval
+    if not n:
+        return []
+    base, box = parameters_of(run.cube()), _box_of(run.model, options.within)
+    values = (low + (high - low) * (np.arange(n) + 0.5) / n).tolist()
+    rows = list(rows_of(run.cube(), base, axis_name(options.parameter), high - low))
+    return [_count(family_at(family, value), value, where, base, box) for _, where, family in rows for value in values]
+
+
+def _box_of(model: Model, within: Mapping[str, tuple[float, float]]) -> Box:
+    ends = np.array([within.get(state, (-np.pi, np.pi)) for state in model.state_names])
+    full = np.array(model.is_angle) & (ends[:, 1] - ends[:, 0] >= 2.0 * np.pi * (1.0 - 1e-3))
+    ends[full] = -np.pi, np.pi
+    return Box(ends[:, 0], ends[:, 1], full)
+
+
+def _count(family: Family, value: float, where: Mapping[str, float], base: Parameters, box: Box) -> Counted:
+    model, system, packed = of_flow(base).model, family.system, family.parameters
+    states, verdict = np.zeros((0, system.n_states)), "no_text"
+    if isinstance(model, TextModel):
+        own = dict(zip(system.parameter_names, packed.tolist(), strict=True))
+        rates = Rates(model.definition, {name: own[name] for name in model.parameter_names})
+        verdict = "jumps"
+        if not rates.obstacle:
+            found = enclose_equilibria(rates, box)
+            verdict = "border" if found.on_border else "proved" if found.is_proved else "undecided"
+            states = np.array([*found.states, *found.on_border]).reshape(-1, system.n_states)
+    if verdict in ("proved", "border"):
+        states = wrap_angles(states, system)
+    else:
+        states = search_equilibria(system, packed, box, wrap_angles(states, system))
+    return Counted(family, value, where, states, verdict)
+
+
+def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any]:
+    """Return dataset variables on the equilibria that were counted; none without a count.
+
+    Returns, over ``box``: ``box_value`` and the values of other axes (``box_...``), ``n_equilibria``,
+    ``n_stable_equilibria``, ``equilibria_index_sum``, and ``box_verdict``, of `COUNTS`.
+    """
+    if not counted:
+        return {}
+    first = counted[0]
+    columns = {"value": [one.value for one in counted], **{d: [one.where[d] for one in counted] for d in first.where}}
+    units = {n: parameter_units(first.family.free[0] if n == "value" else n, model) for n in columns}
+    about = f"sum of the signs of det(-J); {expected_index(first.family.system)} for all equilibria of a bounded flow"
+    numbers = {
+        "n_equilibria": ([len(one.states) for one in counted], "equilibria in the box"),
+        "n_stable_equilibria": ([one.n_stable for one in counted], "stable equilibria in the box"),
+        "equilibria_index_sum": ([one.index_sum for one in counted], about),
+    }
+    codes = np.array([COUNTS.index(one.verdict) for one in counted], np.int8)
+    return {
+        **{
+            f"box_{n}": ("box", values, {"units": units[n], "long_name": "where equilibria were counted"})
+            for n, values in columns.items()
+        },
+        **{n: ("box", np.array(v, np.int32), {"units": "1", "long_name": told}) for n, (v, told) in numbers.items()},
+        "box_verdict": ("box", codes, {"long_name": "whether the number is proved", **code_flags(COUNTS)}),
+    }

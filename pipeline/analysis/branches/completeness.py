@@ -1,0 +1,76 @@
+"""Say how complete a search was: of all orbits, or of all equilibria of a box, at values of the parameter."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.tabular import aligned, counted, words_of
+from pipeline.layout.own_words import RATE, dims_in_own_words
+from pipeline.layout.vocabulary import parameter_name
+from pipeline.specification.tables import FREQUENCY
+
+_VERDICTS = {
+    "agrees": "as if none is missing",
+    "missing": "orbits are missing",
+    "diverged": "says nothing: cells diverged",
+    "unfinished": "says nothing: cells are unfinished",
+    "flow": "says nothing of a flow",
+}
+
+
+def searched_lines(ds: xr.Dataset) -> list[str]:
+    """Return text lines on the points at which all orbits were searched; none if there was no search."""
+    if "searched_value" not in ds:
+        return []
+    word = str(ds.attrs.get(RATE, FREQUENCY))
+    dims = {n: str(n).removeprefix("searched_") for n in ds.data_vars if str(n).startswith("searched_")}
+    dims["searched_value"] = str(ds.attrs["parameter"])
+    names = {n: parameter_name(dims_in_own_words([dim], word)[0]) for n, dim in dims.items()}
+    rows = []
+    for k in range(ds.sizes["searched"]):
+        one = ds.isel(searched=k)
+        told = {words_of(ds["index_verdict"])[code] for code in one["index_verdict"].values.tolist()}
+        counts = zip(ds["times"].values.tolist(), one["n_orbits"].values, one["index_sum"].values, strict=True)
+        rows.append(
+            {
+                **{name: f"{float(one[n]):.7g}" for n, name in names.items()},
+                **{f"period {p}": f"{n} ({total:+d})" for p, n, total in counts},
+                "coverage": f"{float(one['coverage']):.0%}" if np.isfinite(one["coverage"]) else "?",
+                "sum": _VERDICTS["missing" if "missing" in told else told.pop()],
+            }
+        )
+    head = ["", "all orbits searched: their number and, in brackets, the sum of their indices"]
+    return [*head, *aligned(rows)]
+
+
+_NUMBERS = {
+    "proved": "proved by interval arithmetic",
+    "border": "not proved: one lies on the border of the box; move the border",
+    "undecided": "not proved: some touch or nearly touch",
+    "jumps": "not proved: the rates jump",
+    "no_text": "not proved: the model is no text",
+}
+
+
+def counted_lines(ds: xr.Dataset) -> list[str]:
+    """Return text lines on the equilibria that were counted; none if there was no count."""
+    if "box_verdict" not in ds:
+        return []
+    axes = [str(n) for n in ds.data_vars if str(n).startswith("box_") and n not in ("box_verdict", "box_value")]
+    names = {"box_value": parameter_name(str(ds.attrs["parameter"]))}
+    names |= {n: parameter_name(n.removeprefix("box_")) for n in axes}
+    verdicts = words_of(ds["box_verdict"])
+    rows = []
+    for k in range(ds.sizes["box"]):
+        one = ds.isel(box=k)
+        rows.append(
+            {
+                **{told: f"{float(one[n]):.7g}" for n, told in names.items()},
+                "equilibria": str(int(one["n_equilibria"])),
+                "stable": str(int(one["n_stable_equilibria"])),
+                "sum of indices": f"{int(one['equilibria_index_sum']):+d}",
+                "their number": _NUMBERS[verdicts[int(one["box_verdict"])]],
+            }
+        )
+    return ["", f"all equilibria of the box, at {counted(len(rows), 'value')}", *aligned(rows)]

@@ -1,0 +1,122 @@
+"""Find the returns of a time series to its maxima, their return map, and the period of the motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal, stats
+
+from pipeline.analysis.series.embedding import Floats, Series
+from pipeline.analysis.series.surrogates import repeats_by_chance
+
+PROMINENCE = 0.1
+"""Least height of a maximum over the minima beside it, in standard deviations."""
+
+FEWEST = 12
+"""Fewest returns from which a period is taken."""
+
+IRREGULAR = 0.4
+"""Scatter of return times, as a share of their mean, from which on they are no period."""
+
+MOST_IN_CYCLE = 8
+"""Most maxima in a cycle."""
+
+EXACT, CLOSE = 0.01, 0.12
+"""Scatter of the maxima of a closed orbit in standard deviations: without noise, and with noise."""
+
+FEWEST_CYCLES = 20
+"""Fewest cycles of a closed orbit with noise: chaos may stay near an unstable orbit for as long as that."""
+
+N_SEGMENTS = 8
+"""Stretches over which intervals are taken."""
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Maxima of a series in the order of time, and the mean time between them."""
+
+    time: Floats  # since the beginning of the piece [s]
+    height: Floats
+    piece: np.ndarray
+    mean: float = np.nan  # time between maxima [s]
+    low: float = np.nan
+    high: float = np.nan
+    scatter: float = np.nan  # standard deviation of a time between maxima [s]
+    in_cycle: int = 0  # maxima in a closed orbit; 0 if it is not closed, or not decided
+    reason: str = ""
+
+    def pairs(self, apart: int = 1) -> np.ndarray:
+        """Return the maxima that have another one so many returns later in their piece."""
+        return np.flatnonzero(self.piece[apart:] == self.piece[:-apart])
+
+
+def returns_of(series: Series, delay: int) -> Returns:
+    """Return the maxima of a series, and its mean period.
+
+    The series is smoothed by parabolas over half a delay, and a maximum is refined by a parabola through three samples.
+    The interval is that of Student from the mean times in `N_SEGMENTS` stretches.
+
+    Parameters
+    ----------
+    series
+        All samples.
+    delay
+        Delay of the embedding [samples], about a quarter of a period.
+    """
+    time, height, piece = _maxima(series, delay)
+    plain = Returns(time, height, piece)
+    firsts = plain.pairs()
+    if len(firsts) < FEWEST:
+        return Returns(time, height, piece, reason=f"{len(firsts)} returns, fewer than {FEWEST}")
+    times = time[firsts + 1] - time[firsts]
+    mean, scatter = float(times.mean()), float(times.std(ddof=1))
+    # a cycle with several maxima has as many times between them: whole cycles are compared
+    cycle = _in_cycle(plain, series)
+    of_cycles = plain.pairs(max(cycle, 1))
+    spans = (time[of_cycles + max(cycle, 1)] - time[of_cycles]) / max(cycle, 1)
+    means = [part.mean() for part in np.array_split(spans, N_SEGMENTS)]
+    half = float(stats.t.ppf(0.975, N_SEGMENTS - 1) * np.std(means, ddof=1) / np.sqrt(N_SEGMENTS))
+    irregular = cycle == 0 and scatter > IRREGULAR * mean
+    reason = f"times between maxima scatter by {scatter / mean:.0%}" if irregular else ""
+    value = float(spans.mean()) if cycle else mean
+    return Returns(time, height, piece, value, value - half, value + half, float(np.std(spans)), cycle, reason)
+
+
+def _maxima(series: Series, delay: int) -> tuple[Floats, Floats, np.ndarray]:
+    least = PROMINENCE * float(series.values.std())
+    window = max(5, delay // 2 * 2 + 1)
+    found = []
+    for number, piece in enumerate(series.pieces()):
+        if len(piece) <= window:
+            continue
+        smooth = signal.savgol_filter(piece, window, 2)
+        peaks = signal.find_peaks(smooth, prominence=least)[0]
+        before, at, after = smooth[peaks - 1], smooth[peaks], smooth[peaks + 1]
+        curvature = np.minimum(before - 2.0 * at + after, -1e-300)
+        shift = np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)
+        found.append((peaks + shift, at - 0.25 * (before - after) * shift, np.full(len(peaks), number)))
+    if not found:
+        return np.empty(0), np.empty(0), np.empty(0, np.int64)
+    place, height, piece = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return place * series.step, height, piece
+
+
+def _in_cycle(returns: Returns, series: Series) -> int:
+    """Return the number of maxima after which heights repeat but for noise without memory; 0 if they do not."""
+    size = float(series.values.std())
+    scatter = np.full(MOST_IN_CYCLE + 1, np.inf)
+    for k in range(1, min(MOST_IN_CYCLE, len(returns.height) // 4) + 1):
+        firsts = returns.pairs(k)
+        if len(firsts) >= FEWEST // 2:
+            scatter[k] = np.sqrt(np.mean((returns.height[firsts + k] - returns.height[firsts]) ** 2) / 2.0) / size
+    exact = np.flatnonzero(scatter < EXACT)
+    if len(exact):
+        return int(exact[0])
+    k = int(np.flatnonzero(scatter <= 1.5 * scatter.min() + EXACT)[0])
+    if not scatter[k] <= CLOSE or len(returns.height) < FEWEST_CYCLES * k or np.ptp(returns.piece) > 0:
+        return 0
+    rest = returns.height.copy()
+    for phase in range(k):
+        rest[phase::k] -= rest[phase::k].mean()
+    return k if repeats_by_chance(rest, np.random.default_rng(0)) else 0

@@ -1,0 +1,92 @@
+"""Test a time series against surrogates: series of linear noise with the same spectrum and the same values."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from pipeline.analysis.series.embedding import Embedding, Floats, Series
+
+N_SURROGATES = 39
+"""Surrogates: the least of 40 errors is that of the series with a probability of 2.5 % by chance."""
+
+MOST_SAMPLES = 2048
+"""Longest stretch of a series that is compared with surrogates."""
+
+N_ITERATIONS = 60
+"""Most iterations of a surrogate."""
+
+
+def surrogate(values: Floats, generator: np.random.Generator) -> Floats:
+    """Return a series of the same values in another order, with almost the same spectrum and random phases.
+
+    Iterative amplitude-adjusted Fourier transform (Schreiber and Schmitz, Phys. Rev. Lett. 77, 635, 1996).
+    """
+    ordered = np.sort(values)
+    size = np.abs(fft.rfft(values))
+    found = generator.permutation(values)
+    order = np.empty(0, np.int64)
+    for _ in range(N_ITERATIONS):
+        phases = np.exp(1j * np.angle(fft.rfft(found)))
+        new = np.argsort(fft.irfft(size * phases, len(values)))
+        if np.array_equal(new, order):
+            break
+        order = new
+        found[order] = ordered
+    return np.asarray(found)
+
+
+def closed_stretch(values: Floats) -> Floats:
+    """Return the longest stretch whose ends fit: a jump or a kink between them would add power to the spectrum.
+
+    Up to a tenth is cut off on each side.
+    """
+    values = values[:MOST_SAMPLES]
+    tenth = max(1, len(values) // 10)
+    slope = np.gradient(values)
+    scale, steep = values.std(), slope.std()
+    start, end = np.arange(tenth), len(values) - 1 - np.arange(tenth)
+    misfit = ((values[start][:, None] - values[end]) / scale) ** 2
+    misfit += ((slope[start][:, None] - slope[end]) / max(float(steep), 1e-300)) ** 2
+    a, b = np.unravel_index(int(misfit.argmin()), misfit.shape)
+    begin, stop = int(start[a]), int(end[b])
+    # a transform of a length with large prime factors is slow
+    return values[begin : begin + int(fft.prev_fast_len(stop - begin, real=True))]
+
+
+def prediction_error(series: Series, delay: int, dimension: int, theiler: int, ahead: int) -> float:
+    """Return the error of predicting values from the futures of near vectors, as a share of the standard deviation.
+
+    The prediction is the mean over the nearest vectors `ahead` samples after their last coordinate.
+    """
+    embedding = Embedding(series, delay, dimension, theiler)
+    n_nearest = dimension + 2
+    first, nearest, _ = embedding.neighbours(400, ahead, n_nearest)
+    if not len(first):
+        return np.nan
+    later = embedding.span + ahead
+    predicted = series.values[nearest + later].mean(axis=1)
+    return float(np.sqrt(np.mean((predicted - series.values[first + later]) ** 2)) / series.values.std())
+
+
+def against_noise(
+    values: Floats, delay: int, dimension: int, theiler: int, generator: np.random.Generator
+) -> tuple[float, npt.NDArray[np.float64]]:
+    """Return the prediction error of a series, and those of its surrogates."""
+    stretch = closed_stretch(values)
+
+    def error(one: Floats) -> float:
+        return prediction_error(Series.of([one], 1.0), delay, dimension, theiler, 2 * delay)
+
+    return error(stretch), np.array([error(surrogate(stretch, generator)) for _ in range(N_SURROGATES)])
+
+
+def repeats_by_chance(values: Floats, generator: np.random.Generator) -> bool:
+    """Return whether a sequence is predicted no better than its shuffled copies: it has no memory that is seen."""
+
+    def error(one: Floats) -> float:
+        return prediction_error(Series.of([one], 1.0), 1, 2, 0, 1)
+
+    own = error(values)
+    return bool(own >= min(error(generator.permutation(values)) for _ in range(99)))
