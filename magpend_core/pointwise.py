@@ -36,6 +36,10 @@ def _named(t: Any, y: Any, c: Any) -> Any:
     return quantities(t, y, rhs(y, u, c), u, c)
 
 
+def _surfaces(t: Any, y: Any, c: Any) -> Any:
+    return event_values(t, y, rhs(y, forcing(t, c), c), c, 0.0 * t)
+
+
 def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
     """Set the modes of the switches of a SIMD lane from the signs of the event functions; no switch slides."""
     for k in range(N_OWN, NC):
@@ -107,7 +111,7 @@ def _forced(t: Any, y: Any, c: Any) -> Any:
     return (0.0 * y[0] + forcing(t, c),)
 
 
-_KINDS = {"rates": _rates, "jacobian": _slopes, "quantities": _named, "forcing": _forced}
+_KINDS = {"rates": _rates, "jacobian": _slopes, "quantities": _named, "forcing": _forced, "surfaces": _surfaces}
 
 
 @cache
@@ -181,6 +185,28 @@ def evaluate_packed(
     """
     times, rows = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(states, np.float64)
     _evaluator(system, "quantities")(times, rows, float(frequency_hz), packed, out)
+
+
+def surfaces_at(
+    system: System, t: np.ndarray, states: np.ndarray, packed: np.ndarray, frequency_hz: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the functions whose zeros are the surfaces of switches and impacts, and their rates. Nothing is checked.
+
+    Parameters
+    ----------
+    system, t, states, packed, frequency_hz
+        As for `evaluate_packed`.
+
+    Returns
+    -------
+    values, rates : ndarray, (n, surface)
+        The switches come first. No switch slides and no state rests on the surface of an impact.
+    """
+    out = np.empty((len(t), 2 * system.n_events))
+    times, rows = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(states, np.float64)
+    _evaluator(system, "surfaces")(times, rows, float(frequency_hz), packed, out)
+    n = system.n_switches + system.n_impacts
+    return out[:, : 2 * n : 2], out[:, 1 : 2 * n : 2]
 
 
 def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:

@@ -11,7 +11,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
-from pipeline.analysis.events.names import BANDS, BOUNDARY, CASCADE, INTERIOR, NAMES, RANGE_END, TWINS, UNDECIDED
+from pipeline.analysis.events.names import (
+    BANDS,
+    BOUNDARY,
+    CASCADE,
+    GRAZING,
+    INTERIOR,
+    INTERMITTENCY,
+    LOCKING,
+    NAMES,
+    RANGE_END,
+    TWINS,
+    UNDECIDED,
+)
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain, words_of
 from pipeline.layout.vocabulary import letter
@@ -33,15 +45,19 @@ _HALO = [withStroke(linewidth=1.8, foreground="white")]
 
 _OPEN: dict[str, Any] = {"color": "0.45", "linewidth": 1.2, "linestyle": (0, (1, 1.2))}
 _JOIN: dict[str, Any] = {"arrowstyle": "->", "linewidth": 0.6, "color": "0.35", "shrinkA": 5.0, "shrinkB": 4.0}
-_CRISES = {
-    BOUNDARY: ("X", "boundary crisis"),
-    INTERIOR: ("P", "interior crisis"),
-    BANDS: ("d", "merging of bands"),
-    TWINS: ("H", "merging of attractors"),
-}
-"""Markers and names of crises."""
-
 _MARK: dict[str, Any] = {"markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": "black", "zorder": 8.0}
+
+_OTHERS = {
+    CASCADE: ("*", "", "end of a cascade"),
+    BOUNDARY: ("X", "", "boundary crisis"),
+    INTERIOR: ("P", "", "interior crisis"),
+    BANDS: ("d", "", "merging of bands"),
+    TWINS: ("H", "", "merging of attractors"),
+    **{name: ("h", kind.upper(), f"intermittency {kind.upper()}") for kind, name in INTERMITTENCY.items()},
+    LOCKING: (">", "", "locking"),
+    GRAZING: ("<", "", "grazing"),
+}
+"""Marker, label and name of the events that are no bifurcations of a branch."""
 
 
 @style.drawn
@@ -136,9 +152,8 @@ def _draw_events(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
             ax.plot([seen, beyond], [row, row], zorder=2.0, **_OPEN)
         if not np.isfinite(x) or what == RANGE_END:
             continue
-        marker = _CRISES[what][0] if what in _CRISES else MARKERS.get(what, "*")
+        marker, label = _OTHERS[what][:2] if what in _OTHERS else (MARKERS[what], LABELS[what])
         ax.plot(x, row, linestyle="none", marker=marker, **_MARK)
-        label = LABELS.get(what, "")
         if all(abs(x - other) > 3.0 * _LETTER * width for other in taken[row]):
             taken[row].append(x)
         else:
@@ -159,12 +174,10 @@ def _handles(ds: xr.Dataset) -> list[Any]:
         for kind in (*KINDS, *LIMITS)
         if kind in present
     ]
-    if CASCADE in present:
-        handles.append(Line2D([], [], linestyle="none", marker="*", label="end of a cascade", **_MARK))
     handles += [
         Line2D([], [], linestyle="none", marker=marker, label=name, **_MARK)
-        for kind, (marker, name) in _CRISES.items()
-        if kind in present
+        for what, (marker, _, name) in _OTHERS.items()
+        if what in present
     ]
     if UNDECIDED in present:
         handles.append(Line2D([], [], label="not decided", **_OPEN))

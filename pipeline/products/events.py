@@ -24,9 +24,9 @@ EVENTS = Analysis(
     "events",
     """Name the bifurcation at which each attractor begins, changes its period and ends along the swept parameter.
 
-    Follows the branch of each orbit from the last value at which cells end on it. Ends of chaotic sets are
-    named where a cascade of doublings or a crisis is proved, those of tori at a Neimark-Sacker point; all others are
-    not decided.""",
+    Follows the branch of each orbit from the last value at which cells end on it. Ends of chaotic sets and tori are
+    named where doublings, a Neimark-Sacker point, slow passages near an orbit beyond (intermittency, locking) or the
+    touch of an unstable orbit (crises) prove them; all others are not decided.""",
     EventOptions,
     compute=f"{_ROOM}:events",
     table="pipeline.analysis.events.sentences:events_table",
@@ -34,5 +34,5 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
-    version=3,
+    version=4,
 )

@@ -3,8 +3,9 @@
 An attractor that is a closed orbit or an equilibrium lives where its branch is stable. From the last parameter value
 at which cells end on it, its branch is followed until it loses stability (`lines`). So the event is the first
 located bifurcation on the branch of that very orbit, wherever it lies on the grid of parameter values; where the
-branch gives no reason, the event is not decided. `analysis` joins attractors and branches, `cascades` decides ends of
-chaotic sets and tori, `crises` names crises by what `contact` measures, `sentences` has the table.
+branch gives no reason, the event is not decided. `analysis` joins attractors and branches; `cascades`, `passages` and
+`crises` decide ends of chaotic sets and tori, `crises` by what `contact` measures; `grazing` decides those of orbits
+that touch a surface; `sentences` has the table.
 
 Ids that lie on one stable piece of a branch are one attractor and have the least of their ids, since ids of
 equilibria rest on distance alone. Nothing is looked for between neighbouring values at which cells end on the same
@@ -38,8 +39,10 @@ variable                       dims              meaning
 ``stretch_after``              event             stretch of the same attractor beyond a change; -1 none
 ``to_stretch``                 event, outcome    stretches on which the cells go on; -1 none, -2 they diverge
 ``doublings``, ``ratio``       event, doubling   of a cascade: doublings, and the ratio of the last intervals
-``met_period``, ``exponent``,  event             of a crisis: period of the unstable orbit that is met, exponent of
-``exponent_error``                               the mean lifetimes beyond
+``exponent``,                  event             minus the power of the distance from the event with which laminar
+``exponent_error``                               phases or lifetimes grow, and its error
+``rotation``                   event             p/q of the orbit to which a torus locks, in turns of the section
+``met_period``                 event             of a crisis: period of the unstable orbit that is met
 ``twin``, ``lives_beyond``     event             of a crisis: id of the set with which it merges (-1 none); 1 if the
                                                  set on the other side meets the orbit
 ``evidence``                   event             what decided the event, or what was tried

@@ -13,12 +13,15 @@ from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, value_of
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises, Crisis
 from pipeline.analysis.events.graph import at_ends
+from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
-from pipeline.analysis.events.names import CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import CRISES, GRAZING, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
 from pipeline.analysis.outcomes import DIVERGED, outcomes
@@ -143,10 +146,8 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
             if why:
                 fates[one, rises] = (Fate(np.nan, why=why),) * 2
                 continue
-            frequency, packed = parameters_at(ds.isel({scene.axis: int(scene.order[place])}), scene.base)
-            family = family_of(scene.base.model.system, one.period, frequency, packed, scene.axis, scene.scale)
             asked.append((one, rises))
-            orbits.append(Orbit(family, points[row][0], value_of(family, frequency, packed)))
+            orbits.append(Orbit(_family(scene, place, one.period), points[row][0], float(scene.along[place])))
     for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
         if found is None:
             fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
@@ -202,7 +203,7 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     if fate.limit:
         return replace(event, what=fate.limit, error=max(fate.error, LOCATED * scene.scale))
     if fate.bifurcation < 0:
-        return event
+        return _touching(scene, event)
     ds, k = scene.located, fate.bifurcation
     sides = ds["n_unstable_before"].values[k], ds["n_unstable_after"].values[k]
     if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
@@ -212,6 +213,27 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     error = max(float(ds["bracket"].values[k]), (AT_BRANCH_POINT if crosses else LOCATED) * scene.scale)
     what = crossing_at(ds, scene.lines, k) if crosses else KINDS[int(ds["kind"].values[k])]
     return replace(event, what=what, error=error)
+
+
+def _family(scene: Scene, place: int, period: int) -> Family:
+    """Return the family of orbits of a period at the parameters of a place on the axis."""
+    frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
+    return family_of(scene.base.model.system, period, frequency, packed, scene.axis, scene.scale)
+
+
+def _touching(scene: Scene, event: Event) -> Event:
+    """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
+    fate = event.fate
+    line = next((line for line in scene.lines if line.branch == fate.branch), None)
+    if line is None or fate.node not in (0, len(line.value) - 1):
+        return event
+    family = _family(scene, event.stretch.places[event.rises], line.period)
+    found = grazing_of(line, fate.node, family)
+    if found is None:
+        return event
+    value, error, why = found
+    fate = replace(fate, value=value, why=f"{fate.why}; {why}")
+    return replace(event, fate=fate, what=GRAZING, error=max(error, LOCATED * scene.scale))
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:
@@ -262,8 +284,11 @@ def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> B
     """Judge the end of a chaotic set or a torus, given the fate of the orbit beyond."""
     along, geometry, all_points = scene.along, geometry_of(scene.attractors), points_of_rows(scene.attractors)
     points = all_points[stretch.rows[way > 0]]
-    if SETS[stretch.kind] == "chaotic_set":
-        bracket = float(along[place + way]), float(along[place])
+    bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
+    if may_pass(scene.located, fate.bifurcation, is_torus):
+        family = _family(scene, place, 1)
+        return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
+    if not is_torus:
         return cascade_of(scene.located, fate, bracket, points, geometry)
     if stretch.places[0] == stretch.places[1]:
         return Born("", "one value of the run shows the torus; two are needed to see it shrink")
@@ -278,6 +303,8 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
     beyond = [other.stretch for other in named if other.stretch.attractor == heir]
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
+    if any(SETS[other.kind] == "chaotic_set" for other in beyond):
+        return f"{letter(heir)} is a chaotic set: whether the torus breaks up into it is not looked for"
     if len(one.to) > 1:
         return "its cells do not all go on to the same attractor"
     return "its cells do not go on to an orbit whose end is located and whose cells go on to it"
@@ -351,6 +378,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
             "1 if the set on the other side meets the orbit",
             {},
         ),
+        "rotation": ([one.born.rotation if one.born else "" for one in named], "p/q of a locked orbit", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {

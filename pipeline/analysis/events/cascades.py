@@ -48,6 +48,7 @@ class Born:
     ratio: float = np.nan
     exponent: float = np.nan  # minus the power of the distance with which laminar phases grow
     exponent_error: float = np.nan
+    rotation: str = ""  # p/q of the orbit to which a torus locks
 
 
 def cascade_of(

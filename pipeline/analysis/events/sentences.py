@@ -7,7 +7,19 @@ import xarray as xr
 
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.events.graph import graph_of
-from pipeline.analysis.events.names import BANDS, BOUNDARY, CASCADE, CRISES, LIVES_ON, RANGE_END, TWINS, UNDECIDED
+from pipeline.analysis.events.names import (
+    BANDS,
+    BOUNDARY,
+    CASCADE,
+    CRISES,
+    GRAZING,
+    INTERMITTENCY,
+    LIVES_ON,
+    LOCKING,
+    RANGE_END,
+    TWINS,
+    UNDECIDED,
+)
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tabular import (
     MOST_ROWS,
@@ -26,7 +38,7 @@ from pipeline.products.product import Table
 _NAMES = (
     *("attractor", "set", "period", "period_after", "rises", "what", "criticality", "value", "value_error", "seen"),
     *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "met_period", "exponent"),
-    *("exponent_error", "twin", "lives_beyond", "evidence"),
+    *("exponent_error", "rotation", "twin", "lives_beyond", "evidence"),
 )
 
 _LIMITS = {"homoclinic": "homoclinic end (HOM) at a saddle", "snic": "saddle node on a circle (SNIC)"}
@@ -117,11 +129,12 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
 def _reason(row: Row, doublings: list[float]) -> str:
     """Name the event and say what the attractor meets, in words."""
     what, own, other = row["what"], bool(row["is_own"]), row["other_branch"]
-    if what == CASCADE:
-        listed = ", ".join(f"{x:.7g}" for x in doublings)
-        return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    if what in (CASCADE, LOCKING, *INTERMITTENCY.values()):
+        return _end_of_set(row, doublings)
     if what in CRISES:
         return _crisis(row)
+    if what == GRAZING:
+        return "grazing, a peak of it begins to touch a surface of impacts or switches"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
@@ -157,6 +170,25 @@ def _crisis(row: Row) -> str:
     times = f"lifetimes {'' if row['what'] == BOUNDARY else 'of its parts '}grow with the power"
     power = f"-{row['exponent']:.2f} ± {row['exponent_error']:.2f} of the distance"
     return f"{name}, {who} meets the unstable orbit of period {row['met_period']}{twin}; {times} {power}"
+
+
+def _end_of_set(row: Row, doublings: list[float]) -> str:
+    """Name the end of a chaotic set or of a torus, in words."""
+    what = str(row["what"])
+    if what == CASCADE:
+        listed = ", ".join(f"{x:.7g}" for x in doublings)
+        return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
+    kinds = {
+        INTERMITTENCY["ii"]: "subcritical Neimark-Sacker point (NS)",
+        INTERMITTENCY["iii"]: "subcritical doubling (PD)",
+    }
+    ghost = f"the {kinds.get(what, 'fold (LP)')} of the orbit of branch {row['branch']}"
+    if what == LOCKING:
+        of = f" as {row['rotation']}" if row["rotation"] else ""
+        return f"it locks{of} at {ghost}"
+    power = f"-{row['exponent']:.2f} ± {row['exponent_error']:.1g} of the distance"
+    name = plain(what).rpartition(" ")[2].upper()
+    return f"intermittency of type {name} at {ghost}, laminar phases grow with the power {power}"
 
 
 def _going_on(attractor: int, to: dict[int, int]) -> str:

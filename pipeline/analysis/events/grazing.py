@@ -1,0 +1,140 @@
+"""Decide whether the branch of an orbit ends where the orbit begins to touch a surface of impacts or switches.
+
+The map of the section has no derivative where an orbit touches such a surface without crossing it, so that Newton's
+method stops there and the branch is stuck. Up to it the orbit and the height of its peak below the surface are smooth
+in the parameter (di Bernardo et al., Piecewise-smooth Dynamical Systems, 2008, chapter 6). So the value at which the
+peak reaches the surface follows from the last orbits of the branch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from magpend_core.orbits import crossed_state
+from magpend_core.pointwise import surfaces_at
+from magpend_core.sampling import Drive, sample
+from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.known import at_value
+from pipeline.analysis.branches.lockstep import run_together
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.events.lines import Line
+from pipeline.analysis.tolerances import BRANCH_RTOL
+
+SAMPLES = 4000
+"""Instants of an orbit between which its peaks are interpolated."""
+
+CORNER = 3.0
+"""Change of a rate between two instants, in units of those before and after, from which on it is a jump: an impact."""
+
+ROUNDED = 1e-9
+"""Values of the surface's function, in units of its range, that are 0 at neighbouring instants: sliding, or at rest."""
+
+NODES, APART = 30, 2.0
+"""Last points of a branch that are looked at, and the least ratio of the heights of those that are used."""
+
+ORBITS = 4
+"""Most orbits from which the end is extrapolated."""
+
+NEAR = 0.02
+"""Largest height of the last peak below the surface, in units of that function's range on the orbit."""
+
+REACH = 1e-4
+"""Largest distance of the touch from the last orbit, and largest error, in units of the interval of the parameter."""
+
+
+def grazing_of(line: Line, node: int, family: Family) -> tuple[float, float, str] | None:
+    """Return the value at which an orbit begins to touch a surface, its error and the evidence; None if it does not.
+
+    Parameters
+    ----------
+    line, node
+        Branch of the orbit, and its end.
+    family
+        Family of the orbits of the branch.
+    """
+    system = family.system
+    if not system.n_switches + system.n_impacts or not line.period:
+        return None
+    nodes = range(node, max(node - NODES, -1), -1) if node else range(min(NODES, len(line.value)))
+    guesses = [family.unknowns(line.points[i][0], [line.value[i]]) for i in nodes if line.bifurcation[i] < 0]
+    points = [p for p in run_together([at_value(family, guess) for guess in guesses]) if p is not None]
+    peaks = [_peaks(family, point) for point in points]
+    values = np.array([family.values(point.u)[0] for point in points])
+    found = [_touch(values, [peak[of] for peak in peaks]) for of in range(len(peaks[0]) if peaks else 0)]
+    scale = family.scales[0]
+    for of, touch in enumerate(found):
+        if touch is not None and abs(touch[0] - values[0]) <= REACH * scale and touch[1] <= REACH * scale:
+            surface = of // 2
+            n = surface + 1 if surface < system.n_switches else surface + 1 - system.n_switches
+            what = f"{'switch' if surface < system.n_switches else 'impact'} {n}"
+            heights = ", ".join(f"{-peak:.1e}" for peak in touch[2])
+            return touch[0], touch[1], f"a peak of the orbit comes as near to the surface of {what} as {heights}"
+    return None
+
+
+def _touch(values: np.ndarray, peaks: Sequence[float]) -> tuple[float, float, list[float]] | None:
+    """Extrapolate a branch to the value at which the peak of its orbits is 0, given in order from the end inwards.
+
+    Peaks are shares of the range of the surface's function. Return the value, its error, and the peaks used.
+    """
+    chosen: list[int] = []
+    for i, peak in enumerate(peaks):
+        if not peak < 0.0:  # no peak on this side
+            break
+        if not chosen or peak < APART * peaks[chosen[-1]]:
+            chosen.append(i)
+    chosen = chosen[:ORBITS]
+    if len(chosen) < 3 or peaks[chosen[0]] < -NEAR:
+        return None
+    x, y = values[chosen], np.array(peaks)[chosen]
+    if not (np.diff(x) > 0.0).all() and not (np.diff(x) < 0.0).all():
+        return None
+    whole, less = _at_zero(y, x), _at_zero(y[:-1], x[:-1])
+    return whole, abs(whole - less), y.tolist()
+
+
+def _at_zero(y: np.ndarray, x: np.ndarray) -> float:
+    """Return the polynomial x(y) at y = 0 (Neville's method)."""
+    table = list(x)
+    for width in range(1, len(x)):
+        table = [(y[i + width] * table[i] - y[i] * table[i + 1]) / (y[i + width] - y[i]) for i in range(len(table) - 1)]
+    return float(table[0])
+
+
+def _peaks(family: Family, point: Point) -> list[float]:
+    """Return the highest smooth peak of an orbit below each surface, and above it with the sign changed, as shares of
+    the range of the surface's function; NaN if there is none.
+    """
+    system, rows, seconds = family.system, family.rows(point.u[None]), point.value.seconds
+    frequency, packed = float(rows.frequency_hz[0]), rows.parameters
+    times = np.linspace(0.0, seconds, SAMPLES)
+    is_flow = crossed_state(system) is not None
+    drive = Drive(np.array([seconds]) if is_flow else np.full(family.period, 1.0 / frequency))
+    orbit = sample(system, packed, rows.states, [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
+    values, rates = surfaces_at(system, np.mod(times, 1.0 / frequency), orbit.states[0], packed[0], frequency)
+    found: list[float] = []
+    for h, rate in zip(values.T, rates.T, strict=True):
+        extent = max(float(np.ptp(h)), 1e-300)
+        found += [_peak(sign * h, sign * rate, times[1]) / extent for sign in (1.0, -1.0)]
+    return found
+
+
+def _peak(h: np.ndarray, rate: np.ndarray, step: float) -> float:
+    """Return the highest maximum below 0 of a function at equal steps, without those at jumps of its rate.
+
+    NaN if there is none, or if the function stays at 0 for a while.
+    """
+    on = np.abs(h) <= ROUNDED * np.ptp(h)
+    if (on[:-2] & on[1:-1] & on[2:]).any():
+        return np.nan
+    jump = np.abs(np.diff(rate))
+    usual = np.maximum(np.append(jump[1:], 0.0), np.append(0.0, jump[:-1]))
+    at = np.flatnonzero((rate[:-1] > 0.0) & (rate[1:] <= 0.0) & (jump <= CORNER * usual))
+    a, b, ra, rb = h[at], h[at + 1], step * rate[at], step * rate[at + 1]
+    s = ra / (ra - rb)
+    # the cubic through both values and rates
+    tops = (1 + 2 * s) * (1 - s) ** 2 * a + s * (1 - s) ** 2 * ra + s**2 * (3 - 2 * s) * b - s**2 * (1 - s) * rb
+    below = tops[tops < 0.0]
+    return float(below.max()) if len(below) else np.nan

@@ -1,0 +1,299 @@
+"""Decide whether a chaotic set or a torus ends at the local bifurcation of the orbit to which its cells go on.
+
+Beyond a fold, a subcritical Neimark-Sacker point or a subcritical doubling, trajectories pass slowly where the stable
+orbit has been: intermittency of type I, II or III (Pomeau and Manneville, Commun. Math. Phys. 74, 1980, 189). A torus
+that passes slowly where two orbits have met in a fold locks onto them. With d the distance from the bifurcation, the
+passages through the channel of a fold take d**-1/2; near an orbit that repels with the rate d they take 1/d.
+
+The mean length of the laminar phases depends on where trajectories come back to the channel (Elaskar and del Rio, New
+Advances on Chaotic Intermittency and its Applications, 2017). A ratio of the means of two powers, l**m and l**(m - 1),
+does so less: of type I with m = 6 it is near to the longest passage, which has the exponent -1/2. For types II and III
+m = 2, the length of the phase in which a laminar instant lies: its exponent is -1 if arrivals on a line through the
+orbit are spread evenly near it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import gcd
+
+import numpy as np
+import xarray as xr
+from scipy.optimize import least_squares
+
+from magpend_core.defaults import MOST_STEPS
+from magpend_core.extension import more_sections
+from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.events.cascades import Born
+from pipeline.analysis.events.lines import at
+from pipeline.analysis.events.names import INTERMITTENCY, LOCKING
+from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tabular import plain
+
+TYPES = {FOLD: "i", TORUS: "ii", DOUBLING: "iii"}
+"""Types of intermittency by the bifurcation of the orbit."""
+
+EXPONENTS = {FOLD: -0.5, TORUS: -1.0, DOUBLING: -1.0}
+"""Exponents of the length over the distance from the bifurcation."""
+
+MEASURED = {FOLD: (10, 16, 4096), TORUS: (6, 32, 16384), DOUBLING: (6, 32, 16384)}
+"""Numbers of distances, each half of the one before, of trajectories at each, and of their sections."""
+
+POWERS = {FOLD: 6, TORUS: 2, DOUBLING: 2}
+"""Powers m in the ratio of means that is the length of laminar phases."""
+
+GATE, OF_GAP = 0.1, 0.25
+"""Largest distance from the orbit in a laminar phase: as a share of the extent of the set, and at most as a share of
+the least distance between two section points of the orbit.
+"""
+
+LEAST_LENGTH, OF_SECTIONS = 10.0, 1.0 / 12.0
+"""Lengths that are fitted: at least these periods of the orbit, and at most this share of the sections."""
+
+LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 60, 4, 6
+"""Least number of laminar phases at a value, and numbers of values that are fitted, the nearest ones."""
+
+GROUPS = 8
+"""Groups of trajectories whose spread gives the error of a length."""
+
+AGREES, LARGEST_ERROR = 0.12, 0.15
+"""Largest deviation of an exponent from the expected one beyond its error, and largest error."""
+
+REGULAR = 0.2
+"""Largest spread of the lengths of laminar phases on a torus; on chaotic sets it is larger."""
+
+WHOLE = 0.1
+"""Largest distance of the turns over the period of an orbit from a whole number, on a torus that passes it."""
+
+TOLERANCE = 1e-9
+"""Tolerance of the integrations."""
+
+
+@dataclass(frozen=True)
+class Phases:
+    """Laminar phases at some distances from a bifurcation: length, its relative error, number and spread."""
+
+    distance: np.ndarray
+    length: np.ndarray
+    error: np.ndarray
+    number: np.ndarray
+    spread: np.ndarray  # standard deviation of the lengths over their mean, seen from laminar instants
+
+
+def may_pass(ds: xr.Dataset, k: int, is_torus: bool) -> bool:
+    """Return whether a set can end at a bifurcation of an orbit, by slow passages near it."""
+    kind, degree = KINDS[int(ds["kind"].values[k])], CRITICALITIES[int(ds["criticality"].values[k])]
+    return kind == FOLD or (not is_torus and kind in EXPONENTS and degree == "subcritical")
+
+
+def passage_of(
+    ds: xr.Dataset,
+    k: int,
+    family: Family,
+    bracket: tuple[float, float],
+    points: np.ndarray,
+    geometry: Geometry,
+    is_torus: bool,
+) -> Born:
+    """Judge whether a chaotic set or a torus ends at a bifurcation of the orbit to which its cells go on.
+
+    Parameters
+    ----------
+    ds, k
+        Located branches, and the number of a bifurcation at which the set may end, see `may_pass`.
+    family
+        Family of section points at the parameters of the set; its free parameter is that of the branches.
+    bracket
+        Values of the run on the orbit's side and on the set's side.
+    points
+        Section points of the set at its last value.
+    geometry
+        Geometry of the states.
+    is_torus
+        Whether the set is a torus.
+
+    Returns
+    -------
+    Born
+        With the exponent of the length and its error: 1/2 or 1, if it is named.
+    """
+    value, kind = float(ds["value"].values[k]), KINDS[int(ds["kind"].values[k])]
+    degree = "" if kind == FOLD else "subcritical "
+    told = f"the orbit to which its cells go ends at {at(ds, value)}: {degree}{plain(kind)}"
+    if not min(bracket) < value < max(bracket):
+        return Born("", told)
+    ghost = ds["bifurcation_section"].values[k]
+    ghost = ghost[np.isfinite(ghost).all(axis=-1)]
+    distances = abs(bracket[1] - value) * 0.5 ** np.arange(MEASURED[kind][0])
+    values = value + np.sign(bracket[1] - value) * distances
+    sections = _sections(family, values, points, *MEASURED[kind][1:])
+    found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
+    fitted = scaling(found, kind, len(ghost))
+    born = replace(_judged(found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
+    if born.what != LOCKING or fitted is None:
+        return born
+    return replace(born, rotation=rotation_of(sections[fitted[2][-1]], len(ghost), geometry))
+
+
+def _judged(
+    found: Phases, fitted: tuple[float, float, np.ndarray] | None, kind: str, told: str, value: float, is_torus: bool
+) -> Born:
+    """Name the end if the lengths grow towards the bifurcation with its exponent."""
+    if fitted is None:
+        return Born("", f"{told}; its trajectories show too few laminar phases near this orbit to scale their lengths")
+    exponent, error, chosen = fitted
+    lengths, away = found.length[chosen], found.distance[chosen]
+    told += f"; lengths of laminar phases near it from {lengths[0]:.3g} to {lengths[-1]:.3g} sections at distances from"
+    told += f" {away[0]:.2g} to {away[-1]:.2g}: exponent {exponent:.3f} ± {error:.1g}"
+    if (found.spread[chosen].max() <= REGULAR) != is_torus:
+        return Born("", f"{told}, but they are {'uneven, as in chaos' if is_torus else 'equally long, as on a torus'}")
+    expected = EXPONENTS[kind]
+    if error > LARGEST_ERROR or abs(exponent - expected) > max(AGREES, error):
+        return Born("", f"{told}, and {expected:g} is expected")
+    what = LOCKING if is_torus else INTERMITTENCY[TYPES[kind]]
+    return Born(what, told, value, exponent=-exponent, exponent_error=error)
+
+
+def _gate(points: np.ndarray, ghost: np.ndarray, geometry: Geometry) -> float:
+    """Return the distance from the orbit up to which a section belongs to a laminar phase."""
+    extent = float(np.ptp(geometry.difference(points, points[0]), axis=0).max())
+    gaps = geometry.distance(ghost[:, None], ghost[None])[np.triu_indices(len(ghost), 1)]
+    return float(min([GATE * extent, *(OF_GAP * gaps)]))
+
+
+def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int, n: int) -> np.ndarray:
+    """Integrate trajectories of a set at some values of the parameter, shape (value, trajectory, section, state)."""
+    starts = points[np.linspace(0, len(points) - 1, many).astype(int)]
+    unknowns = [family.unknowns(state, [value]) for value in values for state in starts]
+    rows = family.rows(np.array(unknowns))
+    found = more_sections(
+        rows.parameters[:, None],
+        rows.frequency_hz[:, None],
+        rows.states,
+        np.zeros(len(rows.states)),
+        n_more=n,
+        rtol=TOLERANCE,
+        atol=TOLERANCE,
+        max_steps_per_period=MOST_STEPS,
+        system=family.system,
+    )
+    return np.asarray(found.section[:, 0].reshape(len(values), many, n, -1))
+
+
+def phases(
+    sections: np.ndarray, ghost: np.ndarray, gate: float, distances: np.ndarray, geometry: Geometry, power: int
+) -> Phases:
+    """Measure the lengths of the laminar phases of trajectories: of their stays near an orbit.
+
+    Parameters
+    ----------
+    sections
+        Shape (distance, trajectory, section, state).
+    ghost
+        Section points of the orbit, shape (phase, state).
+    gate
+        Largest scaled distance from the orbit in a laminar phase.
+    distances
+        Distances from the bifurcation.
+    geometry
+        Geometry of the states.
+    power
+        The power m of `POWERS`.
+    """
+    rows = []
+    for one in sections:
+        near = np.zeros(one.shape[:-1], bool)
+        for point in ghost:
+            near |= geometry.distance(one, point) <= gate
+        # at the ends of a channel some points of the orbit are near and others are not
+        stays = [stay[stay >= 2 * len(ghost)] for stay in map(_runs, near)]
+        groups = [_ratio(np.concatenate(stays[i::GROUPS]), power) for i in range(GROUPS)]
+        every = np.concatenate(stays)
+        length, middle = _ratio(every, power), _ratio(every, 2)
+        # a length is a whole number of sections
+        error = float(np.std(groups)) / np.sqrt(GROUPS - 1.0) + 0.5
+        spread = np.sqrt(max(_ratio(every, 3) / middle - 1.0, 0.0))
+        rows.append((length, error / length, spread, len(every)))
+    length, error, spread, number = np.array(rows).T
+    return Phases(distances, length, error, number, spread)
+
+
+def _runs(near: np.ndarray) -> np.ndarray:
+    """Return the lengths of the runs of True in a row that begin and end within it."""
+    edges = np.diff(near.astype(np.int8))
+    begins, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    if near[0]:
+        ends = ends[1:]
+    return np.asarray(ends - begins[: len(ends)], np.float64)
+
+
+def _ratio(lengths: np.ndarray, power: int) -> float:
+    """Return the mean of a power of some lengths over that of the power before it; NaN without lengths."""
+    return float((lengths**power).sum() / (lengths ** (power - 1)).sum()) if len(lengths) else np.nan
+
+
+def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.ndarray] | None:
+    """Fit the exponent of the lengths over the distances, with its error, at the nearest distances that serve.
+
+    The difference between the exponents without the farthest and without the nearest distance is part of the error.
+    Return also the numbers of the distances; None if there are too few.
+    """
+    longest = OF_SECTIONS * MEASURED[kind][2]
+    serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= LEAST_PHASES)
+    chosen = np.flatnonzero(serves)[-MOST_VALUES:]
+    if len(chosen) < LEAST_VALUES:
+        return None
+    law = passage if kind == FOLD else straight
+    x, y, error = np.log(found.distance[chosen]), np.log(found.length[chosen]), found.error[chosen]
+    slope, own = _fit(law, x, y, error)
+    parts = slice(1, None), slice(-1)
+    near, far = (_fit(law, x[part], y[part], error[part])[0] for part in parts)
+    return slope, float(np.hypot(own, near - far)), chosen
+
+
+def straight(u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the length over that of the distance: a straight line."""
+    return np.asarray(u[1] + u[0] * x)
+
+
+def passage(u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the length of the passage from -c to c of y' = d + y**2, with d**-1/2 for any power.
+
+    It is 2 d**-1/2 atan(c d**-1/2); the powers of d and the two factors are fitted.
+    """
+    return np.asarray(u[1] + u[0] * x + np.log(np.arctan(np.exp(u[2] + u[0] * x))))
+
+
+def _fit(law: Callable[..., np.ndarray], x: np.ndarray, y: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """Fit a law to the logarithms of lengths; return the exponent, its first coefficient, and its error."""
+    slope = -0.5 if law is passage else -1.0
+    rise = [1.0 - slope * float(x.mean())] if law is passage else []  # a channel of some length, at the middle
+    start = np.array([slope, float((y - slope * x).mean()), *rise])
+    found = least_squares(lambda u: (law(u, x) - y) / error, start, x_scale="jac")
+    excess = max(1.0, 2.0 * found.cost / max(len(x) - len(start), 1))
+    return float(found.x[0]), float(np.sqrt(excess * np.linalg.pinv(found.jac.T @ found.jac)[0, 0]))
+
+
+def rotation_of(trajectories: np.ndarray, period: int, geometry: Geometry) -> str:
+    """Return the rotation number p/q of an orbit of period q from section points of a torus that passes it slowly.
+
+    The section points of each trajectory, shape (trajectory, section, state), turn on an angle of the model if it has
+    one alone, else in the plane of the first two states about the middle of their extent, clockwise as in `rotation`;
+    p is known up to multiples of q. The text is empty if the points do not turn by p/q.
+    """
+    flat = trajectories.reshape(-1, trajectories.shape[-1])
+    away = geometry.difference(trajectories, 0.5 * (flat.max(axis=0) + flat.min(axis=0)))
+    if sum(geometry.is_angle) == 1:
+        i = geometry.is_angle.index(True)
+        angle = away[..., i] * geometry.scales[i]
+    else:
+        angle = np.arctan2(-away[..., 1], away[..., 0])
+    moved = np.diff(angle, axis=1)
+    # the cut of the angles lies opposite to their mean direction
+    middle = float(np.angle(np.exp(1j * moved).mean()))
+    turns = (middle + np.angle(np.exp(1j * (moved - middle)))).mean() / (2.0 * np.pi) * period
+    p = round(turns)
+    return f"{p % period}/{period}" if abs(turns - p) < WHOLE and gcd(p, period) == 1 else ""
