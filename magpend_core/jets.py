@@ -96,11 +96,12 @@ class Series:
         return Series(self.of, self.values * other)
 
     def __truediv__(self, other: Any) -> Series:
-        return self.__mul__(power(other, -1.0) if isinstance(other, Series) else 1.0 / other)
+        inverse = power(other, -1.0) if isinstance(other, Series) else 1.0 / other
+        return self.__mul__(inverse)
 
     def __rtruediv__(self, other: Any) -> Series:
         inverse: Series = power(self, -1.0)
-        return inverse * other
+        return inverse.__mul__(other)
 
     def __pow__(self, exponent: Any) -> Series:
         if exponent == int(exponent) and exponent >= 0:

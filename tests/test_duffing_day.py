@@ -99,6 +99,7 @@ ANALYSES = {
     "overlaps": f"sweep {LINE} --parameter frequency --from 0.155 --to 0.159154943",
     "escapes": "noisy --high x=0.5",
     "density": "noisy --skip 10",
+    "transfer": "noisy --bins 8 --resamples 3",
     "edge": f"sweep --at frequency_hz=0.159154943 {LINE} --between A B --pairs 1 --returns 16 --period 0",
 }
 

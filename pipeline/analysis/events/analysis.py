@@ -333,6 +333,10 @@ def _merged(named: Sequence[Event]) -> list[Event]:
 # ---- dataset -----------------------------------------------------------------------------------
 
 
+Columns = dict[str, tuple[Sequence[object], str, Mapping[str, object]]]
+"""Values, meaning and attributes of the columns of events, by name."""
+
+
 def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> xr.Dataset:
     named = sorted(named, key=lambda one: (one.stretch.attractor, one.stretch.places[one.rises]))
     located, along, n = scene.located, scene.along, len(scene.along)
@@ -345,9 +349,8 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         else 0
         for one in named
     ]
-    crises = [one.born if isinstance(one.born, Crisis) else Crisis("", "") for one in named]
     unit = {"units": str(located.attrs["parameter_units"])}
-    columns: dict[str, tuple[Sequence[object], str, Mapping[str, object]]] = {
+    columns: Columns = {
         "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),
         "set": ([one.stretch.kind for one in named], "kind of the attractor", code_flags(SETS)),
         "period": ([one.stretch.period for one in named], "period of the attractor, 0 none", {}),
@@ -364,26 +367,11 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
-        "ratio": ([one.born.ratio if one.born else np.nan for one in named], "ratio of the last two intervals", {}),
-        "exponent": (
-            [one.born.exponent if one.born else np.nan for one in named],
-            "minus the power of the distance with which phases grow",
-            {},
-        ),
-        "exponent_error": ([one.born.exponent_error if one.born else np.nan for one in named], "its error", {}),
-        "met_period": ([one.period for one in crises], "period of the unstable orbit that is met, 0 none", {}),
-        "twin": ([one.twin for one in crises], "id of the set with which it merges, -1 none", {}),
-        "lives_beyond": (
-            [int(one.lives_beyond) for one in crises],
-            "1 if the set on the other side meets the orbit",
-            {},
-        ),
-        "rotation": ([one.born.rotation if one.born else "" for one in named], "p/q of a locked orbit", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {
         name: ("event", np.array(found), {"units": "1", "long_name": text, **attrs})
-        for name, (found, text, attrs) in columns.items()
+        for name, (found, text, attrs) in (columns | _columns_of_sets(named)).items()
     }
     to = [list(one.to) for one in named], [list(one.to.values()) for one in named]
     doublings = [one.born.doublings if one.born else () for one in named]
@@ -403,6 +391,21 @@ def _stretches_beyond(stretches: Sequence[Stretch], event: Event, beyond: int) -
     """Return the stretches on which the cells of an event go on; -1 none, -2 they diverge."""
     there = {one.attractor: k for k, one in enumerate(stretches) if one.places[0] <= beyond <= one.places[1]}
     return [DIVERGED if i == DIVERGED else there.get(i, -1) for i in event.to]
+
+
+def _columns_of_sets(named: Sequence[Event]) -> Columns:
+    """Return the columns of ends of chaotic sets and tori."""
+    born = [one.born or Born("", "") for one in named]
+    crises = [one if isinstance(one, Crisis) else Crisis("", "") for one in born]
+    return {
+        "ratio": ([one.ratio for one in born], "ratio of the last two intervals", {}),
+        "exponent": ([one.exponent for one in born], "minus the power of the distance with which times grow", {}),
+        "exponent_error": ([one.exponent_error for one in born], "its error", {}),
+        "rotation": ([one.rotation for one in born], "p/q of a locked orbit", {}),
+        "met_period": ([one.period for one in crises], "period of the unstable orbit that is met, 0 none", {}),
+        "twin": ([one.twin for one in crises], "id of the set with which it merges, -1 none", {}),
+        "lives_beyond": ([int(one.lives_beyond) for one in crises], "1 if the set beyond meets the orbit", {}),
+    }
 
 
 def _padded(rows: Sequence[Sequence[float]], fill: float) -> np.ndarray:
