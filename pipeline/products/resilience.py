@@ -24,6 +24,14 @@ class ResilienceOptions(Options):
         0.01, "Distance from its attractor within which a trajectory has arrived, in units of the scales.", gt=0.0
     )
     timed: int = option(256, "Initial states of each parameter point whose arrival is timed.", ge=0)
+    density: str = option(
+        "1", "Density of the initial states, an expression of states and parameters; it weighs cells and arrival times."
+    )
+    quantity: str = option(
+        "",
+        "Quantity of your own: an expression of the results, the parameters, and the states, whose mean over the "
+        "basin's cells is taken.",
+    )
     interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")
     confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
     seed: int = option(0, "Seed of directions, random shocks and timed initial states.", ge=0)

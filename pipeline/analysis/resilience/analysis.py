@@ -8,9 +8,14 @@ variable                         meaning
 ===============================  =============================================================================
 ``basin_stability``, ``_low``,   share of the cells that end on the attractor, with its interval
 ``_high``, ``n_cells``
+``weighted_stability``, ``_low``,  the same, each cell weighed by the density; ``n_effective`` independent cells of
+``_high``, ``n_effective``       equal weight would have the same error
 ``arrived``, ``_low``, ``_high``  share of timed initial states that have arrived within `within` periods
 ``mean_time``, ``_stderr``,      time until arrival of the timed initial states [drive periods or returns]
 ``longest_time``, ``n_timed``
+``weighted_time``                mean of these times, each weighed by the density
+``reactivity``, ...              `local.Local`: growth of small disturbances at once and later, and their decay
+``quantity``                     value of the expression `quantity`
 ``shock_low``, ``shock_high``    interval of the smallest critical shock of the chosen states, at any phase
 ``shock``                        its jump of each state
 ``shock_phase``                  its phase: a share of the drive period, or of the period of a flow's orbit
@@ -27,18 +32,22 @@ variable                         meaning
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from magpend_core.models.text.grammar import Tree
 from pipeline.analysis.attractors.destinations import Destinations, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
+from pipeline.analysis.resilience.expressions import density_at, mean_over_cells, read_expression
+from pipeline.analysis.resilience.local import Local, local_stability
 from pipeline.analysis.resilience.shocks import (
     Asked,
     Bases,
@@ -63,7 +72,9 @@ from pipeline.analysis.tabular import (
     sets_of,
     summary,
     values,
+    with_interval,
 )
+from pipeline.layout.evaluation import parameter_points
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     grid_dim,
@@ -73,10 +84,12 @@ from pipeline.layout.vocabulary import (
     samples_per_period,
     section_attributes,
     split_dims,
+    time_unit,
     told_by,
 )
 from pipeline.products.product import Table
 from pipeline.products.resilience import ResilienceOptions
+from pipeline.specification.tables import FREQUENCY
 
 PRECISION = 1e-6
 """Relative length to which the last ray of a search is divided."""
@@ -91,6 +104,10 @@ _PLAIN = (
     "basin_stability",
     "basin_stability_low",
     "basin_stability_high",
+    "weighted_stability",
+    "weighted_stability_low",
+    "weighted_stability_high",
+    "n_effective",
     "arrived",
     "arrived_low",
     "arrived_high",
@@ -98,7 +115,15 @@ _PLAIN = (
     "mean_time_stderr",
     "longest_time",
     "n_timed",
+    "weighted_time",
+    *Local._fields,
+    "quantity",
 )
+
+_SIZES = ("shock_low", "shock_high", "shock_phase", "distance_low", "distance_high", "orbit_period")
+"""Results that `quantity` may use beside those of `_PLAIN`."""
+
+_WEIGHTED = ("weighted_stability", "weighted_stability_low", "weighted_stability_high")
 
 _SHOWN = ("low", "high", "phase", "to", "safe", "n_below", "n_undecided")
 
@@ -109,6 +134,11 @@ def needs_sweep(run: OpenRun, options: ResilienceOptions) -> None:
     check_starts(cube)
     select_points(cube, options.at)
     _chosen(run, options)
+    _, starts = split_dims(cube["status"])
+    states = _by_name(run, start_states(cube, starts))
+    for point in parameter_points(run.spec):
+        density_at(options.density, {**point, "f": point[FREQUENCY]}, states)
+    _asked_quantity(run, options)
 
 
 def settle_resilience(run: OpenRun, options: ResilienceOptions) -> ResilienceOptions:
@@ -128,6 +158,19 @@ def _chosen(run: OpenRun, options: ResilienceOptions) -> list[str]:
     return [name for name in model.state_names if name in wanted]
 
 
+def _asked_quantity(run: OpenRun, options: ResilienceOptions) -> Tree | None:
+    """Return the parsed expression of the user's own quantity; None if there is none."""
+    if not options.quantity:
+        return None
+    results = [name for name in (*_PLAIN, *_SIZES) if name != "quantity"]
+    return read_expression("quantity", options.quantity, [*results, *run.model.parameter_names, *run.model.state_names])
+
+
+def _by_name(run: OpenRun, states: np.ndarray) -> dict[str, np.ndarray]:
+    """Return initial states (cell, state) by the names of the states."""
+    return dict(zip(run.model.state_names, states.T, strict=True))
+
+
 def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
     """Measure the response of the attractors at each parameter point to shocks."""
     whole = run.derive("attractors")
@@ -139,9 +182,13 @@ def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
     for points in slabs(cube, Dynamics.of(cube), BUDGET):
         for index, there in destinations_at(cube, attractors, points):
             work, own = _Point(there, options, run), labels[index].ravel()
-            result.count(index, own)
-            result.time(index, *work.times(states))
+            weights = density_at(options.density, work.values, _by_name(run, states))
+            result.count(index, own, weights)
+            timed = work.timed(len(states))
+            result.time(index, *work.times(states[timed]), weights[timed])
             result.shocks(index, work.shocks(states, own))
+            result.local(index, work.local())
+            result.quantity(index, {**work.values, **_by_name(run, states)}, own, weights)
     return result.dataset()
 
 
@@ -167,12 +214,30 @@ class _Point:
         o = options
         self._settings = Settings(o.largest, o.directions, o.norm, PRECISION, o.confirmations, o.seed)
 
-    def times(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate some initial states anew; return the label and the arrival time of each."""
+    @property
+    def values(self) -> dict[str, float]:
+        """Values of the parameters by name, and the drive frequency ``f`` [Hz]."""
+        assert self._there.point.parameters is not None
+        return {**self._there.point.parameters, "f": self._there.point.frequency}
+
+    def timed(self, n: int) -> np.ndarray:
+        """Draw the numbers of the initial states, of `n`, whose arrival is timed."""
         rng = np.random.default_rng(self._options.seed)
-        chosen = np.sort(rng.permutation(len(states))[: self._options.timed])
-        found = self._there.follow(states[chosen], self._options.near)
+        return np.sort(rng.permutation(n)[: self._options.timed])
+
+    def times(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Integrate initial states anew; return the label and the arrival time of each."""
+        found = self._there.follow(states, self._options.near)
         return found.label, found.entered
+
+    def local(self) -> dict[int, Local]:
+        """Measure the stability of each attractor against small disturbances."""
+        point = self._there.point
+        assert point.parameters is not None
+        return {
+            own: local_stability(self._there.here.isel(attractor=own), point.parameters, point.frequency, self._scales)
+            for own in sorted(self._there.told)
+        }
 
     def shocks(self, states: np.ndarray, labels: np.ndarray) -> dict[tuple[int, str], tuple[Found, Bases]]:
         """Search the shocks of each attractor: of the chosen states, of all states, and of each state alone."""
@@ -226,6 +291,14 @@ _SEARCHED: dict[str, tuple[str, float, str]] = {
 }
 
 
+_LOCAL: dict[str, tuple[str, str]] = {
+    "reactivity": ("largest growth rate of a small disturbance, at any phase", "1/{}"),
+    "amplification": ("largest factor by which a small disturbance grows", "1"),
+    "amplification_time": ("time after the disturbance at which it is largest", "{}"),
+    "return_time": ("time in which small disturbances shrink by e at last", "{}"),
+}
+
+
 class _Result:
     """Arrays of the result, filled point by point."""
 
@@ -249,8 +322,14 @@ class _Result:
             self._new(name, "float64", np.nan, f"{text}, drive periods or returns")
         self._new("mean_time_stderr", "float64", np.nan, "standard error of the mean time")
         self._new("n_timed", "int64", 0, "timed initial states that end on it")
+        self._new("weighted_time", "float64", np.nan, "mean time until arrival, weighed by the density")
+        self._new("n_effective", "float64", np.nan, "independent cells of equal weight with the same error")
+        for name, (text, units) in _LOCAL.items():
+            self._new(name, "float64", np.nan, text, units=units.format(time_unit(run.model)))
+        self._new("quantity", "float64", np.nan, f"quantity {options.quantity}".strip())
         for end in ("", "_low", "_high"):
             self._new(f"basin_stability{end}", "float64", np.nan, "share of the cells that end on it")
+            self._new(f"weighted_stability{end}", "float64", np.nan, "share of the density that ends on it")
             self._new(f"arrived{end}", "float64", np.nan, "share of initial states that have arrived in time")
 
     def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
@@ -260,30 +339,59 @@ class _Result:
     def _put(self, name: str, at: Any, value: Any) -> None:
         self.arrays[name][1][at] = value
 
-    def _share(self, name: str, at: int, count: int, n: int) -> None:
+    def _share(self, name: str, at: int, count: float, n: float) -> None:
         low, high = binomial_interval(count, n, confidence=self._options.confidence, method=self._options.interval)
         self._put(name, at, count / n if n else np.nan)
         self._put(f"{name}_low", at, low)
         self._put(f"{name}_high", at, high)
 
-    def count(self, index: tuple[int, ...], labels: np.ndarray) -> None:
-        """Fill in the shares of the cells that end on each attractor of a parameter point."""
+    def count(self, index: tuple[int, ...], labels: np.ndarray, weights: np.ndarray) -> None:
+        """Fill in the shares of the cells that end on each attractor of a parameter point, plain and weighed."""
+        counted = labels != -1
+        total, squares = weights[counted].sum(), (weights[counted] ** 2).sum()
+        # of weighed cells the share has the variance of as many independent cells (Kish, Survey Sampling, 1965)
+        effective = total**2 / squares if squares > 0.0 else 0.0
         for own, row in self._rows[index].items():
             if self._attracts[row]:
-                self._share("basin_stability", row, int((labels == own).sum()), int((labels != -1).sum()))
+                here = labels == own
+                self._share("basin_stability", row, int(here.sum()), int(counted.sum()))
+                share = min(weights[here].sum() / total, 1.0) if effective else 0.0
+                self._share("weighted_stability", row, share * effective, effective)
+                self._put("n_effective", row, effective)
 
-    def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray) -> None:
+    def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray, weights: np.ndarray) -> None:
         """Fill in the arrival times of initial states, by attractor."""
         counted = int((label != -1).sum())
         for i in np.unique(label[label >= 0]).tolist():
-            own, at = entered[(label == i) & np.isfinite(entered)], self._rows[index][i]
+            chosen, at = (label == i) & np.isfinite(entered), self._rows[index][i]
+            own, weight = entered[chosen], weights[chosen]
             self._put("n_timed", at, len(own))
             self._share("arrived", at, int((own <= self._options.within).sum()), counted)
             if len(own):
                 self._put("mean_time", at, own.mean())
                 self._put("longest_time", at, own.max())
+            if weight.any():
+                self._put("weighted_time", at, np.average(own, weights=weight))
             if len(own) > 1:
                 self._put("mean_time_stderr", at, own.std(ddof=1) / np.sqrt(len(own)))
+
+    def local(self, index: tuple[int, ...], found: dict[int, Local]) -> None:
+        """Fill in the stability of the attractors of a parameter point against small disturbances."""
+        for own, one in found.items():
+            for name, value in one._asdict().items():
+                self._put(name, self._rows[index][own], value)
+
+    def quantity(self, index: tuple[int, ...], known: dict[str, Any], labels: np.ndarray, weights: np.ndarray) -> None:
+        """Fill in the user's own quantity, from the other results of a parameter point."""
+        tree = _asked_quantity(self._run, self._options)
+        if tree is None:
+            return
+        for own, row in self._rows[index].items():
+            if self._attracts[row]:
+                results = {name: values[row] for name, (dims, values, _) in self.arrays.items() if dims == (SET,)}
+                more = {"orbit_period": float(self._attractors["orbit_period"].values[row])}
+                results |= {**more, "n_cells": float(self._attractors["n_cells"].values[row])}
+                self._put("quantity", row, mean_over_cells(tree, {**known, **results}, weights * (labels == own)))
 
     def shocks(self, index: tuple[int, ...], found: dict[tuple[int, str], tuple[Found, Bases]]) -> None:
         """Fill in the critical shocks of a parameter point."""
@@ -323,7 +431,9 @@ class _Result:
         scales = ("state", np.asarray(self._run.model.scales), {"long_name": "size that counts as 1"})
         attrs = {**told_by(found.attrs), **section_attributes(self._run.model.crossing), "title": "resilience"}
         plain = {
-            k: v for k, v in options.plain().items() if k in ("phases", "largest", "norm", "within", "near", "timed")
+            k: v
+            for k, v in options.plain().items()
+            if k in ("phases", "largest", "norm", "within", "near", "timed", "density", "quantity")
         }
         attrs |= {f"resilience_{k}": v for k, v in plain.items()}
         attrs |= {"resilience_states": ", ".join(_chosen(self._run, options)), N_IDS: found.attrs[N_IDS]}
@@ -346,7 +456,7 @@ def resilience_table(ds: xr.Dataset) -> Table:
         lines += summary(ds, rows, dims, _label_summary, "attractor_id")
     else:
         for _, where in points_of(ds, dims):
-            lines += point_table(ds, where, rows, _words)
+            lines += point_table(ds, where, rows, partial(_words, ds.attrs))
     lines.append(
         "the largest shocks that never led away, and the numbers of smaller ones tried, are in --csv and --json"
     )
@@ -364,7 +474,8 @@ def _head(ds: xr.Dataset) -> str:
     n_phases = samples_per_period(model_of(ds), int(ds.attrs["resilience_phases"]))
     return (
         f"shocks of {ds.attrs['resilience_states']} at {n_phases} phase{'s' * (n_phases > 1)}, distances of all "
-        f"states; sizes: {norm} of the jumps over their scales ({units}); times in {periods}"
+        f"states; sizes: {norm} of the jumps over their scales ({units}); times in {periods}, "
+        f"return times in {time_unit(model_of(ds))}"
     )
 
 
@@ -395,7 +506,8 @@ def size_of(low: float, high: float) -> str:
     return f"{high:.5g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
 
 
-def _words(row: Row) -> Words:
+def _words(attrs: Mapping[str, Any], row: Row) -> Words:
+    is_weighed, has_quantity = attrs["resilience_density"] != "1", attrs["resilience_quantity"] != ""
     share = f"{row['basin_stability']:.4f} ({row['basin_stability_low']:.4f} to {row['basin_stability_high']:.4f})"
     return {
         "letter": row["letter"],
@@ -408,6 +520,12 @@ def _words(row: Row) -> Words:
         "to": row["shock_leads_to"],
         "distance": size_of(row["distance_low"], row["distance_high"]),
         "to ": row["distance_leads_to"],
+        "weighted stability": with_interval(row, _WEIGHTED, ".4f") if is_weighed else None,
+        "weighted time": number(row["weighted_time"], ".1f") if is_weighed else None,
+        "reactivity": number(row["reactivity"], ".4g"),
+        "amplification": number(row["amplification"], ".4g"),
+        "return time": number(row["return_time"], ".4g"),
+        "quantity": number(row["quantity"], ".6g") if has_quantity else None,
     }
 
 

@@ -1,0 +1,102 @@
+"""Evaluate the densities and the quantities that users write as expressions of states, parameters and results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from magpend_core.models.text.grammar import GrammarError, Tree, names, parse, unknown
+from magpend_core.models.text.numeric import value_of
+
+CONSTANTS = ("pi", "f")
+"""Names in every expression: pi, and the drive frequency [Hz]."""
+
+
+def read_expression(key: str, text: str, known: Iterable[str]) -> Tree:
+    """Parse the expression of an option.
+
+    Parameters
+    ----------
+    key
+        Name of the option, for errors.
+    text
+        Arithmetic expression; see `magpend_core.models.text.grammar`.
+    known
+        Names that it may use, beside `CONSTANTS`.
+
+    Raises
+    ------
+    ValueError
+        If it is no expression, or uses another name.
+    """
+    known = [*known, *CONSTANTS]
+    try:
+        tree = parse(text)
+    except GrammarError as error:
+        raise ValueError(f"{key} = {text!r}: {error}.") from None
+    for name, at in names(tree):
+        if name not in known:
+            raise ValueError(f"{key} = {text!r}: {unknown(name, at, known, 'name')}.")
+    return tree
+
+
+def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -> float:
+    """Return the value of an expression, as the weighted mean over cells if it depends on states.
+
+    Parameters
+    ----------
+    tree
+        Expression, from `read_expression`.
+    known
+        Values of its names: numbers, and arrays of shape (cell,).
+    weights
+        Weights of the cells, shape (cell,).
+
+    Returns
+    -------
+    float
+        NaN if it depends on states and there is no cell with a weight.
+    """
+    value = np.asarray(value_of(tree, {"pi": np.pi, **known}), np.float64)
+    if not value.ndim:
+        return float(value)
+    counts = weights > 0.0
+    return float(np.average(value[counts], weights=weights[counts])) if counts.any() else np.nan
+
+
+def density_at(text: str, known: Mapping[str, Any], states: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the density of initial states at cells, as their weights.
+
+    Parameters
+    ----------
+    text
+        Expression of the states and of the names in `known`.
+    known
+        Values of parameters, and of ``f``.
+    states
+        Values of each state, shape (cell,).
+
+    Returns
+    -------
+    ndarray, (cell,)
+        Not normalised.
+
+    Raises
+    ------
+    ValueError
+        If the text is no such expression, or the density is negative or not finite at a cell, or 0 at all cells.
+    """
+    tree = read_expression("density", text, [*known, *states])
+    n = len(next(iter(states.values())))
+    with np.errstate(all="ignore"):
+        value = value_of(tree, {"pi": np.pi, **known, **states})
+    weights = np.array(np.broadcast_to(np.asarray(value, np.float64), n))
+    bad = np.flatnonzero(~(np.isfinite(weights) & (weights >= 0.0)))
+    if len(bad):
+        at = ", ".join(f"{name} = {column[bad[0]]:g}" for name, column in states.items())
+        raise ValueError(f"density = {text!r}: is {weights[bad[0]]:g} at {at}; must be 0 or greater at all starts.")
+    if not weights.any():
+        raise ValueError(f"density = {text!r}: is 0 at all starts of the run; it must be greater than 0 at some.")
+    return weights
