@@ -90,7 +90,7 @@ def _bars(ax: Axes, one: xr.Dataset, x: np.ndarray, name: str, colour: str) -> N
 
 
 def _stability(ax: Axes, one: xr.Dataset, x: np.ndarray, colour: str) -> None:
-    _bars(ax, one, x, "basin_stability", colour)
+    _bars(ax, one, x, "weighted_stability", colour)
 
 
 def _sizes(ax: Axes, one: xr.Dataset, x: np.ndarray, colour: str) -> None:

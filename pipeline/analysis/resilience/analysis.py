@@ -544,4 +544,8 @@ def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> 
         "critical shock": span("shock_high", ".4g"),
         "least at": where if np.isfinite(least["shock_high"]) else "-",
         "distance": span("distance_high", ".4g"),
+        "weighted stability": span("weighted_stability", ".3f") if ds.attrs["resilience_density"] != "1" else None,
+        "amplification": span("amplification", ".4g"),
+        "return time": span("return_time", ".4g"),
+        "quantity": span("quantity", ".6g") if ds.attrs["resilience_quantity"] else None,
     }

@@ -79,8 +79,8 @@ def test_resilience__local_stability_of_a_rest_in_scales(computed):
 
 
 @pytest.mark.slow
-def test_resilience__local_stability_of_orbits(computed):
-    """A forced linear oscillator, x'' + .2 x' + 2 x = cos t, and a linear map: powers and exponentials of a matrix."""
+def test_resilience__local_stability_of_an_orbit(computed):
+    """A forced linear oscillator, x'' + .2 x' + 2 x = cos t: exponentials of a matrix."""
     parameters = {"overrides": {"damping": 0.2, "linear": 2.0, "cubic": 0.0, "amplitude": 1.0}}
     starts = {"kind": "grid", "x": line(-2.0, 2.0, 3), "v": line(-2.0, 2.0, 3)}
     spec = sweep("duffing", starts, frequency_hz=1.0 / (2.0 * np.pi), closes=1e-6, parameters=parameters)
@@ -92,9 +92,15 @@ def test_resilience__local_stability_of_orbits(computed):
     assert float(one["amplification_time"]) == pytest.approx(np.argmax(sizes) * 2.0 * np.pi / 64)
     assert float(one["return_time"]) == pytest.approx(10.0, rel=1e-6)
 
+
+@pytest.mark.slow
+def test_resilience__local_stability_of_a_map(computed):
+    """A linear map: powers of a matrix."""
     model = {**table("linear_map", {"x": "0.5*x + 4*y", "y": "0.75*y"}), "kind": "map"}
     starts = {"kind": "grid", "x": line(-1.0, 1.0, 3), "y": line(-1.0, 1.0, 3)}
-    one = AnalysedRun.of(computed(sweep(model, starts))).derive("resilience", **FEW).isel(set=0)
+    spec = sweep(model, starts)
+    spec["integration"] = {"n_transient": 200, "n_keep": 8}
+    one = AnalysedRun.of(computed(spec)).derive("resilience", **FEW).isel(set=0)
     matrix = np.array([[0.5, 4.0], [0.0, 0.75]])
     sizes = [np.linalg.norm(np.linalg.matrix_power(matrix, k), 2) for k in range(30)]
     assert float(one["reactivity"]) == pytest.approx(np.log(sizes[1]))
