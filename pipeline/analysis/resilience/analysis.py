@@ -232,11 +232,11 @@ class _Point:
 
     def local(self) -> dict[int, Local]:
         """Measure the stability of each attractor against small disturbances."""
-        point = self._there.point
+        here, point = self._there.here, self._there.point
         assert point.parameters is not None
         return {
-            own: local_stability(self._there.here.isel(attractor=own), point.parameters, point.frequency, self._scales)
-            for own in sorted(self._there.told)
+            own: local_stability(here.isel(attractor=own), point.parameters, point.frequency, self._scales)
+            for own in np.flatnonzero(here["stability"].values == ATTRACTS).tolist()
         }
 
     def shocks(self, states: np.ndarray, labels: np.ndarray) -> dict[tuple[int, str], tuple[Found, Bases]]:

@@ -39,7 +39,7 @@ N_TIMES, MOST_DOUBLINGS, LARGEST = 64, 60, 1e12
 intervals, and amplification beyond which it is not sought.
 """
 
-CONVERGED = 1e-9
+CONVERGED = 1e-6
 """Relative change of the fundamental matrix over a period below which it has come to its limit."""
 
 

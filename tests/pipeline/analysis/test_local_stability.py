@@ -6,10 +6,10 @@ from scipy.linalg import expm
 from scipy.special import ndtr
 
 from pipeline.analysis.resilience.analysis import resilience_table
-from pipeline.analysis.resilience.local import amplification_at_rest, amplification_of_orbit
+from pipeline.analysis.resilience.local import _growth, amplification_at_rest, amplification_of_orbit
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
-from tests.core.flows import table
+from tests.core.flows import HOPF, table
 
 from .cubes import line, sweep
 
@@ -42,6 +42,7 @@ def test_amplification_at_rest__matrix_exponential(matrix):
 def test_amplification_at_rest__none_and_never():
     """A normal matrix amplifies nothing (-I/2 is a test of Attractors.jl: 1 at time 0); a growing one is not known."""
     assert amplification_at_rest(-0.5 * np.eye(2)) == (1.0, 0.0)
+    assert _growth(-0.5 * np.eye(2)[None]) == -0.5
     assert np.isnan(amplification_at_rest(np.diag([0.1, -1.0]))[0])
 
 
@@ -107,6 +108,16 @@ def test_resilience__local_stability_of_a_map(computed):
     assert float(one["amplification"]) == pytest.approx(max(sizes))
     assert float(one["amplification_time"]) == np.argmax(sizes)
     assert float(one["return_time"]) == pytest.approx(-1.0 / np.log(0.75))
+
+
+@pytest.mark.slow
+def test_resilience__local_stability_of_a_cycle(computed):
+    """Turning with the cycle of Hopf's normal form, radius 1/2, the radius decays at 2 mu and the angle stays."""
+    starts = {"kind": "grid", "x": line(-0.8, 0.9, 3), "y": line(-0.8, 0.9, 3)}
+    found = AnalysedRun.of(computed(sweep(HOPF, starts, frequency_hz=1.0, lengths=(60, 8)))).derive("resilience", **FEW)
+    assert found["return_time"].values == pytest.approx([2.0], rel=1e-6)
+    assert found["reactivity"].values == pytest.approx([0.0], abs=1e-6)
+    assert found["amplification"].values == pytest.approx([1.0], rel=1e-6)
 
 
 # ---- weights and own quantities ----------------------------------------------------------------
