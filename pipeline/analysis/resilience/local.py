@@ -28,8 +28,10 @@ from pipeline.analysis.resilience.shocks import Bases, bases_of
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 
-PHASES, MOST_PHASES = 64, 512
-"""Phases of a drive period, or of a flow's orbit, at which an orbit is sampled, and most of a whole orbit."""
+PHASES, MOST_PHASES, MOST_ROWS = 64, 512, 4096
+"""Phases of a drive period, or of a flow's orbit, at which an orbit is sampled, most of a whole orbit, and most of
+these times the number of states: the matrices between all pairs of phases are then within 128 MiB.
+"""
 
 MOST_PERIODS = 4096
 """Most periods of an orbit until no disturbance is larger than it was."""
@@ -68,7 +70,7 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
     -------
     Local
         All NaN for a set that is no equilibrium and no periodic orbit. Of an orbit the maxima are over `PHASES` phases
-        of a period, so they are lower bounds.
+        of a period, fewer of a long orbit, so they are lower bounds.
     """
     kind, model = int(one["kind"]), parameters.model
     if kind == EQUILIBRIUM:
@@ -77,19 +79,21 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
         slowest = float(np.linalg.eigvals(matrix).real.max())
         return Local(_growth(matrix), *amplification_at_rest(matrix), -1.0 / slowest if slowest < 0.0 else np.inf)
     n_points = int(one["orbit_period"])
-    if kind != PERIODIC_ORBIT or n_points > MOST_PHASES:
+    most = min(MOST_PHASES, MOST_ROWS // len(scales))
+    if kind != PERIODIC_ORBIT or n_points > most:
         return Local()
     is_cycle = model.autonomous
     own = of_flow(parameters) if is_cycle else parameters
     period = float(one["period_s"]) if is_cycle else 1.0 / frequency
-    bases = bases_of(one, parameters, frequency, PHASES if is_cycle else min(PHASES, MOST_PHASES // n_points))
+    bases = bases_of(one, parameters, frequency, PHASES if is_cycle else min(PHASES, most // n_points))
     steps = _steps(own, bases, period, scales)
     if steps is None:
         return Local()
     n_phases = len(np.unique(bases.phase))
     grown, late = amplification_of_orbit(steps)
     if model.is_map:
-        reactivity = float(np.log(np.linalg.norm(steps, 2, axis=(1, 2)).max()))
+        with np.errstate(divide="ignore"):  # of a superstable point it is -inf
+            reactivity = float(np.log(np.linalg.norm(steps, 2, axis=(1, 2)).max()))
     else:
         slopes = [jacobian(p * period, x, own, 1.0 / period) for p, x in zip(bases.phase, bases.states, strict=True)]
         reactivity = _growth(_scaled(np.array(slopes), scales))
