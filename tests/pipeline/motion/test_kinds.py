@@ -66,7 +66,7 @@ def test_refusal__of_an_orbit(tmp_path: Path, kind: str, sentence: str) -> None:
 def test_unsuited__says_what_a_run_allows_and_what_it_lacks(tmp_path: Path) -> None:
     for kind, own in (
         ("drifting", "analyse tipping, analyse delay, plot drift, plot section"),
-        ("noisy", "analyse escapes, analyse density, plot bifurcation, plot section"),
+        ("noisy", "analyse transfer, analyse escapes, analyse density, plot bifurcation, plot section"),
         ("recorded", "plot bifurcation, plot section"),
     ):
         assert motion(tmp_path, kind).unsuited(ANALYSES["basins"]).endswith(f" Of this run: magpend {own}.")
