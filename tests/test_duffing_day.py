@@ -118,6 +118,7 @@ FIGURES_OF = {
     "convergence": f"sweep {POINT}",
     "multipliers": "walk --period 1",
     "genealogy": "walk --period 1",
+    "transfer": "noisy --at noise_v=0.2 --bins 8 --resamples 3",
     "drift": "ramp",
     "section": f"sweep {POINT}",
 }

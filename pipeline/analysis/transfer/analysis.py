@@ -200,6 +200,8 @@ def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
     found = {"kept": np.full(n, np.nan), "escape_rate": np.full(n, np.nan), "passage": np.full((n, MOST_SETS), np.nan)}
     for k in range(n):
         own = np.flatnonzero(sets.of_box == k)
+        if not len(own):  # of a coarser grid
+            continue
         inner = p[own][:, own]
         rate, _ = quasi_stationary(inner)
         found["escape_rate"][k] = max(-np.log(rate), 0.0) if rate > 0.0 else np.inf
@@ -207,6 +209,8 @@ def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
         if weight.sum() > 0.0:
             found["kept"][k] = float(weight @ np.asarray(inner.sum(axis=1))) / float(weight.sum())
     for k in range(n):
+        if not len(sets.cores[k]):
+            continue
         steps = passage_times(p, sets.cores[k])
         for j in range(n):
             weight = sets.density[sets.cores[j]]
@@ -364,7 +368,7 @@ def _dataset(
         elif name == "place":
             variables[name] = ((SAMPLE, "axis"), np.concatenate(rows), {})
         else:
-            table = np.stack(rows).reshape(*shape, *rows[0].shape)
+            table = np.stack(rows).reshape((*shape, *rows[0].shape))
             variables[name] = ((*dims, *own_dims.get(name, ())), table, units)
     model = model_of(cube)
     coords = coordinates_of(cube, dims) | {"axis": list(names)}

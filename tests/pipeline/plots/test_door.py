@@ -69,6 +69,8 @@ def options_of(name, **given):
 def other_value(model, name):
     """A valid value of an option that is not its default."""
     default = default_of(model, name)
+    if isinstance(default, dict) and name == "within":
+        return {"psi1": (-1.0, 1.0)}
     if isinstance(default, dict) and name != "at":
         return {"psi1": 0.5}
     special = {
@@ -96,6 +98,7 @@ def other_value(model, name):
         "between": ("A", "C"),
         "radius": 0.5,
         "cell": 3,
+        "bins": 50,
     }
     if name in special:
         return special[name]
