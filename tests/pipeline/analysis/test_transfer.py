@@ -133,7 +133,7 @@ equations = { x = "v", v = "x - x**3 - d*v + A*cos(2*pi*f*t)" }
 [noise]
 strengths = { v = 0.05 }
 seed = 1
-steps_per_period = 64
+steps_per_period = 128
 [parameters]
 omega = 1.0
 [axes]
