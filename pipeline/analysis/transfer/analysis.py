@@ -401,7 +401,8 @@ def _summary(one: xr.Dataset, n: int) -> str:
         return f"{text}no set: every path leaves the grid or the sampled boxes"
     text += f"{closed} closed sets" if closed > 1 else f"{n} almost invariant sets"
     if np.isfinite(one["eigenvalue"].values[:2]).all() and closed < 2:
-        text += f", second eigenvalue {complex(one['eigenvalue'].values[1], one['eigenvalue_imaginary'].values[1]):.4g}"
+        real, imaginary = (float(one[name].values[1]) for name in ("eigenvalue", "eigenvalue_imaginary"))
+        text += f", second eigenvalue {complex(real, imaginary) if imaginary else real:.4g}"
     for name, words in (("outside", "leave the grid"), ("unknown", "end in boxes that no pair leaves")):
         if float(one[name]) > (MANY_UNKNOWN if name == "unknown" else 0.0):
             text += f"; {100 * float(one[name]):.2g} % of pairs {words}"
@@ -431,5 +432,5 @@ def _words(row: Row) -> Words:
         if np.isfinite(row[f"passage_{name}"]):
             ends = [f"passage{end}_{name}" for end in ("", "_low", "_high")]
             words[f"steps to {name}"] = with_interval(row, ends, ".4g")
-            words["coarser "] = number(row[f"passage_coarse_{name}"], ".4g")
+            words[f"to {name}, coarser"] = number(row[f"passage_coarse_{name}"], ".4g")
     return words
