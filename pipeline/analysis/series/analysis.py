@@ -79,13 +79,13 @@ def _dataset(found: Measured) -> xr.Dataset:
         name: (over, np.array([getattr(r, name) for r in found.results], float)) for name in ("value", "low", "high")
     }
     variables |= {name: (over, [getattr(r, name) for r in found.results]) for name in ("unit", "reason")}
-    nats, seconds = {"units": "nats"}, {"units": "s"}
-    variables["mutual_information"] = ("lag", found.information, nats)
+    pure, seconds = {"units": "1"}, {"units": "s"}
+    variables["mutual_information"] = ("lag", found.information, pure)
     variables["false_neighbours"] = ("dimension", found.false, {"units": "1"})
     line = np.where((parted.time >= parted.fit[0]) & (parted.time <= parted.fit[1]), 1.0, np.nan)
-    about = {**nats, "long_name": "mean log distance of neighbours, of random pairs 0"}
+    about = {**pure, "long_name": "mean log distance of neighbours, of random pairs 0"}
     variables["divergence"] = ("elapsed", parted.curve, about)
-    variables["fit_line"] = ("elapsed", line * (parted.offset + parted.value * parted.time), nats)
+    variables["fit_line"] = ("elapsed", line * (parted.offset + parted.value * parted.time), pure)
     firsts = returns.pairs()
     variables["maximum"] = ("return", returns.height[firsts])
     variables["next_maximum"] = ("return", returns.height[firsts + 1])
@@ -105,7 +105,7 @@ def _dataset(found: Measured) -> xr.Dataset:
         "dimension": np.arange(1, len(found.false) + 1),
         "elapsed": ("elapsed", parted.time, seconds),
         "embedding": list(sums.dimensions),
-        "radius": ("radius", sums.radius, {"units": "standard deviations"}),
+        "radius": ("radius", sums.radius, {"units": "1"}),
     }
     if found.recurrence is not None:
         coords |= {name: (name, found.recurrence.time, seconds) for name in ("row", "column")}
