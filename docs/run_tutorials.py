@@ -51,6 +51,7 @@ NOT_MADE = {
     "explorer-notebook.png": "JupyterLab with the explorer, by docs/notebook_picture.py RUN FILE",
     "identification-residuals.png": "residuals of the identification that ships, which takes an hour",
     "measured.png": "a sweep of 101 frequencies on the virtual rig, beside a run of as many",
+    "recordings.png": "the flutter rig's recording, a minute, by the command beside it",
     "report.png": "a browser's picture of a part of a report",
     "response-pendulum.png": "the response of the pendulum, half a minute, by the commands beside it",
     "rig-calibrated.png": "a diagram of the calibrated model of docs/rig.md beside the rig's",
