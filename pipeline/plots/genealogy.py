@@ -62,7 +62,7 @@ _OTHERS = {
 
 @style.drawn
 def plot_genealogy(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the range of each attractor as a bar in a row of its own, and the events at the ends of the bars.
+    """Draw the range of each attractor as a bar, one row for each, and mark the events at its ends.
 
     Marks name the bifurcations (LP, PD, ...). An arrow leads to the attractor on which most cells go on. A dotted
     line is the interval in which an end is not decided. A bar bears its period; where it is too short, the period
@@ -115,7 +115,7 @@ def _with_periods(ds: xr.Dataset, number: int) -> str:
 
 
 def _draw_bars(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> set[int]:
-    """Draw the bars with their names, and return the attractors of which a bar is long enough for its name."""
+    """Draw the bars. Return the ids of the attractors with a bar that is long enough for its name."""
     kinds, names = words_of(ds["stretch_set"]), []
     for k in range(ds.sizes["stretch"]):
         number, period = int(ds["stretch_attractor"][k]), int(ds["stretch_period"][k])

@@ -26,7 +26,7 @@ _DECADES = 3.0
 def plot_transfer(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the slow sets of one parameter point, each in a colour of its own.
+    """Draw the slow sets of one parameter point in different colours.
 
     The left panel shows the stationary density within each set, with the core darkest; the right one the probability
     to reach the core of the set before the others. The plane is that of the first two states of the grid; of boxes in

@@ -131,7 +131,7 @@ def _family(one: Family, period: int) -> Family:
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """All equilibria of a box at one parameter point, and whether their number is proved."""
+    """Equilibria of a box at one parameter point, with a flag: is their number proved?"""
 
     family: Family  # of period 1, with the parameter's value among its parameters
     value: float

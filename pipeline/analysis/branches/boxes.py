@@ -226,7 +226,7 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
 
 
 def search_equilibria(system: System, packed: np.ndarray, box: Box, known: np.ndarray) -> np.ndarray:
-    """Search the equilibria of a box by Newton's method from random starts, with deflation of those that are found.
+    """Search a box for equilibria by Newton's method from random starts; each one found is deflated.
 
     Parameters
     ----------

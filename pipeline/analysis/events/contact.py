@@ -217,7 +217,7 @@ Passages = Mapping[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geometry: Geometry) -> Passages:
-    """Return the passages of a saddle orbit by trajectories (trajectory, time, state), within a scaled distance."""
+    """Find where trajectories, shape (trajectory, time, state), pass a saddle orbit within a scaled distance."""
     step = lcm(saddle.period * (2 if saddle.multiplier < 0.0 else 1), n_bands)
     factor = np.float64(saddle.multiplier) ** (step // saddle.period)
     found = {}
@@ -366,8 +366,9 @@ class Approach:
         return float((until[settled] - SETTLE).sum()) / max(n, 1), n
 
     def returning(self, value: float, paths: np.ndarray) -> float:
-        """Return the share of trajectories that pass the orbit again on the side of the set, of those that leave in the
-        first half of the time.
+        """Return the share of leaving trajectories that later pass the orbit on the side of the set.
+
+        Only those count that leave in the first half of the time.
         """
         a, lane, at = self._sided(value, paths)
         until, half = _until(a, lane, at, paths), paths.shape[1] // 2

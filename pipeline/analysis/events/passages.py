@@ -236,7 +236,7 @@ def _ratio(lengths: np.ndarray, power: int) -> float:
 
 
 def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.ndarray] | None:
-    """Fit the exponent of the lengths over the distances, with its error, at the nearest distances that serve.
+    """Fit the power with which the lengths grow near the bifurcation, with its error.
 
     The difference between the exponents without the farthest and without the nearest distance is part of the error.
     Return also the numbers of the distances; None if there are too few.

@@ -38,7 +38,7 @@ def surrogate(values: Floats, generator: np.random.Generator) -> Floats:
 
 
 def closed_stretch(values: Floats) -> Floats:
-    """Return the longest stretch whose ends fit: a jump or a kink between them would add power to the spectrum.
+    """Return the longest stretch whose ends match in value and slope: a jump there adds power.
 
     Up to a tenth is cut off on each side.
     """

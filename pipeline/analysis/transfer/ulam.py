@@ -196,7 +196,7 @@ def memberships(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _corners(x: np.ndarray) -> list[int]:
-    """Return the rows farthest apart: each has the largest distance from the affine hull of those before."""
+    """Return the numbers of the corner rows; each further one is the farthest from the plane of those before."""
     found = [int(np.argmax(np.linalg.norm(x - x.mean(axis=0), axis=1)))]
     rest = x - x[found[0]]
     for _ in range(x.shape[1] - 1):
