@@ -108,7 +108,7 @@ def test_chain__gambler_on_paper() -> None:
     before = np.repeat(np.arange(7), 2)
     after = np.array([0, 0, 0, 2, 1, 3, 2, 4, 3, 5, 4, 6, 6, 6])
     p = chain_of(before, after).p
-    assert [own.tolist() for own in closed_classes(p)] == [[0], [6]] or len(closed_classes(p)) == 2
+    assert sorted(own.tolist() for own in closed_classes(p)) == [[0], [6]]
     ends = [np.array([0]), np.array([6])]
     assert committors(p, ends)[:, 1] == pytest.approx(np.arange(7) / 6.0)
     assert passage_times(p, np.array([0, 6])) == pytest.approx([i * (6 - i) for i in range(7)])
@@ -162,7 +162,7 @@ def test_transfer__noisy_run_against_its_own_passages(tmp_path) -> None:
         # first passages counted in the cells themselves, from one core to the other
         rows = slice(*np.cumsum([0, *found["n_sets"].values])[i : i + 2])
         sizes, first = found["n_points"].values[rows], int(found["n_points"].values[: rows.start].sum())
-        width, low = found["width"].values[i], None
+        width = found["width"].values[i]
         part = slice(first, first + int(sizes.sum()))
         place, core = found["place"].values[part], found["is_core"].values[part] > 0
         own = np.repeat([0, 1], sizes)
