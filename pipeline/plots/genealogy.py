@@ -21,6 +21,7 @@ from pipeline.analysis.events.names import (
     LOCKING,
     NAMES,
     RANGE_END,
+    TRANSIENT,
     TWINS,
     UNDECIDED,
 )
@@ -53,6 +54,7 @@ _OTHERS = {
     INTERIOR: ("P", "", "interior crisis"),
     BANDS: ("d", "", "merging of bands"),
     TWINS: ("H", "", "merging of attractors"),
+    TRANSIENT: ("x", "", "lost into a transient"),
     **{name: ("h", kind.upper(), f"intermittency {kind.upper()}") for kind, name in INTERMITTENCY.items()},
     LOCKING: (">", "", "locking"),
     GRAZING: ("<", "", "grazing"),

@@ -7,13 +7,24 @@ import pytest
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
 import magpend
-from pipeline.analysis.events.contact import count_bands, fit_lifetimes
+from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.events.contact import SectionMap, count_bands, passages, sample_of
+from pipeline.analysis.events.crises import OF_MAP
+from pipeline.analysis.events.transients import fit_lifetimes
 from pipeline.analysis.sets import Geometry
 
 LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.2)
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
 HENON = magpend.model("x' = 1 - a*x**2 + y\ny' = b*x", name="henon", kind="map", a=0.2, b=0.3)
+LINEAR = magpend.model("x' = u*x + y\ny' = 0.3*y", name="linear", kind="map", u=2.0)
 LINE = Geometry((False,), (1.0,))
+
+
+def section_map(model, parameter, value, frequency_hz=None, **fixed):
+    """The section map of a model along a parameter."""
+    packed = model.load(**{parameter: value}, **fixed).pack()
+    family = family_of(model.system, 1, frequency_hz or model.clock_hz, packed, parameter, 1.0)
+    return SectionMap(family, Geometry.of(model), 1e-9)
 
 
 def sweep(model, folder, starts, **axis):
@@ -139,6 +150,18 @@ def test_events__boundary_crisis_of_henon(tmp_path):
 
 
 @pytest.mark.slow
+def test_events__lost_into_a_transient(tmp_path):
+    """Beside an independent chaotic state all orbits have two unstable multipliers, so that none is met for sure."""
+    model = magpend.model("x' = r*x*(1 - x)\ny' = 3.9*y*(1 - y)", name="two", kind="map", r=3.9)
+    found, table = decided(sweep(model, tmp_path, {"x": (0.1, 0.9), "y": (0.1, 0.9)}, r=[3.98, 4.02]))
+    ((what, period, value, error, exponent, exponent_error),) = found
+    assert (what, period) == ("transient", 0), table["evidence"].tolist()
+    assert abs(value - 4.0) <= 3.0 * error < 1e-3
+    assert abs(exponent - 0.5) <= 3.0 * exponent_error < 0.3
+    assert "no orbit that it meets is proved" in table.loc[table["what"] == "transient", "sentence"].iloc[0]
+
+
+@pytest.mark.slow
 def test_events__no_crisis_at_a_window(tmp_path):
     """Where a stable orbit of period 3 is born in the set, the set meets no orbit beside it."""
     found, table = decided(sweep(LOGISTIC, tmp_path, {"x": (0.1, 0.9)}, r=[3.82, 3.835]))
@@ -169,3 +192,29 @@ def test_fit_lifetimes__a_power_law():
     found = fit_lifetimes(values.tolist(), means, [1000] * 8, 2.0)
     assert found.value == pytest.approx(1.9999, abs=1e-8)
     assert 1e-6 < found.value_error < 1e-3
+
+
+@pytest.mark.parametrize("u", [2.0, -2.0])
+def test_passages__of_a_linear_saddle(u):
+    """Near 0 of x' = u x + y, y' = .3 y the sum x + y/(u - .3) is multiplied by u, and is 0 on the stable manifold."""
+    along = section_map(LINEAR, "u", u)
+    saddle = along.saddle(u, np.array([0.01, 0.02]), 1)
+    assert saddle.multiplier == pytest.approx(u)
+    assert saddle.covectors[0] == pytest.approx([1.0, 1.0 / (u - 0.3)])
+    y, distance = np.array([1.0, 1.0, 1.0 / 0.3]), np.array([1e-4, 3e-4, -2e-4])
+    starts = np.column_stack([distance - y / (u - 0.3), y])
+    found = passages(along.paths(u, starts, 30), saddle, 2, 0.05, along.geometry)
+    # y falls below the distance of passages at the third section, of the last trajectory at the fourth; of two bands
+    # even and odd sections are two classes
+    first = {0: np.array([2, 2, 4]), 1: np.array([3, 3, 3])}
+    assert set(found) == {(0, 0), (0, 1)}
+    for (_, phase), (clearance, lane, _) in found.items():
+        assert lane.tolist() == [0, 1, 2]
+        assert clearance == pytest.approx(distance * u ** (first[phase] + 1.0), rel=1e-6)
+
+
+def test_sample_of__starts_in_one_band():
+    along = section_map(LOGISTIC, "r", 3.8565)
+    sample = sample_of(along, 3.8565, np.array([0.5]), OF_MAP)
+    assert sample.n_bands == 3
+    assert np.ptp(sample.starts) < 0.1 < 0.8 < np.ptp(sample.points)
