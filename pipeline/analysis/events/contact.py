@@ -70,8 +70,8 @@ TURNS_ON = 2
 NEIGHBOURS, REFERENCES = 48, 8
 """Section points nearest to a reference point, and reference points, whose return times tell the number of bands."""
 
-MOST_STEPS_TO_ROOT = 40
-"""Most parameter values at which the clearance is computed to find its zero."""
+MOST_STEPS_TO_ROOT = 40, 12
+"""Most parameter values at which the clearance is computed to find its zero, of maps and of flows."""
 
 SHORTEST = 1e-12
 """Shortest interval of the parameter in which the zero is looked for, as a share of the first one."""
@@ -496,7 +496,7 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
     if here.is_beyond or not there.is_beyond:
         return None
     weights, last, best = [1.0, 1.0], 0, here
-    for _ in range(MOST_STEPS_TO_ROOT):
+    for _ in range(MOST_STEPS_TO_ROOT[approach.effort.is_flow]):
         a, b = weights[0] * here.least, weights[1] * there.least
         x = low + (high - low) * (a / (a - b) if np.isfinite(a) and np.isfinite(b) else 0.5)
         if x in (low, high):
@@ -527,8 +527,9 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
 def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_flow: bool) -> Contact | None:
     """Extrapolate the clearances y at values x on both sides to 0; None unless both lines lead to the value found.
 
-    A trajectory may come within the distance of passages a turn later at one of the values: then there is no line. A
-    lowered clearance is that of the lowest fold that was met: its scatter about the lines tells the error.
+    A trajectory may come within the distance of passages a turn later at one of the values: then there is no line. Of
+    flows, the value is the mean of the zero and of both lines, and their scatter tells the error: the lowest fold is
+    not met at each value.
     """
     h, half = x[-1] - value, len(x) // 2
     if not (y * SPREAD < 0.0).all():
@@ -540,13 +541,13 @@ def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_f
         return None
     living, far = (float(value - h * line[1] / line[0]) for line in lines)
     slope = float((y[half] - y[half - 1]) / (x[half] - x[half - 1]))
-    away, allowed = max(abs(living - value), abs(far - value)), CURVED * abs(h)
-    error = 2.0 * max(best.error, abs(best.least)) / abs(slope)
+    away, error = max(abs(living - value), abs(far - value)), 2.0 * max(best.error, abs(best.least)) / abs(slope)
     if is_flow:
         scatter = max(np.std(y[part] - np.polyval(line, u[part])) for part, line in zip(sides, lines, strict=True))
-        error = max(away, 2.0 * float(scatter) * np.sqrt(half / (half - 2.0)) / abs(slope))
-        allowed = 0.5 * abs(h)
-    if not error <= 0.5 * abs(h) or away > allowed:
+        three = np.array([value, living, far])
+        value = float(three.mean())
+        error = 2.0 * max(three.std(ddof=1), float(scatter) * np.sqrt(half / (half - 2.0)) / abs(slope))
+    if not error <= 0.5 * abs(h) or (not is_flow and away > CURVED * abs(h)):
         return None
     return Contact(value, error, slope, living, far, float(abs(h)))
 
@@ -556,7 +557,7 @@ def _span(approach: Approach, value: float, beyond: float) -> float | None:
     share = SHARES[approach.effort.is_flow]
     reach = approach.near * approach.size
     h = min(abs(beyond - value), abs(value - approach.value)) * float(np.sign(beyond - value))
-    for _ in range(MOST_STEPS_TO_ROOT):
+    for _ in range(MOST_STEPS_TO_ROOT[0]):
         found = approach.least(value - h).least
         if found <= share * reach:
             return h

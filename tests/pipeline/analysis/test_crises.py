@@ -8,7 +8,7 @@ from scipy.optimize import brentq, fsolve, minimize_scalar
 
 import magpend
 from pipeline.analysis.branches.starting_orbits import family_of
-from pipeline.analysis.events.contact import SectionMap, count_bands, passages, sample_of
+from pipeline.analysis.events.contact import Approach, Effort, SectionMap, contact_of, count_bands, passages, sample_of
 from pipeline.analysis.events.crises import OF_MAP
 from pipeline.analysis.events.transients import fit_lifetimes
 from pipeline.analysis.sets import Geometry
@@ -17,6 +17,7 @@ LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.2)
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
 HENON = magpend.model("x' = 1 - a*x**2 + y\ny' = b*x", name="henon", kind="map", a=0.2, b=0.3)
 LINEAR = magpend.model("x' = u*x + y\ny' = 0.3*y", name="linear", kind="map", u=2.0)
+UEDA = magpend.model("x'' = B*cos(t) - 0.1*x' - x**3", name="ueda", B=13.3)
 LINE = Geometry((False,), (1.0,))
 
 
@@ -159,6 +160,63 @@ def test_events__lost_into_a_transient(tmp_path):
     assert abs(value - 4.0) <= 3.0 * error < 1e-3
     assert abs(exponent - 0.5) <= 3.0 * exponent_error < 0.3
     assert "no orbit that it meets is proved" in table.loc[table["what"] == "transient", "sentence"].iloc[0]
+
+
+def tangency_of_ueda():
+    """Value of B at which the unstable manifold of the saddle of period 1 touches its stable one, 20 sections later.
+
+    Along the unstable manifold the distance from the stable one has a minimum, which is 0 between these two values.
+    """
+    force = np.array([13.3884, 13.3889])
+
+    def strobe(state, n, steps=400):
+        h, b = 2.0 * np.pi / steps, force.reshape(-1, *[1] * (state.ndim - 2))
+
+        def rate(t, u):
+            return np.stack([u[..., 1], b * np.cos(t) - 0.1 * u[..., 1] - u[..., 0] ** 3], axis=-1)
+
+        for k in range(n * steps):
+            t = (k % steps) * h
+            a = rate(t, state)
+            c = rate(t + 0.5 * h, state + 0.5 * h * a)
+            d = rate(t + 0.5 * h, state + 0.5 * h * c)
+            state = state + h / 6.0 * (a + 2.0 * (c + d) + rate(t + h, state + h * d))
+        return state
+
+    saddle = np.array([[0.4044, -5.607]] * 2)
+    moves = 1e-5 * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    for _ in range(4):
+        ends = strobe(saddle[:, None] + moves, 1)
+        matrix = np.stack([ends[:, 1] - ends[:, 2], ends[:, 3] - ends[:, 4]], axis=-1) / 2e-5
+        saddle = saddle - np.linalg.solve(matrix - np.eye(2), (ends[:, 0] - saddle)[..., None])[..., 0]
+    t, starts, left = 0.6028 + 1e-3 * np.arange(-3, 4), [], []
+    for point, m in zip(saddle, matrix, strict=True):
+        values, right = np.linalg.eig(m)
+        k = int(np.abs(values).argmax())
+        v = right[:, k] / -right[1, k]
+        w = np.linalg.inv(right)[k] * -right[1, k]
+        starts.append(point + 1e-6 * values[k] ** t[:, None] * v)
+        left.append(w)
+    offset = strobe(np.array(starts), 20) - saddle[:, None]
+    lows = []
+    for row, w in zip(offset, left, strict=True):
+        a, b, c = np.polyfit(t - 0.6028, row @ w, 2)
+        lows.append(c - b * b / (4.0 * a))
+    return force[0] + (force[1] - force[0]) * lows[0] / (lows[0] - lows[1])
+
+
+@pytest.mark.slow
+def test_contact_of__boundary_crisis_of_ueda():
+    """Ueda (Ann. N. Y. Acad. Sci. 357, 1980, 422) gives 13.388; `analyse events` finds the same orbit by itself."""
+    along = section_map(UEDA, "B", 13.375, 0.5 / np.pi)
+    effort = Effort(64, 192, 3, 12, 1, is_flow=True)
+    sample = sample_of(along, 13.375, np.array([3.1, -0.78]), effort)
+    saddle = along.saddle(13.375, np.array([0.399, -5.58]), 1)
+    approach = Approach(along, sample, 13.375, saddle, effort)
+    assert approach.begin(approach.paths(13.375))
+    found = contact_of(approach, 13.45)
+    assert found is not None
+    assert abs(found.value - tangency_of_ueda()) <= found.error < 0.01
 
 
 @pytest.mark.slow
