@@ -9,6 +9,8 @@ those of power series (`magpend_core.jets`), so that no derivative is a differen
 point               normal form                                                                coefficients
 =================== ========================================================================== =======================
 cusp                w' = c w^3                                                                 c [1/s]
+degenerate          w' = quintic w^5                                                           quintic [1/s]
+pitchfork
 Bogdanov-Takens     w0' = w1, w1' = a w0^2 + b w0 w1, a > 0                                    a [1/s2], b [1/s]
 generalised Hopf    w' = i omega w + c1 w |w|^2 + c2 w |w|^4                                   lyapunov2 = Re c2 / omega
 zero-Hopf           x' = b x^2 + c |z|^2 + ..., z' = i omega z + d x z + e x^2 z, after a      s = sign(b c),
@@ -141,6 +143,11 @@ def _carried(of: Monomials, states: np.ndarray, flow: np.ndarray) -> np.ndarray:
 def cusp(rest: Rest) -> dict[str, float]:
     """Return the cubic coefficient c of a cusp."""
     return {"c": normal_form(rest, [0j], 3)[0, (3,)].real}
+
+
+def degenerate_pitchfork(rest: Rest) -> dict[str, float]:
+    """Return the coefficient of the fifth degree of a pitchfork without a cubic term."""
+    return {"quintic": normal_form(rest, [0j], 5)[0, (5,)].real}
 
 
 def bogdanov_takens(rest: Rest) -> dict[str, float]:

@@ -12,8 +12,10 @@ import xarray as xr
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import multipliers_of
+from pipeline.analysis.branches.center_manifold import null_vectors
 from pipeline.analysis.branches.codimension_two import (
     BT,
+    DEGENERATE,
     DOUBLE_HOPF,
     DOUBLING_TORUS,
     FOLD_FLIP,
@@ -30,7 +32,6 @@ from pipeline.analysis.branches.codimension_two import (
     merged,
 )
 from pipeline.analysis.branches.equilibrium_curves import (
-    EQUILIBRIUM_KINDS,
     PERSISTS,
     EquilibriumCurve,
     EquilibriumDetector,
@@ -90,6 +91,11 @@ CURVE_ENDS = (
 GENERATIONS = 3
 """Number of generations of curves that spring from points of codimension two."""
 
+LOST = "Newton's method finds no curve through it"
+UNFOLDED = "the second parameter unfolds it: the branches come apart, and a fold may remain; it has no curve"
+OF_ORBITS = "branch points of periodic orbits are not continued, those of equilibria are"
+"""Reasons why a located point has no curve."""
+
 SPRINGING = {
     R1: ((FOLD, 1), (TORUS, 1)),
     R2: ((DOUBLING, 1), (TORUS, 1), (TORUS, 2)),
@@ -101,6 +107,7 @@ SPRINGING = {
     GENERALISED_HOPF: ((FOLD, 1),),
     ZERO_HOPF: ((FOLD, 0), (HOPF, 0), (TORUS, 1)),
     DOUBLE_HOPF: ((HOPF, 0), (TORUS, 1)),
+    DEGENERATE: ((FOLD, 0),),
 }
 """Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit; at
 equilibria 0 for equilibria, 1 for cycles."""
@@ -115,7 +122,7 @@ BESIDE = (0.02, 0.005)
 """Scaled distances from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins."""
 
 AMPLITUDES = (0.02, 0.05, 0.1)
-"""Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
+"""Scaled distances, tried in turn, of the first orbit of a curve from the point at which the curve begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +152,7 @@ def curves_from(
     bounds: Bounds,
     max_period: int,
     generations: int = GENERATIONS,
+    left_out: dict[int, str] | None = None,
 ) -> list[Curve]:
     """Continue the bifurcations located on branches as curves in the plane of the branches' parameter and a second one.
 
@@ -162,6 +170,8 @@ def curves_from(
         Longest period of the orbits; 0 takes the longest of the branches.
     generations
         Number of generations of curves that spring from points of codimension two.
+    left_out
+        Gets the number of each located point that has no curve, with the reason.
 
     Returns
     -------
@@ -169,10 +179,11 @@ def curves_from(
         Curves in the order of the located points they start from, none twice; then those of homoclinic orbits.
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
-    starts = _starts(branches, parameters, second, bounds, longest)
+    left_out = {} if left_out is None else left_out
+    starts = _starts(branches, parameters, second, bounds, longest, left_out)
     nodes = saddle_nodes_of(branches, parameters, second, bounds, longest)
     starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
-    found = continue_curves(starts, bounds, CURVE, longest, generations)
+    found = continue_curves(starts, bounds, CURVE, longest, generations, left_out)
     takens = [p for p in merged({i: c.special for i, c in enumerate(found)}) if p.kind == BT]
     beside = [loop_near(point, away) for point in takens for away in BESIDE]
     loops = loops_of(branches, parameters, second, bounds, longest) + [loop for loop in beside if loop is not None]
@@ -192,18 +203,22 @@ def continue_curves(
     settings: Settings = CURVE,
     max_period: int = 0,
     generations: int = GENERATIONS,
+    left_out: dict[int, str] | None = None,
 ) -> list[Curve]:
     """Follow each bifurcation in both directions in the parameter plane, until a bound, its own start or a resonance.
 
-    Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
+    Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`. Starts
+    without a curve go to `left_out`, with the reason.
     """
+    left_out = {} if left_out is None else left_out
     problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
     firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
+    left_out |= {s[0]: LOST for s, f in zip(starts, firsts, strict=True) if f is None}
     curves: list[Curve] = []
     seen: list[SpecialPoint] = []
     for _ in range(1 + generations):
-        _follow_all(ready, curves, bounds, settings)
+        _follow_all(ready, curves, bounds, settings, left_out)
         points = merged({i: curve.special for i, curve in enumerate(curves)})
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
@@ -226,7 +241,9 @@ Ready = tuple[int, CurveProblem, Point]
 """Number of a located point (-1: none), the problem of its curve, and the curve's first point."""
 
 
-def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
+def _follow_all(
+    ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings, left_out: dict[int, str]
+) -> None:
     """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
     ready = [r for r in ready if not any(_passes(curve, r[1], r[2]) for curve in curves)]
     traces = run_together(
@@ -235,6 +252,9 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
     for i, (number, problem, first) in enumerate(ready):
         (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
+        if not all(_persists(problem, point) for point in points):
+            left_out[number] = UNFOLDED
+            continue
         is_known = any(_passes(curve, problem, first) for curve in curves)
         if not is_known and (number >= 0 or len(points) > 2):
             ends = back.end, ahead.end
@@ -265,6 +285,9 @@ def _rest_sprung(problem: EquilibriumCurve, at: SpecialPoint) -> Steps[tuple[Cur
     own = 2.0 * np.pi / at.point.value.seconds
     omega = omegas[0] if len(omegas) == 1 else max(omegas, key=lambda one: abs(one - own))
     u = problem.start(at.point.u, omega)
+    if at.kind == DEGENERATE:
+        right, _ = null_vectors(at.family.scaled(at.point.value.monodromy))
+        return (yield from _first_beside(problem, u, right))
     if problem.kind == FOLD:
         value = yield Query(problem, u)
         problem = EquilibriumCurve(problem.family, kind_of_zero(problem.family, u, value))
@@ -277,14 +300,21 @@ def _cycles_sprung(
     problem: BifurcationProblem, at: SpecialPoint, omega: float
 ) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first small cycle on a curve of bifurcations of cycles that starts at a point of codimension two."""
-    family, n = problem.family, problem.family.system.n_states
-    direction = cycle_direction(family, at.point, omega)
+    n = problem.family.system.n_states
+    direction = cycle_direction(problem.family, at.point, omega)
     assert direction is not None
-    normal = np.append(direction, [0.0, 0.0])
+    return (yield from _first_beside(problem, np.concatenate([at.point.u[:n], at.point.u[-2:]]), direction))
+
+
+def _first_beside(
+    problem: CurveProblem, u: np.ndarray, direction: np.ndarray
+) -> Steps[tuple[CurveProblem, Point] | None]:
+    """Find a first point of a curve at some small distance from unknowns, along a direction of the states."""
+    normal = np.append(direction, np.zeros(len(u) - len(direction)))
     for amplitude in AMPLITUDES:
-        guess = np.concatenate([at.point.u[:n], at.point.u[-2:]]) + amplitude * normal
-        found = yield from correct(problem, guess, normal / np.linalg.norm(normal), CURVE)
-        if found is not None and not end_of_crossings(family, found):
+        guess = u + amplitude * normal
+        found = yield from correct(problem, guess, normal / np.linalg.norm(normal), _own(CURVE, problem))
+        if found is not None and not (problem.family.period and end_of_crossings(problem.family, found)):
             return problem, found
     return None
 
@@ -297,15 +327,12 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[CurveP
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
     _, q, _ = critical_vectors(at.family.scaled(at.point.value.monodromy), DOUBLING)
-    normal = np.append(q.real, [0.0, 0.0])
-    for amplitude in AMPLITUDES:
-        found = yield from correct(problem, at.point.u + amplitude * normal, normal, CURVE)
-        if found is not None:
-            return problem, found
-    return None
+    return (yield from _first_beside(problem, at.point.u, q.real))
 
 
-def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
+def _starts(
+    ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int, left_out: dict[int, str]
+) -> list[CurveStart]:
     """Select the located bifurcations to continue. Each comes with its family of orbits and its start in scaled
     unknowns.
     """
@@ -315,7 +342,10 @@ def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds,
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
-        if period > max_period or kind not in (TESTS if period else EQUILIBRIUM_KINDS):
+        if period > max_period:
+            continue
+        if period and kind not in TESTS:
+            left_out[k] = OF_ORBITS
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
@@ -334,7 +364,7 @@ def _own(settings: Settings, problem: CurveProblem) -> Settings:
 def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     value = yield Query(problem, u)
     found = (yield from correct(problem, u, kernel_of(value), _own(settings, problem))) if value.is_finite else None
-    if found is None or not _persists(problem, found):
+    if found is None:
         return None
     tangent = kernel_of(found.value)
     return replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))

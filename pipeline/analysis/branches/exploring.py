@@ -19,7 +19,7 @@ import numpy as np
 from magpend_core.orbits import crossed_state, section_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import SAME_PLACE, Bifurcation, settle_sides
+from pipeline.analysis.branches.bifurcations import SAME_PLACE, SHIFTS, Bifurcation, locate, settle_sides
 from pipeline.analysis.branches.following import (
     Branch,
     Half,
@@ -33,9 +33,9 @@ from pipeline.analysis.branches.following import (
     problem_of,
 )
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF
-from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others
+from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others, shorter_orbit
 from pipeline.analysis.branches.limits import settle_limits
-from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.lockstep import Steps, run_alone, run_together
 from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 from pipeline.analysis.tolerances import BRANCH_RTOL
@@ -139,10 +139,8 @@ def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
 
 
 def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:
-    firsts = run_together(
-        [first_point(problem_of(s.family), s.family.unknowns(s.state, [s.value]), scope.settings) for s in starts]
-    )
-    pairs = [(s.family, p) for s, p in zip(starts, firsts, strict=True) if p is not None]
+    firsts = run_together([_first(start, scope.settings) for start in starts])
+    pairs = [pair for pair in firsts if pair is not None]
     halves = run_together(
         [
             half_branch(family, way, scope.low, scope.high, scope.settings)
@@ -152,7 +150,23 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
         what,
     )
     found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
-    return [None if p is None else next(found) for p in firsts]
+    return [None if pair is None else next(found) for pair in firsts]
+
+
+def _first(start: Start, settings: Settings) -> Steps[tuple[Family, Point] | None]:
+    """Return the first point of a branch and the family of its least period; None if Newton's method fails.
+
+    At a period doubling a starting orbit of twice the period may be the single one but for its error.
+    """
+    family, u = start.family, start.unknowns
+    while True:
+        point = yield from first_point(problem_of(family), u, settings)
+        if point is None:
+            return None
+        shorter = shorter_orbit(family, point)
+        if shorter is None:
+            return family, point
+        family, u = shorter
 
 
 # ---- switching ---------------------------------------------------------------------------------
@@ -526,6 +540,11 @@ def _move(one: Bifurcation, turning: Branch) -> None:
     one.after, one.child = place - 1, turning
     straight.bifurcations = sorted([*straight.bifurcations, one], key=lambda own: own.after)
     straight.origin, turning.origin = None, turning.origin or one
+    if 0 < place < len(straight.points):  # the branch that turns is known there to the root of its residual alone
+        beside, settings = straight.points[place - 1 : place + 1], Settings()
+        again = run_alone(locate(problem_of(straight.family), *beside, BRANCHING, settings, SHIFTS))
+        if again is not None:
+            one.point, one.bracket = again.point, again.bracket
     settle_sides(straight.points, straight.bifurcations)
 
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.pointwise import jacobian_at
-from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
+from pipeline.analysis.branches.bifurcations import CONTRADICTORY, WIDTH, Bifurcation
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import Ends, Family, Rows, Value
@@ -129,13 +129,14 @@ def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> No
     square, error, _ = settled(case.coefficients(_quadratic, matrices))
     size, _, _ = settled(case.coefficients(_size, matrices))
     by_arms, one.criticality = one.criticality, ""
+    cubic, cubic_error, _ = settled(case.coefficients(_cubic, matrices))
     if not np.isfinite(square + size):
         return
+    error += 3.0 * np.nan_to_num(abs(cubic)) * WIDTH  # from where the point was located to where it is
     if abs(square) > max(SAME * size, 3.0 * error):
         one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square, error
-    elif error <= SAME * size:
-        one.kind = PITCHFORK
-        one.coefficient, one.coefficient_error, _ = settled(case.coefficients(_cubic, matrices))
+    elif error <= SAME * size or by_arms:
+        one.kind, one.coefficient, one.coefficient_error = PITCHFORK, cubic, cubic_error
         one.criticality = by_arms
         _judge_sign(one)
 
