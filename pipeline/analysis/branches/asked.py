@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,8 @@ from magpend_core.pointwise import jacobian_at
 from pipeline.analysis.branches.boxes import Box, enclose_equilibria, search_equilibria
 from pipeline.analysis.branches.deflation import expected_index, orbit_near
 from pipeline.analysis.branches.known import Start
-from pipeline.analysis.branches.problems import Family, parameter_units
-from pipeline.analysis.branches.searching import family_at, rows_of
-from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.searching import family_at, rows_of, where_variables
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
@@ -107,7 +106,7 @@ def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, fl
             at = "".join(f", {parameter_name(n)} {v:g}" for n, v in {name: value, **where}.items())
             lines.append(f"start{at}: Newton's method found {what} from there")
         else:
-            starts.append(Start(_family(there, own_period), near, value))
+            starts.append(Start(replace(there, period=own_period), near, value))
     return starts, lines
 
 
@@ -118,10 +117,6 @@ def _closed_near(family: Family, state: np.ndarray, period: int) -> tuple[np.nda
         return (wrap_angles(found.states[0], family.system) if found.converged[0] else None), 0
     orbit = orbit_near(state, period, family.frequency_hz, family.parameters, family.system)
     return (None, period) if orbit is None else (orbit.points[0], orbit.period)
-
-
-def _family(one: Family, period: int) -> Family:
-    return family_of(one.system, period, one.frequency_hz, one.parameters, one.free[0], one.scales[0])
 
 
 # ---- all equilibria ----------------------------------------------------------------------------
@@ -140,7 +135,7 @@ class Counted:
     @property
     def starts(self) -> list[Start]:
         """The equilibria as starts of branches."""
-        return [Start(_family(self.family, 0), state, self.value) for state in self.states]
+        return [Start(replace(self.family, period=0), state, self.value) for state in self.states]
 
     @property
     def jacobians(self) -> np.ndarray:
@@ -205,10 +200,8 @@ def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any
     """
     if not counted:
         return {}
-    first = counted[0]
-    columns = {"value": [one.value for one in counted], **{d: [one.where[d] for one in counted] for d in first.where}}
-    units = {n: parameter_units(first.family.free[0] if n == "value" else n, model) for n in columns}
-    about = f"sum of the signs of det(-J); {expected_index(first.family.system)} for all equilibria of a bounded flow"
+    expected = expected_index(counted[0].family.system)
+    about = f"sum of the signs of det(-J); {expected} for all equilibria of a bounded flow"
     numbers = {
         "n_equilibria": ([len(one.states) for one in counted], "equilibria in the box"),
         "n_stable_equilibria": ([one.n_stable for one in counted], "stable equilibria in the box"),
@@ -216,10 +209,7 @@ def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any
     }
     codes = np.array([COUNTS.index(one.verdict) for one in counted], np.int8)
     return {
-        **{
-            f"box_{n}": ("box", values, {"units": units[n], "long_name": "where equilibria were counted"})
-            for n, values in columns.items()
-        },
+        **where_variables("box", counted, model),
         **{n: ("box", np.array(v, np.int32), {"units": "1", "long_name": told}) for n, (v, told) in numbers.items()},
         "box_verdict": ("box", codes, {"long_name": "whether the number is proved", **code_flags(COUNTS)}),
     }

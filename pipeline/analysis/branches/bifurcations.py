@@ -354,7 +354,7 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
-        if (one.kind == TORUS and not _is_torus(one)) or (one.kind == HOPF and not _is_pair(one)):
+        if (one.kind == TORUS and not has_torus(one.point)) or (one.kind == HOPF and not _is_pair(one)):
             continue
         if one.kind == FOLD and any(np.abs(one.point.u - u).max() < SAME_PLACE for u in branching):
             continue
@@ -362,11 +362,11 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     return sorted(kept, key=lambda one: float(a.tangent @ (one.point.u - a.u)))
 
 
-def _is_torus(one: Bifurcation) -> bool:
-    """Return whether a located zero is a torus bifurcation (complex multipliers), and not a neutral saddle (real
+def has_torus(point: Point) -> bool:
+    """Return whether a zero of the torus test is a bifurcation (complex multipliers), and not a neutral saddle (real
     multipliers).
     """
-    multipliers = multipliers_of(one.point)
+    multipliers = multipliers_of(point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)
 

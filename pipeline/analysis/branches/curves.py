@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import multipliers_of
+from pipeline.analysis.branches.bifurcations import has_torus
 from pipeline.analysis.branches.center_manifold import null_vectors
 from pipeline.analysis.branches.codimension_two import (
     BT,
@@ -31,6 +32,7 @@ from pipeline.analysis.branches.codimension_two import (
     SpecialPoint,
     merged,
 )
+from pipeline.analysis.branches.dataset import column, filled
 from pipeline.analysis.branches.equilibrium_curves import (
     PERSISTS,
     EquilibriumCurve,
@@ -392,7 +394,7 @@ def _follow(
         here = points[-1]
         if not is_inside(here.u):
             return "bound"
-        if problem.kind == TORUS and not _has_torus(here):
+        if problem.kind == TORUS and not has_torus(here):
             return "resonance"
         if problem.kind == HOPF and not np.isfinite(here.value.seconds):
             return BT
@@ -422,12 +424,6 @@ def _follow(
     if found.end in ("resonance", BT):
         found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
-
-
-def _has_torus(point: Point) -> bool:
-    multipliers = multipliers_of(point)
-    pairs = multipliers[multipliers.imag > 0.0]
-    return bool(len(pairs)) and bool(np.abs(np.abs(pairs) - 1.0).min() < 1e-4)
 
 
 def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
@@ -476,78 +472,78 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
         Tells names and units.
     """
     names = curves[0].family.system.state_names if curves else (model.state_names if model else ())
-    n = max((len(c.points) for c in curves), default=0)
-    values = np.full((len(curves), n, 2), np.nan)
-    section = np.full((len(curves), n, len(names)), np.nan)
-    residual = np.full((len(curves), n), np.nan)
-    quantity = np.full((len(curves), n), np.nan)
-    for i, curve in enumerate(curves):
-        values[i, : len(curve.points)] = curve.values
-        section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
-        residual[i, : len(curve.points)] = [p.residual for p in curve.points]
-        if curve.kind == HOMOCLINIC:
-            quantity[i, : len(curve.points)] = [saddle_quantity(p.value.monodromy) for p in curve.points]
-    dims = ("curve", "point")
-    one, units = {"units": "1"}, state_units(model)
-
-    def codes(i: int) -> np.ndarray:
-        return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
-
-    kinds = np.array([CURVE_KINDS.index(c.kind) for c in curves], np.int8)
-
-    def numbers(values: list[int]) -> np.ndarray:
-        return np.array(values, np.int32)
-
+    points = [((i, j), (c, point)) for i, c in enumerate(curves) for j, point in enumerate(c.points)]
+    shape = (len(curves), max((len(c.points) for c in curves), default=0))
+    units = [parameter_units(name, model) for name in (first, second)]
+    variables = filled(
+        ("curve", "point"),
+        shape,
+        points,
+        {"state": len(names)},
+        {
+            "first": ((), units[0], first, lambda c, point: c.family.values(point.u)[0]),
+            "second": ((), units[1], second, lambda c, point: c.family.values(point.u)[1]),
+            "section": (
+                ("state",),
+                state_units(model),
+                "a section point, or the saddle",
+                lambda c, point: c.family.state(point.u),
+            ),
+            "residual": ((), "1", "largest residual, test function included", lambda _, point: point.residual),
+            "saddle_quantity": (
+                (),
+                "1/s",
+                "sum of the leading eigenvalues of the saddle of a homoclinic orbit",
+                lambda c, point: saddle_quantity(point.value.monodromy) if c.kind == HOMOCLINIC else np.nan,
+            ),
+        },
+    )
+    ends = [
+        column([CURVE_ENDS.index(c.ends[i]) for c in curves], "int8", "why", **code_flags(CURVE_ENDS)) for i in (0, 1)
+    ]
+    kinds = [CURVE_KINDS.index(c.kind) for c in curves]
+    columns = {
+        "kind": column(kinds, "int8", "kind of bifurcation", **code_flags(CURVE_KINDS)),
+        "orbit_period": column([c.family.period for c in curves], "int32", "period, 0 for equilibria"),
+        "start": column([c.start for c in curves], "int32", "located point"),
+        "n_missed": column([c.n_missed for c in curves], "int32", "sign changes that could not be located"),
+        "n_points": column([len(c.points) for c in curves], "int32", "points of the curve"),
+        "first_end": column(ends[0], "int8", "why it begins", **code_flags(CURVE_ENDS)),
+        "last_end": column(ends[1], "int8", "why it ends", **code_flags(CURVE_ENDS)),
+    }
+    variables |= {name: ("curve", *own) for name, own in columns.items()}
     told = {} if model is None else {"model": model_attribute(model), **section_attributes(model.crossing)}
     return xr.Dataset(
-        {
-            "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
-            "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
-            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point, or the saddle"}),
-            "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
-            "saddle_quantity": (
-                dims,
-                quantity,
-                {"units": "1/s", "long_name": "sum of the leading eigenvalues of the saddle of a homoclinic orbit"},
-            ),
-            "kind": ("curve", kinds, {**one, **code_flags(CURVE_KINDS)}),
-            "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
-            "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
-            "n_missed": (
-                "curve",
-                numbers([c.n_missed for c in curves]),
-                {**one, "long_name": "sign changes that could not be located"},
-            ),
-            "n_points": ("curve", numbers([len(c.points) for c in curves]), one),
-            "first_end": ("curve", codes(0), {**one, **code_flags(CURVE_ENDS)}),
-            "last_end": ("curve", codes(1), {**one, **code_flags(CURVE_ENDS)}),
-            **_special_points(curves, first, second, model, len(names)),
-        },
+        variables | _special_points(curves, (first, second), units, state_units(model), len(names)),
         coords={"state": list(names)},
         attrs={"first_parameter": first, "second_parameter": second, **told},
     )
 
 
 def _special_points(
-    curves: Sequence[Curve], first: str, second: str, model: Model | None, n_states: int
-) -> dict[str, tuple[object, ...]]:
+    curves: Sequence[Curve], names: tuple[str, str], units: Sequence[str], states: str, n_states: int
+) -> dict[str, Any]:
     """Return the points of codimension two on all curves as dataset variables, each point once."""
     found = merged({i: curve.special for i, curve in enumerate(curves)})
-    values = np.array([one.values for one in found]).reshape(-1, 2)
-    brackets = np.array([one.bracket for one in found]).reshape(-1, 2)
-    section = np.array([one.family.state(one.point.u) for one in found]).reshape(-1, n_states)
-    one, kinds = {"units": "1"}, code_flags(POINT_KINDS)
-    variables: dict[str, tuple[object, ...]] = {
-        "special_kind": ("special", np.array([POINT_KINDS.index(p.kind) for p in found], np.int8), {**one, **kinds}),
-        "special_curve": ("special", np.array([p.curve for p in found], np.int32), one),
-        "special_period": ("special", np.array([p.family.period for p in found], np.int32), one),
-        "special_section": (("special", "state"), section, {"units": state_units(model)}),
+    kinds = [POINT_KINDS.index(one.kind) for one in found]
+    codes = {
+        "special_kind": column(kinds, "int8", "kind of point", **code_flags(POINT_KINDS)),
+        "special_curve": column([one.curve for one in found], "int32", "curve on which it was located"),
+        "special_period": column([one.family.period for one in found], "int32", "period, 0 for equilibria"),
     }
-    for name in sorted({name for p in found for name in p.coefficients}):
-        about = {"units": COEFFICIENTS[name], "long_name": f"normal form coefficient {name}"}
-        variables[f"special_{name}"] = ("special", np.array([p.coefficients.get(name, np.nan) for p in found]), about)
-    for i, (role, name) in enumerate((("first", first), ("second", second))):
-        units = {"units": parameter_units(name, model)}
-        variables[f"special_{role}"] = ("special", values[:, i], {**units, "long_name": name})
-        variables[f"special_{role}_error"] = ("special", brackets[:, i], {**units, "long_name": f"error of {name}"})
-    return variables
+    columns: dict[str, Any] = {
+        "special_section": (("state",), states, "a section point", lambda one: one.family.state(one.point.u))
+    }
+    for i, (role, name) in enumerate(zip(("first", "second"), names, strict=True)):
+        columns[f"special_{role}"] = ((), units[i], name, lambda one, i=i: one.values[i])
+        columns[f"special_{role}_error"] = ((), units[i], f"error of {name}", lambda one, i=i: one.bracket[i])
+    for name in sorted({name for one in found for name in one.coefficients}):
+        about = f"normal form coefficient {name}"
+        columns[f"special_{name}"] = (
+            *((), COEFFICIENTS[name], about),
+            lambda one, name=name: one.coefficients.get(name, np.nan),
+        )
+    items = [((k,), (one,)) for k, one in enumerate(found)]
+    return {name: ("special", *own) for name, own in codes.items()} | filled(
+        ("special",), (len(found),), items, {"state": n_states}, columns
+    )

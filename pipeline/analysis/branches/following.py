@@ -267,10 +267,7 @@ def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
     """Return the start of the doubled branch at a period doubling: the same orbit traversed twice, with the new
     branch's tangent.
     """
-    double = Family(
-        family.system, 2 * family.period, family.frequency_hz, family.parameters, family.free, family.scales
-    )
-    value = yield Query(OrbitProblem(double), at.point.u)
+    value = yield Query(OrbitProblem(replace(family, period=2 * family.period)), at.point.u)
     if not value.is_finite:
         return None
     matrix = family.scaled(at.point.value.monodromy)
