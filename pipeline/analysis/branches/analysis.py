@@ -27,6 +27,7 @@ from pipeline.analysis.tabular import Row, Words, aligned, counted, value_with_e
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
+from pipeline.specification.problems import SpecError, unknown_name
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -52,8 +53,6 @@ def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
 
 def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
     """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
-    from pipeline.specification.problems import SpecError
-
     if axis_name(parameter) == FREQUENCY_DIM and run.model.clock_hz is not None:
         swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
@@ -107,8 +106,6 @@ def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
     """Fill in the parameter interval of the branches; raise SpecError unless the second parameter differs from the
     first.
     """
-    from pipeline.specification.problems import SpecError
-
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
     second = options.second
     if axis_name(second) == axis_name(settled.parameter):
@@ -152,8 +149,6 @@ def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:
 
 def interval_of(run: OpenRun, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Return the parameter interval of the branches; its default is the range that the run sweeps."""
-    from pipeline.specification.problems import SpecError, unknown_name
-
     base = parameters_of(run.cube())
     is_frequency = axis_name(parameter) == FREQUENCY_DIM
     if not is_frequency and parameter not in base.names:

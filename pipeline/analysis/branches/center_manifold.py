@@ -29,7 +29,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.jets import Monomials, monomials, rates_on
-from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import Family
 
 NO_TERM = 1e-9
@@ -56,6 +55,14 @@ class Rest:
         states = np.zeros((len(a), len(of.exponents)), complex)
         states[:, 1], states[:, 2] = a, b
         return self.rates(of, states)[:, of.position((1, 1))]
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve linear equations; NaN if the matrix is singular."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return np.full(len(right), np.nan)
 
 
 def null_vectors(matrix: np.ndarray, value: complex = 0.0) -> tuple[np.ndarray, np.ndarray]:

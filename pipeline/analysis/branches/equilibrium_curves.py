@@ -41,6 +41,7 @@ from pipeline.analysis.branches.center_manifold import (
     double_hopf,
     lyapunov,
     null_vectors,
+    solved,
     zero_hopf,
 )
 from pipeline.analysis.branches.codimension_two import (
@@ -55,7 +56,6 @@ from pipeline.analysis.branches.codimension_two import (
 )
 from pipeline.analysis.branches.kinds import FOLD, HOPF, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import (
     PARAMETER_STEP,
     STATE_STEP,

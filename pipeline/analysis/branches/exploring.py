@@ -217,10 +217,9 @@ def _half_orbit(branch: Branch, which: int) -> Start:
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies."""
-    worse_above = (at.n_unstable_after > at.n_unstable_before) == at.rises_before
     reach = min(4, len(child.points))  # a branch that leaves the interval soon is short
     inner = child.points[reach - 1 if end == 0 else -reach]
-    return "supercritical" if (inner.u[-1] > at.point.u[-1]) == worse_above else "subcritical"
+    return _side_criticality(at, 1 if inner.u[-1] > at.point.u[-1] else -1)
 
 
 def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
@@ -559,7 +558,7 @@ def _drop(one: Bifurcation, branch: Branch) -> None:
 
 
 def _side_criticality(at: Bifurcation, side: int) -> str:
-    """Decide whether a pitchfork is sub- or supercritical, from the side on which the branch that turns there lies."""
+    """Decide whether a bifurcation is sub- or supercritical, from the side of the branch that turns there."""
     if at.n_unstable_before == at.n_unstable_after:
         return ""
     worse = 1 if (at.n_unstable_after > at.n_unstable_before) == at.rises_before else -1
