@@ -498,9 +498,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
             ),
         },
     )
-    ends = [
-        column([CURVE_ENDS.index(c.ends[i]) for c in curves], "int8", "why", **code_flags(CURVE_ENDS)) for i in (0, 1)
-    ]
+    ends = [[CURVE_ENDS.index(c.ends[i]) for c in curves] for i in (0, 1)]
     kinds = [CURVE_KINDS.index(c.kind) for c in curves]
     columns = {
         "kind": column(kinds, "int8", "kind of bifurcation", **code_flags(CURVE_KINDS)),

@@ -124,7 +124,9 @@ class EquilibriumCurve(FamilyProblem):
         if not (np.isfinite(rates).all() and np.isfinite(jacobian).all()):
             nothing = np.full((self.size - 1, self.size), np.nan)
             return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobian, is_rest=True)
-        right, left = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
+        vectors = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
+        # of either sign where the singular value is 0 but for rounding, which would turn the imperfection's
+        right, left = (v * np.copysign(1.0, v[np.argmax(np.abs(v))]) for v in vectors)
         steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
         found = np.array(
             [self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))]
