@@ -289,13 +289,13 @@ def test_follower_force():
     """Flutter by Routh and Hurwitz, divergence where det K = 0; both meet at the double zero."""
     flutter = brentq(lambda load: routh(follower_polynomial(load, 1.0)), 1.0, 2.0, xtol=1e-12)
     bounds = ((0.2, 4.0), (0.0, 1.2))
-    curves = curves_of(FOLLOWER, "hopf", [0, 0, 0, 0], [flutter, 1.0], bounds)
+    curves = curves_of(FOLLOWER, "hopf", [0, 0, 0, 0], [flutter, 1.0], bounds, generations=1)
     curve, sprung = curves
     assert (curve.kind, sprung.kind) == ("hopf", "pitchfork")
     assert "bogdanov_takens" in curve.ends
     assert max(least_sum(follower_polynomial(*values)) for values in curve.values) < 1e-9
     buckling = brentq(lambda load: follower_polynomial(load, 0.2)[-1], 0.1, 0.8, xtol=1e-12)
-    (divergence,) = curves_of(FOLLOWER, "pitchfork", [0, 0, 0, 0], [buckling, 0.2], bounds)
+    (divergence,) = curves_of(FOLLOWER, "pitchfork", [0, 0, 0, 0], [buckling, 0.2], bounds, generations=0)
     for values in (*divergence.values, *sprung.values):
         assert abs(follower_polynomial(*values)[-1]) < 1e-9
     known = fsolve(lambda x: follower_polynomial(*x)[-2:], curve.special[0].values + 1e-3, xtol=1e-12)
