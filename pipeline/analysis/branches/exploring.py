@@ -19,7 +19,7 @@ import numpy as np
 from magpend_core.orbits import crossed_state, section_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import SAME_PLACE, SHIFTS, Bifurcation, locate, settle_sides
+from pipeline.analysis.branches.bifurcations import SAME_PLACE, SHIFTS, TESTS, Bifurcation, locate, settle_sides
 from pipeline.analysis.branches.following import (
     Branch,
     Half,
@@ -539,12 +539,19 @@ def _move(one: Bifurcation, turning: Branch) -> None:
     one.after, one.child = place - 1, turning
     straight.bifurcations = sorted([*straight.bifurcations, one], key=lambda own: own.after)
     straight.origin, turning.origin = None, turning.origin or one
-    if 0 < place < len(straight.points):  # the branch that turns is known there to the root of its residual alone
-        beside, settings = straight.points[place - 1 : place + 1], Settings()
-        again = run_alone(locate(problem_of(straight.family), *beside, BRANCHING, settings, SHIFTS))
-        if again is not None:
-            one.point, one.bracket = again.point, again.bracket
+    _relocate(one, straight, place)
     settle_sides(straight.points, straight.bifurcations)
+
+
+def _relocate(one: Bifurcation, branch: Branch, place: int) -> None:
+    """Locate a branch point again between the points of the branch that passes straight through it: on the branch that
+    turns there it is known to the root of its residual alone.
+    """
+    beside, test = branch.points[max(place - 1, 0) : place + 1], TESTS[BRANCHING]
+    if len(beside) == 2 and test(beside[0]) * test(beside[1]) < 0.0:
+        found = run_alone(locate(problem_of(branch.family), *beside, BRANCHING, Settings(), SHIFTS))
+        if found is not None:
+            one.point, one.bracket = found.point, found.bracket
 
 
 def _drop(one: Bifurcation, branch: Branch) -> None:
