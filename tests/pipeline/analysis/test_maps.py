@@ -128,15 +128,17 @@ def logistic(folder, values, model=LOGISTIC):
 
 def test_logistic__grid_values_on_bifurcations(tmp_path):
     """Cells at r = 1 and 3 end on an orbit of twice the period, but for their error: each branch is there once."""
-    run = logistic(tmp_path / "run", [1.0, 2.0, 3.0, 3.2])
-    rows = located(run, 0.5, 3.4, "r")
-    assert [row[1:3] for row in rows] == [("transcritical", 1), ("period_doubling", 1)]
-    assert [row[0] for row in rows] == pytest.approx([1.0, 3.0], abs=1e-8)
-    ds = run.branches(low=0.5, high=3.4)
-    assert ds["orbit_period"].values.tolist() == [1, 1, 2]
-    (alone,) = located(logistic(tmp_path / "alone", [3.0]), 2.5, 3.3, "r")
-    assert alone[1:3] == ("period_doubling", 1)
-    assert alone[0] == pytest.approx(3.0, abs=1e-8)
+    for values, ends, known, periods in (
+        ([1.0, 2.0, 3.0], (0.5, 3.2), {"transcritical": 1.0, "period_doubling": 3.0}, [1, 1, 2]),
+        ([3.0], (2.9, 3.1), {"period_doubling": 3.0}, [1, 2]),
+    ):
+        ds = logistic(tmp_path / str(len(values)), values).branches(low=ends[0], high=ends[1])
+        rows = branches_table(ds).rows
+        assert ds["orbit_period"].values.tolist() == periods
+        assert [(row["type"], row["period"]) for row in rows] == [(kind, 1) for kind in known]
+        # where branches cross Newton's method is as exact as the root of its residual
+        assert [row["r"] for row in rows] == pytest.approx(list(known.values()), abs=1e-6)
+        assert rows[-1]["r"] == pytest.approx(3.0, abs=1e-8)
 
 
 def test_logistic__orbits_near_a_start(tmp_path, command):
