@@ -134,7 +134,7 @@ def test_logistic__grid_values_on_bifurcations(tmp_path):
     ):
         ds = logistic(tmp_path / str(len(values)), values).branches(low=ends[0], high=ends[1])
         rows = branches_table(ds).rows
-        assert ds["orbit_period"].values.tolist() == periods
+        assert sorted(ds["orbit_period"].values) == periods
         assert [(row["type"], row["period"]) for row in rows] == [(kind, 1) for kind in known]
         # where branches cross Newton's method is as exact as the root of its residual
         assert [row["r"] for row in rows] == pytest.approx(list(known.values()), abs=1e-6)
