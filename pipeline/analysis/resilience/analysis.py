@@ -13,7 +13,8 @@ variable                         meaning
 ``arrived``, ``_low``, ``_high``  share of timed initial states that have arrived within `within` periods
 ``mean_time``, ``_stderr``,      time until arrival of the timed initial states [drive periods or returns]
 ``longest_time``, ``n_timed``
-``weighted_time``                mean of these times, each weighed by the density
+``weighted_time``,               mean of these times, each weighed by the density, and share of the density of the
+``weighted_arrived``             timed initial states that has arrived within `within` periods
 ``reactivity``, ...              `local.Local`: growth of small disturbances at once and later, and their decay
 ``quantity``                     value of the expression `quantity`
 ``shock_low``, ``shock_high``    interval of the smallest critical shock of the chosen states, at any phase
@@ -116,6 +117,7 @@ _PLAIN = (
     "longest_time",
     "n_timed",
     "weighted_time",
+    "weighted_arrived",
     *Local._fields,
     "quantity",
 )
@@ -323,6 +325,7 @@ class _Result:
         self._new("mean_time_stderr", "float64", np.nan, "standard error of the mean time")
         self._new("n_timed", "int64", 0, "timed initial states that end on it")
         self._new("weighted_time", "float64", np.nan, "mean time until arrival, weighed by the density")
+        self._new("weighted_arrived", "float64", np.nan, "share of the density that has arrived in time")
         self._new("n_effective", "float64", np.nan, "independent cells of equal weight with the same error")
         for name, (text, units) in _LOCAL.items():
             self._new(name, "float64", np.nan, text, units=units.format(time_unit(run.model)))
@@ -361,7 +364,7 @@ class _Result:
 
     def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray, weights: np.ndarray) -> None:
         """Fill in the arrival times of initial states, by attractor."""
-        counted = int((label != -1).sum())
+        counted, total = int((label != -1).sum()), weights[label != -1].sum()
         for i in np.unique(label[label >= 0]).tolist():
             chosen, at = (label == i) & np.isfinite(entered), self._rows[index][i]
             own, weight = entered[chosen], weights[chosen]
@@ -370,6 +373,8 @@ class _Result:
             if len(own):
                 self._put("mean_time", at, own.mean())
                 self._put("longest_time", at, own.max())
+            if total > 0.0:
+                self._put("weighted_arrived", at, weight[own <= self._options.within].sum() / total)
             if weight.any():
                 self._put("weighted_time", at, np.average(own, weights=weight))
             if len(own) > 1:
@@ -521,6 +526,7 @@ def _words(attrs: Mapping[str, Any], row: Row) -> Words:
         "distance": size_of(row["distance_low"], row["distance_high"]),
         "to ": row["distance_leads_to"],
         "weighted stability": with_interval(row, _WEIGHTED, ".4f") if is_weighed else None,
+        "weighted in time": number(row["weighted_arrived"], ".3f") if is_weighed else None,
         "weighted time": number(row["weighted_time"], ".1f") if is_weighed else None,
         "reactivity": number(row["reactivity"], ".4g"),
         "amplification": number(row["amplification"], ".4g"),
