@@ -36,7 +36,7 @@ class Case:
     motion: str  # "chaotic", "periodic", "regular" or "noise"
     exponent: float = np.nan
     dimension: tuple[float, float] = (np.nan, np.nan)
-    period: float = np.nan  # of an orbit, between maxima
+    period: float = np.nan  # mean time between maxima
     cycle: int = 0
 
 
@@ -110,6 +110,7 @@ CASES = {
         "chaotic",
         0.0714,
         (1.991 - 0.065, 1.991 + 0.065),
+        5.857,
     ),
     "lorenz": Case(
         flow(lorenz, 0.03, 30.0),
@@ -122,11 +123,13 @@ CASES = {
     "ueda": Case(
         flow(ueda, 0.2, 200.0), 0.2, ((4000, 0.0), (10_000, 0.0), (4000, 0.02)), "chaotic", 0.1034, (2.543, 2.807)
     ),
-    "torus": Case(torus, 0.17, ((1500, 0.0), (4000, 0.0), (12_000, 0.0), (4000, 0.05)), "regular", 0.0, (2.0, 2.0)),
+    "torus": Case(
+        torus, 0.17, ((1500, 0.0), (4000, 0.0), (12_000, 0.0), (4000, 0.05)), "regular", 0.0, (2.0, 2.0), TURN
+    ),
     "orbit": Case(orbit(1.0, 0.3), 0.1, ((1500, 0.05), (3000, 0.2), (4000, 0.0)), "periodic", 0.0, (1.0, 1.0), TURN, 1),
     "orbit-2": Case(orbit(0.5, 1.0), 0.1, ((4000, 0.1),), "periodic", 0.0, (1.0, 1.0), TURN / 2.0, 2),
     "doubled": Case(
-        flow(roessler(3.5), 0.2, 800.0), 0.2, ((4000, 0.0), (4000, 0.02)), "periodic", 0.0, (1.0, 1.0), cycle=2
+        flow(roessler(3.5), 0.2, 800.0), 0.2, ((4000, 0.0), (4000, 0.02)), "periodic", 0.0, (1.0, 1.0), 5.7726, 2
     ),
     "ar1": Case(autoregressive(1.0, -0.95), 1.0, ((1500, 0.0), (4000, 0.0)), "noise"),
     "narrow": Case(autoregressive(*NARROW), 1.0, ((1500, 0.0), (4000, 0.0)), "noise"),

@@ -245,7 +245,11 @@ def coarsened(chain: Chain, grid: Grid, sets: Sets) -> dict[str, np.ndarray]:
     *cores, others = (np.flatnonzero(core_of == k) for k in range(len(sets.cores) + 1))
     merged = replace(sets, of_box=most(sets.of_box), cores=cores, density=density, others=others)
     found = numbers_of(Chain(boxes, counts, np.bincount(to, chain.out, n), chain.unknown).p, merged)
-    return found | {"committor": found["committor"][to]}
+    # one step on the fine boxes, later ones on the coarse: the boxes themselves are compared at one place
+    reached = chain.p @ found["committor"][to]
+    for k, core in enumerate(sets.cores):
+        reached[core] = np.arange(len(sets.cores)) == k
+    return found | {"committor": reached}
 
 
 def intervals_of(
