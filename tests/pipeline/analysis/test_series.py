@@ -166,25 +166,3 @@ def test_series_of__refuses_what_it_cannot_measure():
         magpend.series_of(series(np.ones(300), 1.0))
     with pytest.raises(ValueError, match="'y' is not there"):
         magpend.series_of(series(np.arange(300.0), 1.0), "y")
-
-
-@pytest.mark.slow
-def test_series__of_a_chaotic_cell_has_the_exponent_of_its_tangents(tmp_path):
-    """From the cell's samples alone, and from the variational equations (`[products] lyapunov`)."""
-    spec = (
-        magpend.Spec("sweep", "rossler")
-        .with_start_list(points=[(1.0, 1.0, 1.0)])
-        .with_section(of="x", value=0.0, direction="up")
-        .with_integration(n_transient=50, n_keep=50)
-        .with_lyapunov(n_transient=50, n_periods=400)
-    )
-    run = magpend.run(spec, tmp_path / "run", workers=0)
-    found = run.series(cell=0, periods=140, samples=30)
-    low, _, high = one(found, "exponent")
-    assert found.attrs["motion"] == "chaotic"
-    assert 0.0 < low <= float(run.cube()["lyapunov"].isel(exponent=0).item()) <= high
-    assert found["power"].attrs["units"] == "1/Hz"
-    assert "chaotic" in series_table(found).lines[0]
-    assert len(run.plot.series(cell=0, periods=140, samples=30)) == 6
-    with pytest.raises(magpend.SpecError, match="unknown channel 'w'"):
-        run.series(channel="w")
