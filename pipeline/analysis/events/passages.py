@@ -39,8 +39,10 @@ TYPES = {FOLD: "i", TORUS: "ii", DOUBLING: "iii"}
 EXPONENTS = {FOLD: -0.5, TORUS: -1.0, DOUBLING: -1.0}
 """Exponents of the length over the distance from the bifurcation."""
 
-MEASURED = {FOLD: (10, 16, 4096), TORUS: (6, 32, 16384), DOUBLING: (6, 32, 16384)}
-"""Numbers of distances, each half of the one before, of trajectories at each, and of their sections."""
+MEASURED = {FOLD: (10, 16, 4096), TORUS: (6, 32, 16384), DOUBLING: (6, 32, 16384), LOCKING: (10, 8, 8192)}
+"""Numbers of distances, each half of the one before, of trajectories at each, and of their sections. A torus passes the
+place of a fold in equal times, of which fewer are needed, and slow oscillators need longer ones.
+"""
 
 POWERS = {FOLD: 6, TORUS: 2, DOUBLING: 2}
 """Powers m in the ratio of means that is the length of laminar phases."""
@@ -127,11 +129,12 @@ def passage_of(
         return Born("", told)
     ghost = ds["bifurcation_section"].values[k]
     ghost = ghost[np.isfinite(ghost).all(axis=-1)]
-    distances = abs(bracket[1] - value) * 0.5 ** np.arange(MEASURED[kind][0])
+    n_values, many, n = MEASURED[LOCKING if is_torus else kind]
+    distances = abs(bracket[1] - value) * 0.5 ** np.arange(n_values)
     values = value + np.sign(bracket[1] - value) * distances
-    sections = _sections(family, values, points, *MEASURED[kind][1:])
+    sections = _sections(family, values, points, many, n)
     found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
-    fitted = scaling(found, kind, len(ghost))
+    fitted = scaling(found, kind, len(ghost), OF_SECTIONS * n)
     born = replace(_judged(found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
     if born.what != LOCKING or fitted is None:
         return born
@@ -235,13 +238,12 @@ def _ratio(lengths: np.ndarray, power: int) -> float:
     return float((lengths**power).sum() / (lengths ** (power - 1)).sum()) if len(lengths) else np.nan
 
 
-def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.ndarray] | None:
-    """Fit the power with which the lengths grow near the bifurcation, with its error.
+def scaling(found: Phases, kind: str, period: int, longest: float) -> tuple[float, float, np.ndarray] | None:
+    """Fit the power with which the lengths, up to the longest, grow near the bifurcation, with its error.
 
     The difference between the exponents without the farthest and without the nearest distance is part of the error.
     Return also the numbers of the distances; None if there are too few.
     """
-    longest = OF_SECTIONS * MEASURED[kind][2]
     serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= LEAST_PHASES)
     chosen = np.flatnonzero(serves)[-MOST_VALUES:]
     if len(chosen) < LEAST_VALUES:

@@ -37,7 +37,8 @@ def at_second(curve, value):
 def test_homoclinic_curves__closed_form():
     """Sandstede (1997): y**2 = x**2 - x**3 is invariant at m = a**2, and the saddle's eigenvalues are a - 1, a + 1.
 
-    The saddle quantity 2 a vanishes at a = 0, and at a = 1 the stable eigenvalue does.
+    The saddle quantity 2 a vanishes at a = 0, at a = 1 the stable eigenvalue does, and at a = -1 the unstable one. At
+    the last one the orbit leaves the saddle so slowly that a segment must be as short as the stable eigenvalue asks.
     """
     equations = table(
         "sandstede_plane",
@@ -53,15 +54,18 @@ def test_homoclinic_curves__closed_form():
 
     loop = solve_ivp(rates, (0.0, 16.0), [0.01, 0.01 * np.sqrt(0.99)], "DOP853", times, rtol=1e-9, atol=1e-11).y.T
     guess = Loop(family, times, loop, np.zeros(2), np.array([0.26, -0.5]))
-    (curve,) = homoclinic_curves([guess], ((-1.0, 2.0), (-0.7, 1.5)))
+    (curve,) = homoclinic_curves([guess], ((-1.0, 2.0), (-1.5, 1.5)))
     points = np.array([family.values(p.u) for p in curve.points])
     np.testing.assert_allclose(points[1:-1, 0], points[1:-1, 1] ** 2, atol=1e-8)
-    assert curve.ends == ("bound", "saddle_node_homoclinic")
-    found = {(one.kind, round(one.values[1])): one for one in curve.special}
-    for (kind, a), one in found.items():
-        assert kind == ("neutral_saddle" if a == 0 else "saddle_node_homoclinic")
+    assert curve.ends == ("saddle_node_homoclinic", "saddle_node_homoclinic")
+    assert sorted((one.kind, round(one.values[1])) for one in curve.special) == [
+        ("neutral_saddle", 0),
+        ("saddle_node_homoclinic", -1),
+        ("saddle_node_homoclinic", 1),
+    ]
+    for one in curve.special:
+        a = round(one.values[1])
         np.testing.assert_allclose(one.values, [a * a, a], atol=1e-6 if a else 1e-8)
-    assert len(found) == 2
 
 
 TAKENS = table("takens", {"x": "y", "y": "b1 + b2*x + x**2 + x*y"}, {"b1": 0.0, "b2": 0.0})
