@@ -312,7 +312,7 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
     if any(SETS[other.kind] == "chaotic_set" for other in beyond):
-        return f"{letter(heir)} is a chaotic set: whether the torus breaks up into it is not looked for"
+        return f"{letter(heir)} is a chaotic set, but the cells of the two do not all go on to each other"
     if len(one.to) > 1:
         return "its cells do not all go on to the same attractor"
     return "its cells do not go on to an orbit whose end is located and whose cells go on to it"

@@ -28,6 +28,9 @@ from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
 VALUES, ROUNDS = 15, 3
 """Further values in each round, and rounds, each between the last torus and the first chaotic set of the one before."""
 
+MOST_OPEN = 2
+"""Most values of a round whose sets are neither tori nor chaotic nor locked: too near to the break-up to tell."""
+
 TRANSIENT, LENGTH = 1000, 2048
 """Sections of each trajectory before it counts, and those along which its exponents are computed."""
 
@@ -100,7 +103,7 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         The value is the middle of the interval between the last torus and the first chaotic set, the error half its
         length.
     """
-    torus, chaos, n, rate = *values, 0, np.nan
+    (torus, chaos), n, rate = values, 0, np.nan
     for _ in range(ROUNDS):
         between = np.linspace(torus, chaos, VALUES + 2)[1:-1]
         found = [_found(along, x, sets) for x in between]
@@ -111,10 +114,10 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         torus, chaos = [torus, *between][first], [*between, chaos][last]
         rate = found[last].rate if last < len(found) else rate
         told = f"of {n} further values it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
-        if (kinds[first:last] != BOUNDED_SET).any():
+        if (kinds[first:last] != BOUNDED_SET).any() or last - first > MOST_OPEN:
             listed = _listed(between[first:last], found[first:last])
             return Born("", f"whether the torus breaks up is open: at {told}; between, it is {listed}")
-        if first < last:  # sets between are too near to the break-up for their exponents
+        if first < last:
             break
     told = f"at {told} (largest exponent {rate:.3g} per section), and locked at none"
     return Born(BREAKUP, told, float(0.5 * (torus + chaos)), float(0.5 * abs(chaos - torus)))
