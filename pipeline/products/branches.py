@@ -130,7 +130,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
-    version=2,
+    version=3,
 )
 
 BANDS = Analysis(
