@@ -42,6 +42,9 @@ stay before an orbit comes to stick, in units of its range and of the square of 
 it the orbit comes in across the surface, and not along it.
 """
 
+RESOLVED = 4.0 / SAMPLES**2
+"""Error of a short stay, as a share of the period: its beginning and its end are seen between two instants."""
+
 NODES, APART = 30, 2.0
 """Last points of a branch that are looked at, and the least ratio of the heights of those that are used."""
 
@@ -78,6 +81,9 @@ def grazing_of(line: Line, node: int, family: Family) -> tuple[str, float, float
     for name, measured in ((GRAZING, peaks), (SLIDING, stays)):
         for of in range(len(measured[0]) if measured else 0):
             touch = _touch(values, [one[of] for one in measured])
+            if name == SLIDING and touch is not None:
+                other = _touch(values, [one[of] - RESOLVED for one in measured])
+                touch = None if other is None else (touch[0], touch[1] + abs(other[0] - touch[0]), touch[2])
             if touch is not None and max(abs(touch[0] - values[0]), touch[1]) <= REACH * family.scales[0]:
                 return name, touch[0], touch[1], _evidence(name, of, touch[2], system.n_switches)
     return None

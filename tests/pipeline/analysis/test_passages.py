@@ -242,6 +242,14 @@ def test_peak__is_smooth_and_below_zero():
     assert np.isnan(grazing._peak(np.where(t > 3.5, 0.0, h), rate, 0.01))
 
 
+def test_stay__is_one_between_others():
+    """A fall onto a surface and a leave along it, with a stay of 31 of 200 intervals; not at an end, twice, or never."""
+    h = np.concatenate([(1e-2 * np.arange(80, 0, -1)) ** 2, np.zeros(31), (1e-2 * np.arange(1, 91)) ** 2])
+    assert grazing._stay(h) == pytest.approx(31 / 200)
+    for other in (h[80:], h[:111], np.concatenate([h, h]), h + 1e-9):
+        assert np.isnan(grazing._stay(other))
+
+
 def test_touch__extrapolates_and_refuses():
     """Peaks -(c - x) - (c - x)**2 reach 0 at c; orbits that stay away, or of which one side is unknown, do not."""
     away = 1e-3 * 0.4 ** np.arange(7)[::-1]
