@@ -13,8 +13,6 @@ from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
-from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises, Crisis
@@ -149,7 +147,7 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
                 fates[one, rises] = (Fate(np.nan, why=why),) * 2
                 continue
             asked.append((one, rises))
-            orbits.append(Orbit(_family(scene, place, one.period), points[row][0], float(scene.along[place])))
+            orbits.append(Orbit(scene.family(place, one.period), points[row][0], float(scene.along[place])))
     for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
         if found is None:
             fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
@@ -217,19 +215,13 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     return replace(event, what=what, error=error)
 
 
-def _family(scene: Scene, place: int, period: int) -> Family:
-    """Return the family of orbits of a period at the parameters of a place on the axis."""
-    frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
-    return family_of(scene.base.model.system, period, frequency, packed, scene.axis, scene.scale)
-
-
 def _touching(scene: Scene, event: Event) -> Event:
     """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
     fate = event.fate
     line = next((line for line in scene.lines if line.branch == fate.branch), None)
     if line is None or fate.node not in (0, len(line.value) - 1):
         return event
-    family = _family(scene, event.stretch.places[event.rises], line.period)
+    family = scene.family(event.stretch.places[event.rises], line.period)
     found = grazing_of(line, fate.node, family)
     if found is None:
         return event
@@ -294,7 +286,7 @@ def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> B
     points = all_points[stretch.rows[way > 0]]
     bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
     if may_pass(scene.located, fate.bifurcation, is_torus):
-        family = _family(scene, place, 1)
+        family = scene.family(place, 1)
         return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
     if not is_torus:
         return cascade_of(scene.located, fate, bracket, points, geometry)

@@ -30,7 +30,6 @@ from magpend_core.orbits import polish_orbits, section_map
 from magpend_core.status import Status
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.problems import Family, Rows
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.events.scene import Scene
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
@@ -165,9 +164,7 @@ class SectionMap:
 
 def map_along(scene: Scene, place: int) -> SectionMap:
     """Return the section map along the parameter, with the other parameters of a place on the axis."""
-    frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
-    family = family_of(scene.base.model.system, 1, frequency, packed, scene.axis, scene.scale)
-    return SectionMap(family, geometry_of(scene.attractors), PORTRAIT_RTOL)
+    return SectionMap(scene.family(place, 1), geometry_of(scene.attractors), PORTRAIT_RTOL)
 
 
 def _saddle(points: np.ndarray, derivatives: np.ndarray, scales: np.ndarray) -> Saddle | None:
