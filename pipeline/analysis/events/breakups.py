@@ -113,13 +113,15 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         last = len(kinds) - int(np.argmin([*(kinds[::-1] == CHAOTIC_SET), False]))
         torus, chaos = [torus, *between][first], [*between, chaos][last]
         rate = found[last].rate if last < len(found) else rate
-        told = f"of {n} further values it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
+        told = (
+            f"at {n} further values looked at, it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
+        )
         if (kinds[first:last] != BOUNDED_SET).any() or last - first > MOST_OPEN:
             listed = _listed(between[first:last], found[first:last])
-            return Born("", f"whether the torus breaks up is open: at {told}; between, it is {listed}")
+            return Born("", f"whether the torus breaks up is open: {told}; between, it is {listed}")
         if first < last:
             break
-    told = f"at {told} (largest exponent {rate:.3g} per section), and locked at none"
+    told = f"{told} (largest exponent {rate:.3g} per section), and locked at none"
     return Born(BREAKUP, told, float(0.5 * (torus + chaos)), float(0.5 * abs(chaos - torus)))
 
 
