@@ -113,9 +113,7 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         last = len(kinds) - int(np.argmin([*(kinds[::-1] == CHAOTIC_SET), False]))
         torus, chaos = [torus, *between][first], [*between, chaos][last]
         rate = found[last].rate if last < len(found) else rate
-        told = (
-            f"at {n} further values looked at, it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
-        )
+        told = f"by {n} further values it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
         if (kinds[first:last] != BOUNDED_SET).any() or last - first > MOST_OPEN:
             listed = _listed(between[first:last], found[first:last])
             return Born("", f"whether the torus breaks up is open: {told}; between, it is {listed}")
