@@ -34,5 +34,5 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
-    version=4,
+    version=5,
 )
