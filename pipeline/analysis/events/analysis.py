@@ -93,11 +93,13 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    crises = Crises(scene)
-    stretches = crises.split(_stretches(scene))
+    stretches, ids = _continued(scene, _stretches(scene))
+    crises = Crises(replace(scene, names=ids))
+    stretches = crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
+    names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
     named = [_aperiodic(scene, crises, one, named) for one in named]
@@ -125,6 +127,42 @@ def _stretches(scene: Scene) -> list[Stretch]:
                 one = replace(last, places=(last.places[0], place), rows=(last.rows[0], row))
             of_id.append(one)
     return [one for number in sorted(found) for one in found[number]]
+
+
+def _continued(scene: Scene, stretches: Sequence[Stretch]) -> tuple[list[Stretch], dict[tuple[int, int], int]]:
+    """Join neighbouring chaotic sets whose cells all go on to each other: ids of such sets rest on distance alone.
+
+    Return also the id of the joined stretch by the place and the id of each one.
+    """
+    names = {(place, one.attractor): one.attractor for one in stretches for place in _places(one)}
+    scene = replace(scene, names=names)
+    joined: list[Stretch] = []
+    found = dict(names)
+    for one in sorted(stretches, key=lambda one: one.places):
+        k = next((k for k, before in enumerate(joined) if _is_continued(scene, before, one)), -1)
+        if k < 0:
+            joined.append(one)
+            continue
+        before = joined[k]
+        joined[k] = replace(before, places=(before.places[0], one.places[1]), rows=(before.rows[0], one.rows[1]))
+        found |= {(place, one.attractor): before.attractor for place in _places(one)}
+    return joined, found
+
+
+def _places(one: Stretch) -> range:
+    return range(one.places[0], one.places[1] + 1)
+
+
+def _is_continued(scene: Scene, before: Stretch, after: Stretch) -> bool:
+    """Tell whether a chaotic set follows another one at the next value, and all cells of each go on to the other."""
+    is_chaotic = {SETS[one.kind] for one in (before, after)} == {"chaotic_set"}
+    if not is_chaotic or before.places[1] + 1 != after.places[0]:
+        return False
+    ids = [int(scene.attractors["attractor"].values[row]) for row in (before.rows[1], after.rows[0])]
+    here, there = before.places[1], after.places[0]
+    up, _ = _cells(scene, ids[0], True, here, there)
+    down, _ = _cells(scene, ids[1], False, there, here)
+    return set(up) - {-1} == {ids[1]} and set(down) - {-1} == {ids[0]}
 
 
 Fates = dict[tuple[Stretch, bool], tuple[Fate, Fate]]
@@ -181,7 +219,7 @@ def _joined(stretches: Sequence[Stretch], fates: Fates) -> tuple[list[Stretch], 
             k = len(joined) - 1
         if right:
             open_ends[(*right, one.period)] = k
-        names |= {(place, one.attractor): joined[k].attractor for place in range(one.places[0], one.places[1] + 1)}
+        names |= {(place, one.attractor): joined[k].attractor for place in _places(one)}
     return joined, kept, names
 
 
