@@ -10,15 +10,23 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 import magpend
 from pipeline.analysis.tabular import plain
 from pipeline.layout.vocabulary import letter
+from pipeline.plots.branches import NAMES
 
 PAGE = Path(__file__).resolve().parent / "tutorials" / "bifurcations.md"
+
+SMALL = 1e-8
+"""Error of a value [Hz] that the tables leave out."""
+
+Row = dict[str, Any]
 
 LONGEST = {"events_2_3hz": 24, "events_0p1_2hz": 12}
 """Longest period of the branches that are followed in each run."""
@@ -41,11 +49,33 @@ def rows_of(run: magpend.Run, options: dict[str, object]) -> pd.DataFrame:
     return rows.iloc[middle.argsort(kind="stable")]
 
 
-def tables_of(rows: pd.DataFrame, longest: int) -> list[str]:
+def twins_of(run: magpend.Run) -> set[frozenset[int]]:
+    """Return the pairs of attractors that are near mirror images of each other at some frequency, from both sides."""
+    found = run.table("attractors")[["attractor_id", "mirror_partner"]].itertuples(index=False)
+    seen = {(int(a), int(b)) for a, b in found if a != b and b >= 0}
+    return {frozenset(pair) for pair in seen if pair[::-1] in seen}
+
+
+def paired(rows: Sequence[Row], twins: set[frozenset[int]]) -> list[list[Row]]:
+    """Put events of one kind together if their attractors are twins."""
+    kind = ("what", "criticality", "rises", "period", "period_after", "is_own")
+    found: list[list[Row]] = []
+    for row in rows:
+        for other in found:
+            same = all(other[0][name] == row[name] for name in kind)
+            if len(other) == 1 and same and frozenset((row["attractor"], other[0]["attractor"])) in twins:
+                other.append(row)
+                break
+        else:
+            found.append([row])
+    return found
+
+
+def tables_of(rows: pd.DataFrame, longest: int, twins: set[frozenset[int]]) -> list[str]:
     """Return the number of events by name, a table of the decided ones for each group, and one of all others."""
     is_open = rows["what"] == "not_decided"
     counts = rows.loc[~is_open, "what"].value_counts()
-    told = ", ".join(f"{n} {plain(what)}{'s' * (n > 1)}" for what, n in counts.items())
+    told = ", ".join(f"{n} {_named(what)}{'s' * (n > 1)}" for what, n in counts.items())
     lines = [f"{len(rows)} events: {told}, {is_open.sum()} not decided."]
     kept = rows["side"].map(
         lambda side: next((name for name, own in SIDES.items() if set(side.split(", ")) <= {*own}), "")
@@ -55,9 +85,7 @@ def tables_of(rows: pd.DataFrame, longest: int) -> list[str]:
         if len(own):
             lines += ["", f"**Motions {name or 'that change between these classes'}**", ""]
             lines += ["| Hz | attractor | ends as the frequency | by | its cells go on |", "|---|---|---|---|---|"]
-        for row in own.to_dict("records"):
-            value, what, cells = _parts(row["sentence"])
-            lines.append(f"| {value} | {_who(row)} | {'rises' if row['rises'] else 'falls'} | {what} | {cells} |")
+        lines += [_line(one) for one in paired(own.to_dict("records"), twins)]
     lines += ["", "**Not decided**", "", "| motions | end, between these values in Hz | tried |", "|---|---|---|"]
     groups: dict[tuple[str, str], list[str]] = {}
     for row in rows[is_open].to_dict("records"):
@@ -68,25 +96,45 @@ def tables_of(rows: pd.DataFrame, longest: int) -> list[str]:
     return lines + [f"| {who} | {', '.join(ends)} | {tried} |" for (who, tried), ends in sorted(groups.items())]
 
 
+def _line(told: Sequence[Row]) -> str:
+    """Return the line of an event, or of those of two twins."""
+    values, whats, cells = zip(*(_parts(row) for row in told), strict=True)
+    names = [letter(row["attractor"]) for row in told]
+    own = [f"{name}: {to}" for name, to in zip(names, cells, strict=True) if to] if len(told) > 1 else cells
+    sides = [f" ({row['side']})" if row["side"] in SIDES["on one side"] else "" for row in told]
+    who = ", ".join(name + side for name, side in zip(names, sides, strict=True))
+    first = told[0]
+    period = f"period {first['period']}" if first["period"] else plain(first["set"])
+    after = f" to {first['period_after']}" if first["period_after"] >= 0 else ""
+    what = whats[0] if len(set(whats)) == 1 else "; ".join(f"{n}: {w}" for n, w in zip(names, whats, strict=True))
+    way = "rises" if first["rises"] else "falls"
+    return f"| {', '.join(values)} | {who}: {period}{after} | {way} | {what} | {'; '.join(own)} |"
+
+
+def _named(what: str) -> str:
+    return NAMES.get(what, plain(what)) + (" point" if what in ("neimark_sacker", "hopf") else "")
+
+
 def _group(sides: str) -> str:
     return next((name for name, own in SIDES.items() if set(sides.split(", ")) <= {*own}), "")
 
 
-def _parts(sentence: str) -> tuple[str, str, str]:
-    """Return the value with its error, the event and what becomes of the cells, without the numbers of branches."""
-    value, _, rest = sentence.partition(" = ")[2].partition(" Hz as it ")
+def _parts(row: Row) -> tuple[str, str, str]:
+    """Return the value of an event, what happens, and what becomes of the cells, without the numbers of branches."""
+    value, _, rest = row["sentence"].partition(" = ")[2].partition(" Hz as it ")
     what, _, cells = rest.partition(": ")[2].partition("; its cells ")
     if not cells:
         what, _, cells = what.partition("; of its cells ")
     what = re.sub(r" \(branch \d+\)", "", what.replace("meets the unstable", "meets an unstable"))
     cells = cells.replace("go on ", "").replace("reach no attractor", "to none")
+    value = f"{row['value']:.7f}" if row["value_error"] <= SMALL else value
     return value, re.sub(r" of branch \d+", "", what), cells
 
 
-def _tried(row: dict[str, object], longest: int) -> str:
+def _tried(row: Row, longest: int) -> str:
     """Say in brief why an end is not decided."""
-    why, _, crisis = str(row["evidence"]).partition("; no crisis: ")
-    if int(str(row["period"])) > longest:
+    why, _, crisis = row["evidence"].partition("; no crisis: ")
+    if row["period"] > longest:
         return "no branch was followed"
     if "such ids rest on distance" in why:
         why = "the set beyond is chaotic too and may be the same"
@@ -94,14 +142,8 @@ def _tried(row: dict[str, object], longest: int) -> str:
     return why + ("; no unstable orbit that was tried is met" if crisis else "")
 
 
-def _own(row: dict[str, object]) -> str:
-    return f"orbit of period {row['period']}" if row["period"] else plain(str(row["set"]))
-
-
-def _who(row: dict[str, object]) -> str:
-    own = f"period {row['period']}" if row["period"] else plain(str(row["set"]))
-    after = f" to {row['period_after']}" if int(str(row["period_after"])) >= 0 else ""
-    return f"{letter(int(str(row['attractor'])))}, {row['side']}, {own}{after}"
+def _own(row: Row) -> str:
+    return f"orbit of period {row['period']}" if row["period"] else plain(row["set"])
 
 
 def written(page: str, name: str, lines: list[str]) -> str:
@@ -125,7 +167,7 @@ def main() -> None:
         rows = rows_of(run, options)
         rows.to_csv(PAGE.parent / f"{name}.csv", index=False)
         run.plot.genealogy(**options).figure.savefig(PAGE.parent / f"{name}.png", dpi=120)
-        PAGE.write_text(written(PAGE.read_text("utf-8"), name, tables_of(rows, LONGEST[name])), "utf-8")
+        PAGE.write_text(written(PAGE.read_text("utf-8"), name, tables_of(rows, LONGEST[name], twins_of(run))), "utf-8")
 
 
 if __name__ == "__main__":
