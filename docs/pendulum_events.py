@@ -31,7 +31,12 @@ Row = dict[str, Any]
 LONGEST = {"events_2_3hz": 24, "events_0p1_2hz": 12}
 """Longest period of the branches that are followed in each run."""
 
-SIDES = {"on one side": ("left", "right"), "that swing to both sides": ("straddling",), "that rotate": ("rotating",)}
+SIDES = {
+    "on one side": ("left", "right"),
+    "that swing to both sides": ("straddling",),
+    "that rotate": ("rotating",),
+    "of no class": ("undecided",),
+}
 """Groups of the tables: classes of motion."""
 
 
