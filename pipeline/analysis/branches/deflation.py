@@ -79,7 +79,6 @@ def search_orbits(
     system: System,
     *,
     rounds: int = ROUNDS,
-    iterations: int = ITERATIONS,
     what: str = "searching orbits",
 ) -> list[FoundOrbit]:
     """Find the periodic orbits near many starts by plain and then by deflated Newton iterations, each orbit once.
@@ -98,8 +97,6 @@ def search_orbits(
         System of equations to integrate.
     rounds
         Largest number of rounds with deflation.
-    iterations
-        Largest number of Newton iterations from a start.
     what
         Name of the work in progress reports.
 
@@ -113,7 +110,7 @@ def search_orbits(
     for number in range(1 + rounds):
         report(what, number, 1 + rounds)
         moved = starts + spread * generator.standard_normal(starts.shape) if number else starts
-        ends = _iterate(moved, periods, frequency_hz, packed, system, found, iterations)
+        ends = _iterate(moved, periods, frequency_hz, packed, system, found)
         n_before = len(found)
         add_orbits(found, *ends, number, frequency_hz, packed, system)
         if len(found) == n_before:
@@ -160,12 +157,11 @@ def _iterate(
     packed: np.ndarray,
     system: System,
     known: Sequence[FoundOrbit],
-    iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Iterate Newton's method from all starts. Return the section points to which it converged, and their periods."""
     state, scales = starts.astype(np.float64), np.asarray(system.scales)
     rows, done = np.arange(len(state)), []
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         ends = section_map(
             np.tile(packed, (len(rows), 1)),
             np.full(len(rows), frequency_hz),

@@ -48,9 +48,6 @@ OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(64, 256, 3, 12, 1)
 OF_BANDS = 12
 """Longest period of the orbits that are looked for because it is once or twice the number of bands."""
 
-ITERATIONS = 12
-"""Most Newton iterations from a start: near a chaotic set most starts lead nowhere, and others arrive earlier."""
-
 SURE = 4.0
 """Largest distance of the value from lifetimes, in units of its error."""
 
@@ -198,9 +195,8 @@ class Crises:
                     starts.append(line.points[node, :1])
                     asked = np.append(asked, line.period)
         found = search_orbits(
-            np.concatenate(starts), asked, float(rows.frequency_hz[0]), rows.parameters[0], system,
-            rounds=effort.rounds, iterations=ITERATIONS,
-        )  # fmt: skip
+            np.concatenate(starts), asked, float(rows.frequency_hz[0]), rows.parameters[0], system, rounds=effort.rounds
+        )
         saddles = [along.saddle(seen, one.points[0], one.period) for one in found]
         return [one for one in saddles if one is not None]
 
