@@ -271,6 +271,15 @@ def test_passages__of_a_linear_saddle(u):
         assert clearance == pytest.approx(distance * u ** (first[phase] + 1.0), rel=1e-6)
 
 
+def test_passages__that_follow_each_other_by_chance():
+    """A trajectory that is away in between passes twice: its second clearance is not divided by the growth."""
+    along = section_map(LINEAR, "u", 2.0)
+    paths = np.ones((1, 12, 2))
+    paths[0, 4], paths[0, 6] = (0.01, 0.04), (0.008, 0.0)
+    found = passages(paths, along.saddle(2.0, np.zeros(2), 1), 2, 0.05, along.geometry)
+    assert found[0, 0][0] == pytest.approx([0.01 + 0.04 / 1.7, 0.008])
+
+
 def test_sample_of__starts_in_one_band():
     along = section_map(LOGISTIC, "r", 3.8565)
     sample = sample_of(along, 3.8565, np.array([0.5]), OF_MAP)
