@@ -173,7 +173,7 @@ def transient_of(along: SectionMap, sample: Sample, seen: float, beyond: float, 
             values, means, counts = [*values, value], [*means, mean], [*counts, n]
     if len(values) < FEWEST_LIFETIMES:
         return "beyond, too few of its trajectories leave at times that can be measured"
-    values, means, counts = (x[-MOST_LIFETIMES:] for x in (values, means, counts))
+    values, means, counts = values[-MOST_LIFETIMES:], means[-MOST_LIFETIMES:], counts[-MOST_LIFETIMES:]
     found = fit_lifetimes(values, means, counts, low)
     found = fit_lifetimes(values, means, counts, found.value)
     exponent, error = found.free_exponent
