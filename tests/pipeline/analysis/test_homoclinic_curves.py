@@ -134,10 +134,11 @@ def test_curves__of_a_run_from_a_bogdanov_takens_point(tmp_path, main):
     """
     damped = magpend.model("x' = y\ny' = b1 + b2*y + x**2 + x*y", name="damped", b1=-0.2, b2=0.2)
     spec = magpend.Spec("sweep", damped).with_section(of="y", value=0.0, longest=60.0)
-    spec = spec.with_axis("b1", values=[-0.3, -0.1]).with_start_random(n=1, x=(-0.6, -0.4), y=(0.0, 0.05), seed=0)
+    spec = spec.with_axis("b1", values=[-0.12, -0.1]).with_start_random(n=1, x=(-0.4, -0.3), y=(0.0, 0.05), seed=0)
     run = magpend.run(spec.with_integration(n_transient=100, n_keep=4), tmp_path / "run", workers=0)
-    second = {"low": -0.4, "high": 0.1, "second": "b2", "second_low": -0.05, "second_high": 0.3}
-    flags = ["--from", -0.4, "--to", 0.1, "--second", "b2", "--second-from", -0.05, "--second-to", 0.3]
+    # the unstable cycles are not needed
+    second = {"low": -0.12, "high": 0.02, "second": "b2", "second_low": -0.02, "second_high": 0.22, "stable": True}
+    flags = ["--from", -0.12, "--to", 0.02, "--second", "b2", "--second-from", -0.02, "--second-to", 0.22, "--stable"]
     code, out, _ = main("analyse", "curves", "run", *flags)
     assert code == 0
     assert "HOM homoclinic" in out
