@@ -177,7 +177,7 @@ def test_extras_and_groups__are_named_and_installed():
     (own,) = (text for text in groups["whole"] if text.startswith("magpend["))
     assert set(own[len("magpend[") : -1].split(",")) == extras
     assert {entry["include-group"] for entry in groups["dev"]} == set(groups) - {"dev", "bench"}
-    for name, group in (("tests", "test"), ("whole suite", "dev")):
+    for name, group in (("tests", "test"), ("slow tests", "dev")):
         (command,) = re.findall(rf"<!-- run: {name} -->\n```sh\n(.*?)\n```", README, re.DOTALL)
         assert f"--group {group} " in command
 

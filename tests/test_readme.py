@@ -155,7 +155,7 @@ def test_reference__has_every_option_of_every_command():
         assert {flag.replace("|", "/") for flag, _ in reference._options(command)} <= told(name), name
 
 
-@pytest.mark.parametrize("name", ["main job", "tests", "whole suite"])
+@pytest.mark.parametrize("name", ["main job", "tests", "slow tests"])
 def test_readme__commands_for_ci_are_one_line(name):
     (command,) = re.findall(rf"<!-- run: {name} -->\n```sh\n(.*?)\n```", README, re.DOTALL)
     assert "\n" not in command
