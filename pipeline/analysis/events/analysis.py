@@ -11,6 +11,7 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
+from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.events.breakups import Breakups
@@ -91,11 +92,13 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    crises = Crises(scene)
-    stretches = crises.split(_stretches(scene))
+    stretches, ids = _continued(scene, _stretches(scene))
+    crises = Crises(replace(scene, names=ids))
+    stretches = crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
+    names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
     breakups = Breakups(scene)
@@ -124,6 +127,42 @@ def _stretches(scene: Scene) -> list[Stretch]:
                 one = replace(last, places=(last.places[0], place), rows=(last.rows[0], row))
             of_id.append(one)
     return [one for number in sorted(found) for one in found[number]]
+
+
+def _continued(scene: Scene, stretches: Sequence[Stretch]) -> tuple[list[Stretch], dict[tuple[int, int], int]]:
+    """Join neighbouring chaotic sets whose cells all go on to each other: ids of such sets rest on distance alone.
+
+    Return also the id of the joined stretch by the place and the id of each one.
+    """
+    names = {(place, one.attractor): one.attractor for one in stretches for place in _places(one)}
+    scene = replace(scene, names=names)
+    joined: list[Stretch] = []
+    found = dict(names)
+    for one in sorted(stretches, key=lambda one: one.places):
+        k = next((k for k, before in enumerate(joined) if _is_continued(scene, before, one)), -1)
+        if k < 0:
+            joined.append(one)
+            continue
+        before = joined[k]
+        joined[k] = replace(before, places=(before.places[0], one.places[1]), rows=(before.rows[0], one.rows[1]))
+        found |= {(place, one.attractor): before.attractor for place in _places(one)}
+    return joined, found
+
+
+def _places(one: Stretch) -> range:
+    return range(one.places[0], one.places[1] + 1)
+
+
+def _is_continued(scene: Scene, before: Stretch, after: Stretch) -> bool:
+    """Tell whether a chaotic set follows another one at the next value, and all cells of each go on to the other."""
+    is_chaotic = {SETS[one.kind] for one in (before, after)} == {"chaotic_set"}
+    if not is_chaotic or before.places[1] + 1 != after.places[0]:
+        return False
+    ids = [int(scene.attractors["attractor"].values[row]) for row in (before.rows[1], after.rows[0])]
+    here, there = before.places[1], after.places[0]
+    up, _ = _cells(scene, ids[0], True, here, there)
+    down, _ = _cells(scene, ids[1], False, there, here)
+    return set(up) - {-1} == {ids[1]} and set(down) - {-1} == {ids[0]}
 
 
 Fates = dict[tuple[Stretch, bool], tuple[Fate, Fate]]
@@ -180,7 +219,7 @@ def _joined(stretches: Sequence[Stretch], fates: Fates) -> tuple[list[Stretch], 
             k = len(joined) - 1
         if right:
             open_ends[(*right, one.period)] = k
-        names |= {(place, one.attractor): joined[k].attractor for place in range(one.places[0], one.places[1] + 1)}
+        names |= {(place, one.attractor): joined[k].attractor for place in _places(one)}
     return joined, kept, names
 
 
@@ -330,6 +369,55 @@ def _merged(named: Sequence[Event]) -> list[Event]:
     return merged
 
 
+def _same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
+    """Return for each end of an attractor the number of the end that leads: ends at one bifurcation are one event.
+
+    The leading end is that of the orbit on which the bifurcation lies, or of the set that meets the orbit of a crisis.
+    """
+    groups: list[list[int]] = []
+    for k, one in enumerate(named):
+        own = next((group for group in groups if any(_is_same(scene, named[i], one) for i in group)), None)
+        if own is None:
+            groups.append([k])
+        else:
+            own.append(k)
+    found = [0] * len(named)
+    for group in groups:
+        lead = min(group, key=lambda k: (_is_seen_from_elsewhere(scene.located, named[k]), k))
+        for k in group:
+            found[k] = lead
+    return found
+
+
+def _is_seen_from_elsewhere(ds: xr.Dataset, one: Event) -> bool:
+    if isinstance(one.born, Crisis):
+        return one.born.lives_beyond
+    return not _is_own(ds, one.fate)
+
+
+def _is_same(scene: Scene, a: Event, b: Event) -> bool:
+    """Tell whether two ends are one event: of one kind, at one value, and of one orbit or of mirror images."""
+    if a.what != b.what or not abs(_value(a) - _value(b)) <= a.error + b.error:
+        return False
+    ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
+    if a.what in CRISES and (a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)):
+        return True  # one crisis told from both sides, or by both sets that merge
+    if min(j, k) >= 0:
+        points = ds["bifurcation_section"].values[[j, k]]
+        away = geometry_of(scene.attractors).distance(points[0], points[1, 0])
+        if j == k or np.nanmin(away) <= SAME_PLACE:
+            return True
+    return a.rises == b.rises and _are_mirrored(scene, a, b)
+
+
+def _are_mirrored(scene: Scene, a: Event, b: Event) -> bool:
+    """Tell whether two attractors are mirror images of each other at the ends of their stretches."""
+    ds, (i, j) = scene.attractors, (one.stretch.rows[one.rises] for one in (a, b))
+    if a.stretch.places[a.rises] != b.stretch.places[b.rises] or "mirror_partner" not in ds:
+        return False
+    return int(ds["mirror_partner"].values[i]) == int(ds["attractor"].values[j])
+
+
 # ---- dataset -----------------------------------------------------------------------------------
 
 
@@ -367,6 +455,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
+        "same_as": (_same_as(scene, named), "number of the event that this end belongs to", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {
