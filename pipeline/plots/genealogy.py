@@ -23,6 +23,7 @@ from pipeline.analysis.events.names import (
     NAMES,
     RANGE_END,
     SLIDING,
+    TRANSIENT,
     TWINS,
     UNDECIDED,
 )
@@ -55,6 +56,7 @@ _OTHERS = {
     INTERIOR: ("P", "", "interior crisis"),
     BANDS: ("d", "", "merging of bands"),
     TWINS: ("H", "", "merging of attractors"),
+    TRANSIENT: ("x", "", "lost into a transient"),
     **{name: ("h", kind.upper(), f"intermittency {kind.upper()}") for kind, name in INTERMITTENCY.items()},
     LOCKING: (">", "", "locking"),
     GRAZING: ("<", "", "grazing"),

@@ -14,13 +14,12 @@ and by time modulo the number of bands. The number of states does not matter, bu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import lcm
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from magpend_core.defaults import MOST_STEPS
 from magpend_core.engine.entry import integrate
@@ -31,7 +30,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.problems import Family, Rows
 from pipeline.analysis.events.scene import Scene
-from pipeline.analysis.sets import Geometry
+from pipeline.analysis.sets import Geometry, nearest_distances
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 
 NEAR, WIDEST = (0.03, 0.018, 0.05), 0.25
@@ -50,14 +49,32 @@ LEAST = 32
 FEW = 32
 """Trajectories that are looked at first."""
 
+AROUND, AWAY = 0.1, 1.0 / 16.0
+"""Distance from a set, as a share of its size, beyond which a trajectory is away from it; and the share of the time, at
+its end, in which a trajectory that has left is away.
+"""
+
 SUBSAMPLE = 8
-"""The error of the least clearance is its change if an eighth of the trajectories is taken."""
+"""The error of the least clearance is its median change if an eighth of the trajectories is taken."""
+
+CLOSE = 0.25
+"""Least clearance, in units of its error, at which the search for its zero ends."""
+
+BACK, LOWERED = 12, 2
+"""Sections before a passage at which the start of a trajectory is moved, and the number of passages of each part of the
+trajectories: the lowest ones."""
+
+RADII, ROUNDS = (6, 16), 7
+"""Powers of 1/4 of the set's size by which a start is moved first, and the number of rounds of the search."""
+
+TURNS_ON = 2
+"""Turns about the orbit after the passage: nearer to the stable manifold the closest approach is later, and closer."""
 
 NEIGHBOURS, REFERENCES = 48, 8
 """Section points nearest to a reference point, and reference points, whose return times tell the number of bands."""
 
-MOST_STEPS_TO_ROOT = 40
-"""Most parameter values at which the clearance is computed to find its zero."""
+MOST_STEPS_TO_ROOT = 40, 12
+"""Most parameter values at which the clearance is computed to find its zero, of maps and of flows."""
 
 SHORTEST = 1e-12
 """Shortest interval of the parameter in which the zero is looked for, as a share of the first one."""
@@ -65,17 +82,12 @@ SHORTEST = 1e-12
 JUMP = 0.01
 """Largest clearance at the value where it changes its sign, as a share of the distance of passages."""
 
+SPREAD, SHARES = (-1.0, -0.8, -0.6, -0.4, 0.4, 0.6, 0.8, 1.0), (0.5, 0.25)
+"""Values on both sides of the zero at which the clearance is taken, in units of the largest distance; and the clearance
+there as a share of the distance of passages: of maps, and of flows, for which it counts less how few pass."""
+
 CURVED = 0.2
 """Largest distance of the zero from those of the lines on each side, as a share of the distance of their values."""
-
-LONGEST_SPAN = 8.0
-"""Largest distance at which lifetimes are taken, in units of that of the clearances."""
-
-SCATTER = 0.05
-"""Relative deviation of lifetimes from a power law that counts as one standard deviation: they have fine structure."""
-
-FEWEST_ESCAPES, FEWEST_LIFETIMES, MOST_LIFETIMES = 40, 4, 8
-"""Trajectories that leave at a parameter value, and fewest and most values of the parameter, for a fit of lifetimes."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +99,7 @@ class Effort:
     longest: int  # period
     starts: int  # of Newton's method for each period
     rounds: int  # of deflation
+    is_flow: bool = False  # few trajectories: clearances are lowered between them, see `Approach._lowest`
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +118,13 @@ class Saddle:
     def period(self) -> int:
         """Least period."""
         return len(self.points)
+
+    def turn(self, n_bands: int) -> tuple[int, np.float64]:
+        """Return the sections after which a trajectory is in the same band and on the same side, and the growth of its
+        coordinate in them.
+        """
+        step = lcm(self.period * (2 if self.multiplier < 0.0 else 1), n_bands)
+        return step, np.float64(self.multiplier) ** (step // self.period)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,19 +241,22 @@ def count_bands(points: np.ndarray, geometry: Geometry) -> int:
 
 
 Passages = Mapping[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Clearances of passages, their trajectories and their times, by section point of the orbit and class of time."""
+"""Clearances of passages, their trajectories and the times of their closest approach, by section point of the orbit
+and class of time."""
+
+Sided = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Clearances of passages, positive on the side of the living set, their trajectories, times and section points."""
 
 
 def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geometry: Geometry) -> Passages:
     """Find where trajectories, shape (trajectory, time, state), pass a saddle orbit within a scaled distance."""
-    step = lcm(saddle.period * (2 if saddle.multiplier < 0.0 else 1), n_bands)
-    factor = np.float64(saddle.multiplier) ** (step // saddle.period)
+    step, factor = saddle.turn(n_bands)
+    with np.errstate(invalid="ignore"):
+        near = np.array([geometry.distance(paths, x) < 2.0 * reach for x in saddle.points])
     found = {}
     for k in range(saddle.period):
-        offset = geometry.difference(paths, saddle.points[k])
-        with np.errstate(invalid="ignore"):
-            lane, time = np.nonzero(np.abs(offset).max(axis=-1) < 2.0 * reach)
-        offset = offset[lane, time]
+        lane, time = np.nonzero(near[k])
+        offset = geometry.difference(paths[lane, time], saddle.points[k])
         along = offset @ saddle.covectors[k]
         beside = np.abs(offset - along[:, None] * saddle.directions[k]).max(axis=-1)
         away = np.maximum(np.abs(along), beside)
@@ -243,6 +266,8 @@ def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geom
         if not len(lane):
             continue
         begins = np.append(True, (np.diff(lane) != 0) | (np.diff(time) != step))
+        for i in range(1, step):  # it has left, and come back by chance, if it does not follow the orbit in between
+            begins |= ~near[(k - i) % saddle.period, lane, time - i]
         number = np.cumsum(begins) - 1
         closest = np.lexsort((away, number))[np.flatnonzero(begins)]
         first, turns = time[begins], np.bincount(number)
@@ -287,6 +312,7 @@ class Approach:
     effort: Effort
     near: float = NEAR[0]  # share of the set's size
     sides: dict[tuple[int, int], float] = field(default_factory=dict)
+    is_lost: bool = False  # whether most trajectories were seen to leave for good
     _known: dict[float, Saddle] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -318,13 +344,15 @@ class Approach:
         saddle = self.saddle(value)
         if saddle is None:
             return {}, np.nan
-        geometry = self.along.geometry
-        with np.errstate(invalid="ignore"):
-            away = min(float(np.nanmin(geometry.distance(paths, x))) for x in saddle.points)
-        reach = max(2.0 * away, self.near * self.size)
+        reach = self._reach(saddle, paths)
         if not reach <= WIDEST * self.size:
             return {}, np.nan
-        return passages(paths, saddle, self.sample.n_bands, reach, geometry), reach
+        return passages(paths, saddle, self.sample.n_bands, reach, self.along.geometry), reach
+
+    def _reach(self, saddle: Saddle, paths: np.ndarray) -> float:
+        with np.errstate(invalid="ignore"):
+            away = min(float(np.nanmin(self.along.geometry.distance(paths, x))) for x in saddle.points)
+        return max(2.0 * away, self.near * self.size)
 
     def begin(self, paths: np.ndarray) -> bool:
         """Find the sides on which the living set passes; return whether it keeps to one side in each class."""
@@ -339,35 +367,88 @@ class Approach:
     def least(self, value: float, paths: np.ndarray | None = None) -> Clearance:
         """Compute the least clearance at a parameter value."""
         paths = self.paths(value) if paths is None else paths
-        a, lane, _ = self._until_left(value, paths)
+        passed = self._until_left(value, paths)
         has_left = not np.isfinite(paths[:, -1]).all()
-        if not len(a):
+        if not len(passed[0]):
             return Clearance(np.nan, np.nan, has_left)
-        some = a[lane % SUBSAMPLE == int(lane[a.argmin()] + 1) % SUBSAMPLE]
-        return Clearance(float(a.min()), float(some.min(initial=np.inf) - a.min()), has_left)
+        lowest, part = self._lowest(value, paths, passed)
+        parts = [lowest[part == i].min(initial=np.inf) for i in range(SUBSAMPLE)]
+        return Clearance(float(lowest.min()), float(np.median(parts) - lowest.min()), has_left)
 
-    def _until_left(self, value: float, paths: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return clearances, trajectories and times of the passages of each settled trajectory up to its first one on
-        the other side: after it the trajectory may come back from elsewhere.
+    def _lowest(self, value: float, paths: np.ndarray, passed: Sided) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least clearances of each part of the trajectories, with the number of the part; those of
+        flows are lowered between trajectories.
+
+        A flow's set is a curve along the unstable direction, many times folded, and a fold is what comes nearest. The
+        starts of these passages, `BACK` sections before, are moved to both sides: what this changes across the curve
+        has died out at the passage, and what it changes along the curve leads to the fold.
         """
-        a, lane, at = self._sided(value, paths)
+        order = np.argsort(passed[0], kind="stable")
+        parts = passed[1][order] % SUBSAMPLE
+        order = np.concatenate([order[parts == i][:LOWERED] for i in range(SUBSAMPLE)])
+        a, lane, at, k = (x[order] for x in passed)
+        saddle = self.saddle(value)
+        if not self.effort.is_flow or saddle is None:
+            return a, lane % SUBSAMPLE
+        geometry, starts, reach = self.along.geometry, paths[lane, at - BACK], self._reach(saddle, paths)
+        points, covectors = saddle.points[k], saddle.covectors[k]
+        step, factor = saddle.turn(self.sample.n_bands)
+        scale = a / (geometry.difference(paths[lane, at], points) * covectors).sum(axis=1)
+        unit = np.eye(geometry.n_states)[0] * geometry.scales[0]
+
+        def moved(s: np.ndarray) -> np.ndarray:
+            begins = (starts[:, None] + s[..., None] * unit).reshape(-1, geometry.n_states)
+            ends = self.along.paths(value, begins, BACK + TURNS_ON * step)[:, BACK - 1 :: step]
+            offset = geometry.difference(ends.reshape(*s.shape, -1, geometry.n_states), points[:, None, None])
+            away = np.abs(offset).max(axis=-1)
+            away = np.where(np.logical_and.accumulate(away < reach, axis=-1), away, np.inf)
+            closest = away.argmin(axis=-1)[..., None]
+            along = np.take_along_axis((offset * covectors[:, None, None]).sum(axis=-1), closest, -1) / factor**closest
+            return np.where(np.isfinite(away[..., 0]), scale[:, None] * along[..., 0], np.inf)
+
+        shares = self.size * 4.0 ** -np.arange(*RADII)
+        s = np.tile([0.0, *shares, *-shares], (len(a), 1))
+        width = np.zeros(len(a))
+        for number in range(ROUNDS):
+            found = moved(s)
+            best = found.argmin(axis=1)[:, None]
+            middle, lowest = np.take_along_axis(s, best, 1)[:, 0], np.take_along_axis(found, best, 1)[:, 0]
+            width = 0.4 * width if number else np.maximum(0.8 * np.abs(middle), shares[-1])
+            s = middle[:, None] + width[:, None] * np.linspace(-1.0, 1.0, 9)
+        within = np.abs(middle) < shares[0]
+        return np.where(within & np.isfinite(lowest), lowest, a), lane % SUBSAMPLE
+
+    def _until_left(self, value: float, paths: np.ndarray) -> Sided:
+        """Return the passages of each settled trajectory up to its first one on the other side: after it the trajectory
+        may come back from elsewhere.
+        """
+        a, lane, at, k = self._sided(value, paths)
         until = _until(a, lane, at, paths)
         kept = (at <= until[lane]) & (at >= SETTLE)
-        return a[kept], lane[kept], at[kept]
+        return a[kept], lane[kept], at[kept], k[kept]
 
-    def _sided(self, value: float, paths: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return clearances, positive on the side of the living set, trajectories and times of all passages."""
+    def _sided(self, value: float, paths: np.ndarray) -> Sided:
+        """Return all passages."""
         found, _ = self.passages(value, paths)
-        own = [(side * found[key][0], *found[key][1:]) for key, side in self.sides.items() if key in found]
+        own = [
+            (side * found[key][0], *found[key][1:], np.full(len(found[key][0]), key[0]))
+            for key, side in self.sides.items()
+            if key in found
+        ]
         if not own:
-            return np.zeros(0), np.zeros(0, int), np.zeros(0, int)
-        a, lane, at = (np.concatenate(parts) for parts in zip(*own, strict=True))
-        return a, lane, at
+            return np.zeros(0), np.zeros(0, int), np.zeros(0, int), np.zeros(0, int)
+        a, lane, at, k = (np.concatenate(parts) for parts in zip(*own, strict=True))
+        return a, lane, at, k
 
     def lifetimes(self, value: float, length: int) -> tuple[float, int]:
         """Return the mean time before trajectories leave at a parameter value, and the number that left."""
         paths = self.paths(value, length)
-        until = _until(*self._sided(value, paths), paths)
+        until = _until(*self._sided(value, paths)[:3], paths)
+        if self.effort.is_flow:  # of a lost set, most trajectories leave far from the orbit, and none comes back
+            last = last_stays(paths, self.sample.points, AROUND * self.size, self.along.geometry)
+            gone = last <= paths.shape[1] - AWAY * length
+            self.is_lost |= bool(gone.mean() > 0.5)
+            until = np.where(gone, last, paths.shape[1]) if self.is_lost else until
         left = until < paths.shape[1]
         settled = until >= SETTLE
         n = int(left[settled].sum())
@@ -378,12 +459,19 @@ class Approach:
 
         Only those count that leave in the first half of the time.
         """
-        a, lane, at = self._sided(value, paths)
+        a, lane, at, _ = self._sided(value, paths)
         until, half = _until(a, lane, at, paths), paths.shape[1] // 2
         again = np.zeros(len(paths), bool)
         again[lane[(a > 0.0) & (at > half)]] = True
         left = until < half
-        return float(again[left].mean()) if left.sum() >= FEWEST_ESCAPES else np.nan
+        return float(again[left].mean()) if left.sum() >= LEAST else np.nan
+
+
+def last_stays(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
+    """Return the number of sections up to the last one of each trajectory within a distance of a set; 0 if none is."""
+    is_near, lives = np.zeros(paths.shape[:2], bool), np.isfinite(paths).all(axis=2)
+    is_near[lives] = nearest_distances(paths[lives], points, geometry) <= radius
+    return np.where(is_near.any(axis=1), paths.shape[1] - np.argmax(is_near[:, ::-1], axis=1), 0)
 
 
 def _until(a: np.ndarray, lane: np.ndarray, at: np.ndarray, paths: np.ndarray) -> np.ndarray:
@@ -408,15 +496,15 @@ class Contact:
 def contact_of(approach: Approach, beyond: float) -> Contact | None:
     """Find the zero of the least clearance between the value where the set lives and another one; None without it.
 
-    The zero is found by the Illinois method, up to the error of the sample. Lines through the clearances at two values
-    on each side must lead to the same zero.
+    The zero is found by the Illinois method, up to the error of the sample. Lines through the clearances on each side
+    must lead to the same zero.
     """
     low, high = approach.value, beyond
     here, there = approach.least(low), approach.least(high)
     if here.is_beyond or not there.is_beyond:
         return None
     weights, last, best = [1.0, 1.0], 0, here
-    for _ in range(MOST_STEPS_TO_ROOT):
+    for _ in range(MOST_STEPS_TO_ROOT[approach.effort.is_flow]):
         a, b = weights[0] * here.least, weights[1] * there.least
         x = low + (high - low) * (a / (a - b) if np.isfinite(a) and np.isfinite(b) else 0.5)
         if x in (low, high):
@@ -427,105 +515,59 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         else:
             low, here, weights = x, best, [1.0, 0.5 * weights[1] if last < 0 else 1.0]
         last = 1 if best.is_beyond else -1
-        if abs(best.least) <= best.error or abs(high - low) <= SHORTEST * abs(beyond - approach.value):
+        if abs(best.least) <= CLOSE * best.error < np.inf or abs(high - low) <= SHORTEST * abs(beyond - approach.value):
             break
     if not abs(best.least) <= max(best.error, JUMP * NEAR[0] * approach.size):
         return None  # it jumps there
     for near in NEAR:
         approach.near = near
         h = _span(approach, x, beyond)
-        values = x + (0.0 if h is None else h) * np.array([-1.0, -0.5, 0.5, 1.0])
+        if h is None:
+            continue
+        values = x + h * np.array(SPREAD)
         least = np.array([approach.least(float(one)).least for one in values])
-        if not ((least[:2] > 0.0).all() and (least[2:] < 0.0).all()):
-            return None
-        found = _confirmed(x, best, values, least)
+        found = _confirmed(x, best, values, least, approach.effort.is_flow)
         if found is not None:
             return found
     return None
 
 
-def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray) -> Contact | None:
-    """Extrapolate the clearances y at two values x on each side to 0; None unless both lead to the value found.
+def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_flow: bool) -> Contact | None:
+    """Extrapolate the clearances y at values x on both sides to 0; None unless both lines lead to the value found.
 
-    A trajectory may come within the distance of passages a turn later at one of the values: then there is no line.
+    A trajectory may come within the distance of passages a turn later at one of the values: then there is no line. Of
+    flows, the value is the mean of the zero and of both lines, and their scatter tells the error: the lowest fold is
+    not met at each value.
     """
-    if not y[0] > y[1] > y[2] > y[3]:
+    h, half = x[-1] - value, len(x) // 2
+    if not (y * SPREAD < 0.0).all():
         return None
-    h = x[3] - value
-    living, far = (float(x[i] - y[i] * (x[j] - x[i]) / (y[j] - y[i])) for i, j in ((0, 1), (3, 2)))
-    slope = float((y[2] - y[1]) / (x[2] - x[1]))
-    error = 2.0 * max(best.error, abs(best.least)) / abs(slope)
-    if max(abs(living - value), abs(far - value)) > CURVED * abs(h) or not np.isfinite(error):
+    u = (x - value) / h
+    sides = slice(half), slice(half, None)
+    lines = [np.polyfit(u[part], y[part], 1) for part in sides]
+    if not all(line[0] < 0.0 for line in lines):
+        return None
+    living, far = (float(value - h * line[1] / line[0]) for line in lines)
+    slope = float((y[half] - y[half - 1]) / (x[half] - x[half - 1]))
+    away, error = max(abs(living - value), abs(far - value)), 2.0 * max(best.error, abs(best.least)) / abs(slope)
+    if is_flow:
+        scatter = max(np.std(y[part] - np.polyval(line, u[part])) for part, line in zip(sides, lines, strict=True))
+        three = np.array([value, living, far])
+        value = float(three.mean())
+        error = 2.0 * max(three.std(ddof=1), float(scatter) * np.sqrt(half / (half - 2.0)) / abs(slope))
+    if not error <= 0.5 * abs(h) or (not is_flow and away > CURVED * abs(h)):
         return None
     return Contact(value, error, slope, living, far, float(abs(h)))
 
 
 def _span(approach: Approach, value: float, beyond: float) -> float | None:
-    """Return the distance from the zero, with its sign, at which the clearance is half of the reach."""
+    """Return the distance from the zero, with its sign, at which the clearance is a share of the reach."""
+    share = SHARES[approach.effort.is_flow]
     reach = approach.near * approach.size
     h = min(abs(beyond - value), abs(value - approach.value)) * float(np.sign(beyond - value))
-    for _ in range(MOST_STEPS_TO_ROOT):
+    for _ in range(MOST_STEPS_TO_ROOT[0]):
         found = approach.least(value - h).least
-        if found <= 0.5 * reach:
+        if found <= share * reach:
             return h
-        h *= 0.5 if not np.isfinite(found) else max(0.4 * reach / found, 0.1)
+        h *= 0.5 if not np.isfinite(found) else max(0.8 * share * reach / found, 0.1)
     return None
-
-
-@dataclass(frozen=True)
-class Lifetimes:
-    """Lifetimes beyond contact, and the fitted law ``c |p - p_c|^-exponent``."""
-
-    values: tuple[float, ...]
-    means: tuple[float, ...]
-    exponent: float  # with p_c at the contact
-    exponent_error: float
-    value: float  # p_c, fitted without knowledge of the contact
-    value_error: float
-
-
-def lifetimes_of(approach: Approach, contact: Contact, beyond: float) -> Lifetimes | None:
-    """Fit a power law to mean lifetimes at several values beyond contact; None if there are too few of them."""
-    span = min(abs(beyond - contact.value), LONGEST_SPAN * contact.span) * float(np.sign(beyond - contact.value))
-    values: list[float] = []
-    means: list[float] = []
-    counts: list[int] = []
-    for k in range(MOST_LIFETIMES):
-        value = contact.value + span * 0.5**k
-        mean, n = approach.lifetimes(value, 4 * approach.effort.length)
-        if n < FEWEST_ESCAPES and values:
-            break
-        if n >= FEWEST_ESCAPES and mean >= SETTLE:
-            values, means, counts = [*values, value], [*means, mean], [*counts, n]
-    if len(values) < FEWEST_LIFETIMES:
-        return None
-    return fit_lifetimes(values, means, counts, contact.value)
-
-
-def fit_lifetimes(values: Sequence[float], means: Sequence[float], counts: Sequence[int], contact: float) -> Lifetimes:
-    """Fit ``c |p - p_c|^-gamma`` to mean lifetimes: gamma with p_c at the contact, and p_c with both free.
-
-    Parameters
-    ----------
-    values, means, counts
-        Parameter values, mean lifetimes there, and numbers of trajectories that left, the nearest value last.
-    contact
-        Value of the contact.
-    """
-    away, logs = np.asarray(values) - contact, np.log(means)
-    unit, sigma = away[-1], np.sqrt(1.0 / np.asarray(counts) + SCATTER**2)
-
-    def residual(u: np.ndarray) -> np.ndarray:
-        shift = u[2] if len(u) == 3 else 0.0
-        return np.asarray((u[0] - u[1] * np.log(away / unit - shift) - logs) / sigma)
-
-    def fitted(start: list[float]) -> tuple[np.ndarray, np.ndarray]:
-        most = [np.inf, np.inf, 0.999][: len(start)]
-        found = least_squares(residual, start, bounds=([-np.inf] * len(start), most))
-        scatter = max(1.0, 2.0 * found.cost / max(len(logs) - len(start), 1))
-        return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac) * scatter))
-
-    fixed, errors = fitted([float(logs[-1]), 1.0])
-    free, free_errors = fitted([*fixed.tolist(), 0.0])
-    value, value_error = float(contact + unit * free[2]), float(abs(unit) * free_errors[2])
-    return Lifetimes(tuple(values), tuple(means), float(fixed[1]), float(errors[1]), value, value_error)

@@ -22,29 +22,28 @@ from pipeline.analysis.events.contact import (
     Approach,
     Contact,
     Effort,
-    Lifetimes,
     Saddle,
     Sample,
     SectionMap,
     contact_of,
     count_bands,
-    lifetimes_of,
     map_along,
     sample_of,
 )
 from pipeline.analysis.events.lines import at
-from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TWINS
+from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TRANSIENT, TWINS
 from pipeline.analysis.events.scene import Event, Scene, Stretch
+from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transient_of
 from pipeline.analysis.ragged import points_of_rows, rows_at
 from pipeline.analysis.sets import nearest_distances
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter
 
-OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(64, 256, 3, 12, 1)
+OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 12, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
 
 OF_BANDS = 12
-"""Longest period of the orbits that are looked for because it is once or twice the number of bands."""
+"""Longest period of the orbits that are looked for because it is one to three times the number of bands."""
 
 SURE = 4.0
 """Largest distance of the value from lifetimes, in units of its error."""
@@ -79,7 +78,7 @@ class Crises:
 
     def name(self, one: Event, why: str) -> Event:
         """Name the end of a chaotic set by the crisis of this set, or of a set that its cells go on to, as seen from
-        the other side; add `why` else.
+        the other side, else by lifetimes beyond; add `why` if it stays open.
         """
         place, way = one.stretch.places[one.rises], 1 if one.rises else -1
         tries = [self.at(one.stretch.attractor, place, way)]
@@ -88,7 +87,11 @@ class Crises:
             tries += [replace(self.at(i, place + way, -way), lives_beyond=True) for i in heirs]
         found = next((crisis for crisis in tries if crisis.what), None)
         if found is None:
-            return replace(one, fate=replace(one.fate, why="; ".join(dict.fromkeys([why, *(x.why for x in tries)]))))
+            found = self._transient(one.stretch.attractor, place, way)
+            tried = "; ".join(dict.fromkeys([why, *(x.why for x in tries), found.why]))
+            if not found.what:
+                return replace(one, fate=replace(one.fate, why=tried))
+            found = replace(found, why=tried)
         fate = replace(one.fate, value=found.value, bifurcation=-1, why=found.why)
         return replace(one, fate=fate, what=found.what, error=found.error, born=found)
 
@@ -163,6 +166,24 @@ class Crises:
         }
         return _judged(scene, *met, beyond, others)
 
+    def _transient(self, attractor: int, place: int, way: int) -> Crisis:
+        """Judge by lifetimes alone whether a chaotic set is lost between a place and the next one."""
+        scene, row = self.scene, self._row(attractor, place)
+        if row is None or not 0 <= place + way < len(scene.along):
+            return Crisis("", "")
+        seen, beyond = (float(x) for x in scene.along[[place, place + way]])
+        along, effort = self._map(place)
+        try:
+            sample = sample_of(along, seen, points_of_rows(scene.attractors)[row][-1], effort)
+        except ValueError:
+            return Crisis("", "")
+        found = transient_of(along, sample, seen, beyond, effort)
+        if isinstance(found, str):
+            return Crisis("", found)
+        exponent, error = found.free_exponent
+        why = f"beyond, its trajectories leave for good: {_law(found, exponent, error)}"
+        return Crisis(TRANSIENT, why, found.value, found.value_error, exponent=exponent, exponent_error=error)
+
     def _row(self, attractor: int, place: int) -> int | None:
         """Return the row of a chaotic set at a place; None if it is not there."""
         ds = self.scene.attractors
@@ -180,7 +201,7 @@ class Crises:
         system = along.family.system
         rows = along.rows(seen, sample.points[:1])
         m = sample.n_bands
-        periods = sorted({*range(1, effort.longest + 1), *(p for p in (m, 2 * m) if p <= OF_BANDS)})
+        periods = sorted({*range(1, effort.longest + 1), *(p for p in (m, 2 * m, 3 * m) if p <= OF_BANDS)})
         starts = [starts_around(sample.points[::7], effort.starts, 0, system)] * len(periods)
         asked = np.repeat(periods, effort.starts)
         for line in self.scene.lines:
@@ -235,11 +256,7 @@ def _judged(
     times = lifetimes_of(approach, contact, beyond)
     if times is None:
         return Crisis("", f"{told}; too few trajectories leave beyond it for lifetimes")
-    listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(times.values, times.means, strict=True))
-    told += (
-        f"; mean lifetimes {listed} grow with the power -{times.exponent:.3f} ± {times.exponent_error:.3f} of the "
-        f"distance from {times.value:.10g} ± {times.value_error:.0e}"
-    )
+    told += f"; {_law(times, times.exponent, times.exponent_error)}"
     far = max(abs(times.values[0] - contact.value), 1e-300)
     if abs(times.value - contact.value) > SURE * times.value_error + contact.error or times.value_error > 0.25 * far:
         return Crisis("", f"{told}: they do not agree with the clearance")
@@ -251,6 +268,14 @@ def _judged(
     error = max(contact.error, 1e-9 * scene.scale)
     found = Crisis(what, told, contact.value, error, period=period, bands=bands, twin=twin)
     return replace(found, exponent=times.exponent, exponent_error=times.exponent_error)
+
+
+def _law(times: Lifetimes, exponent: float, error: float) -> str:
+    listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(times.values, times.means, strict=True))
+    return (
+        f"mean lifetimes {listed} grow with the power -{exponent:.3f} ± {error:.3f} of the distance from "
+        f"{times.value:.10g} ± {times.value_error:.0e}"
+    )
 
 
 def _kind(

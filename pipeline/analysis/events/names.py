@@ -10,13 +10,16 @@ BOUNDARY, INTERIOR, BANDS, TWINS = "boundary_crisis", "interior_crisis", "band_m
 CRISES = (BOUNDARY, INTERIOR, BANDS, TWINS)
 """Crises: a chaotic set is lost, grows, or merges its bands or with another set, as it meets an unstable orbit."""
 
+TRANSIENT = "transient"
+"""A chaotic set is lost, as lifetimes beyond show, but no orbit that it meets is proved."""
+
 INTERMITTENCY = {kind: f"intermittency_{kind}" for kind in ("i", "ii", "iii")}
 """Names of intermittency by its type."""
 
 LOCKING, GRAZING, BREAKUP, SLIDING = "locking", "grazing", "torus_breakup", "grazing_sliding"
 
 NAMES = (
-    *(UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *CRISES),
+    *(UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *CRISES, TRANSIENT),
     *(*INTERMITTENCY.values(), LOCKING, GRAZING, BREAKUP, SLIDING),
 )
 """Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""

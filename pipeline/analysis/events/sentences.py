@@ -21,6 +21,7 @@ from pipeline.analysis.events.names import (
     LOCKING,
     RANGE_END,
     SLIDING,
+    TRANSIENT,
     TWINS,
     UNDECIDED,
 )
@@ -158,6 +159,8 @@ def _reason(row: Row, doublings: list[float]) -> str:
         return _end_of_set(row, doublings)
     if what in CRISES:
         return _crisis(row)
+    if what == TRANSIENT:
+        return f"lost into a transient, {_power(row, 'lifetimes beyond')}; no orbit that it meets is proved"
     if what == BREAKUP:
         return "break-up of the torus into a chaotic set"
     if what == GRAZING:
@@ -196,9 +199,12 @@ def _crisis(row: Row) -> str:
     name = {BANDS: "merging of bands", TWINS: "merging of attractors"}.get(row["what"], plain(row["what"]))
     who = "the set beyond" if row["lives_beyond"] else "it"
     twin = f" together with {letter(row['twin'])}" if row["twin"] >= 0 else ""
-    times = f"lifetimes {'' if row['what'] == BOUNDARY else 'of its parts '}grow with the power"
-    power = f"-{row['exponent']:.2f} ± {row['exponent_error']:.2f} of the distance"
-    return f"{name}, {who} meets the unstable orbit of period {row['met_period']}{twin}; {times} {power}"
+    times = _power(row, "lifetimes" if row["what"] == BOUNDARY else "lifetimes of its parts")
+    return f"{name}, {who} meets the unstable orbit of period {row['met_period']}{twin}; {times}"
+
+
+def _power(row: Row, times: str) -> str:
+    return f"{times} grow with the power -{row['exponent']:.2f} ± {row['exponent_error']:.2f} of the distance"
 
 
 def _end_of_set(row: Row, doublings: list[float]) -> str:

@@ -7,13 +7,25 @@ import pytest
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
 import magpend
-from pipeline.analysis.events.contact import count_bands, fit_lifetimes
+from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.events.contact import Approach, Effort, SectionMap, contact_of, count_bands, passages, sample_of
+from pipeline.analysis.events.crises import OF_MAP
+from pipeline.analysis.events.transients import fit_lifetimes
 from pipeline.analysis.sets import Geometry
 
 LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.2)
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
 HENON = magpend.model("x' = 1 - a*x**2 + y\ny' = b*x", name="henon", kind="map", a=0.2, b=0.3)
+LINEAR = magpend.model("x' = u*x + y\ny' = 0.3*y", name="linear", kind="map", u=2.0)
+UEDA = magpend.model("x'' = B*cos(t) - 0.1*x' - x**3", name="ueda", B=13.3)
 LINE = Geometry((False,), (1.0,))
+
+
+def section_map(model, parameter, value, frequency_hz=None, **fixed):
+    """The section map of a model along a parameter."""
+    packed = model.load(**{parameter: value}, **fixed).pack()
+    family = family_of(model.system, 1, frequency_hz or model.clock_hz, packed, parameter, 1.0)
+    return SectionMap(family, Geometry.of(model), 1e-9)
 
 
 def sweep(model, folder, starts, **axis):
@@ -139,6 +151,75 @@ def test_events__boundary_crisis_of_henon(tmp_path):
 
 
 @pytest.mark.slow
+def test_events__lost_into_a_transient(tmp_path):
+    """Beside an independent chaotic state all orbits have two unstable multipliers, so that none is met for sure."""
+    model = magpend.model("x' = r*x*(1 - x)\ny' = 3.9*y*(1 - y)", name="two", kind="map", r=3.9)
+    found, table = decided(sweep(model, tmp_path, {"x": (0.1, 0.9), "y": (0.1, 0.9)}, r=[3.98, 4.02]))
+    ((what, period, value, error, exponent, exponent_error),) = found
+    assert (what, period) == ("transient", 0), table["evidence"].tolist()
+    assert abs(value - 4.0) <= 3.0 * error < 1e-3
+    assert abs(exponent - 0.5) <= 3.0 * exponent_error < 0.3
+    assert "no orbit that it meets is proved" in table.loc[table["what"] == "transient", "sentence"].iloc[0]
+
+
+def tangency_of_ueda():
+    """Value of B at which the unstable manifold of the saddle of period 1 touches its stable one, 20 sections later.
+
+    Along the unstable manifold the distance from the stable one has a minimum, which is 0 between these two values.
+    """
+    force = np.array([13.3884, 13.3889])
+
+    def strobe(state, n, steps=400):
+        h, b = 2.0 * np.pi / steps, force.reshape(-1, *[1] * (state.ndim - 2))
+
+        def rate(t, u):
+            return np.stack([u[..., 1], b * np.cos(t) - 0.1 * u[..., 1] - u[..., 0] ** 3], axis=-1)
+
+        for k in range(n * steps):
+            t = (k % steps) * h
+            a = rate(t, state)
+            c = rate(t + 0.5 * h, state + 0.5 * h * a)
+            d = rate(t + 0.5 * h, state + 0.5 * h * c)
+            state = state + h / 6.0 * (a + 2.0 * (c + d) + rate(t + h, state + h * d))
+        return state
+
+    saddle = np.array([[0.4044, -5.607]] * 2)
+    moves = 1e-5 * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    for _ in range(4):
+        ends = strobe(saddle[:, None] + moves, 1)
+        matrix = np.stack([ends[:, 1] - ends[:, 2], ends[:, 3] - ends[:, 4]], axis=-1) / 2e-5
+        saddle = saddle - np.linalg.solve(matrix - np.eye(2), (ends[:, 0] - saddle)[..., None])[..., 0]
+    t, starts, left = 0.6028 + 1e-3 * np.arange(-3, 4), [], []
+    for point, m in zip(saddle, matrix, strict=True):
+        values, right = np.linalg.eig(m)
+        k = int(np.abs(values).argmax())
+        v = right[:, k] / -right[1, k]
+        w = np.linalg.inv(right)[k] * -right[1, k]
+        starts.append(point + 1e-6 * values[k] ** t[:, None] * v)
+        left.append(w)
+    offset = strobe(np.array(starts), 20) - saddle[:, None]
+    lows = []
+    for row, w in zip(offset, left, strict=True):
+        a, b, c = np.polyfit(t - 0.6028, row @ w, 2)
+        lows.append(c - b * b / (4.0 * a))
+    return force[0] + (force[1] - force[0]) * lows[0] / (lows[0] - lows[1])
+
+
+@pytest.mark.slow
+def test_contact_of__boundary_crisis_of_ueda():
+    """Ueda (Ann. N. Y. Acad. Sci. 357, 1980, 422) gives 13.388; `analyse events` finds the same orbit by itself."""
+    along = section_map(UEDA, "B", 13.375, 0.5 / np.pi)
+    effort = Effort(64, 192, 3, 12, 1, is_flow=True)
+    sample = sample_of(along, 13.375, np.array([3.1, -0.78]), effort)
+    saddle = along.saddle(13.375, np.array([0.399, -5.58]), 1)
+    approach = Approach(along, sample, 13.375, saddle, effort)
+    assert approach.begin(approach.paths(13.375))
+    found = contact_of(approach, 13.45)
+    assert found is not None
+    assert abs(found.value - tangency_of_ueda()) <= found.error < 0.01
+
+
+@pytest.mark.slow
 def test_events__no_crisis_at_a_window(tmp_path):
     """Where a stable orbit of period 3 is born in the set, the set meets no orbit beside it."""
     found, table = decided(sweep(LOGISTIC, tmp_path, {"x": (0.1, 0.9)}, r=[3.82, 3.835]))
@@ -169,3 +250,38 @@ def test_fit_lifetimes__a_power_law():
     found = fit_lifetimes(values.tolist(), means, [1000] * 8, 2.0)
     assert found.value == pytest.approx(1.9999, abs=1e-8)
     assert 1e-6 < found.value_error < 1e-3
+
+
+@pytest.mark.parametrize("u", [2.0, -2.0])
+def test_passages__of_a_linear_saddle(u):
+    """Near 0 of x' = u x + y, y' = .3 y the sum x + y/(u - .3) is multiplied by u, and is 0 on the stable manifold."""
+    along = section_map(LINEAR, "u", u)
+    saddle = along.saddle(u, np.array([0.01, 0.02]), 1)
+    assert saddle.multiplier == pytest.approx(u)
+    assert saddle.covectors[0] == pytest.approx([1.0, 1.0 / (u - 0.3)])
+    y, distance = np.array([1.0, 1.0, 1.0 / 0.3]), np.array([1e-4, 3e-4, -2e-4])
+    starts = np.column_stack([distance - y / (u - 0.3), y])
+    found = passages(along.paths(u, starts, 30), saddle, 2, 0.05, along.geometry)
+    # y falls below the distance of passages at the third section, of the last trajectory at the fourth; of two bands
+    # even and odd sections are two classes
+    first = {0: np.array([2, 2, 4]), 1: np.array([3, 3, 3])}
+    assert set(found) == {(0, 0), (0, 1)}
+    for (_, phase), (clearance, lane, _) in found.items():
+        assert lane.tolist() == [0, 1, 2]
+        assert clearance == pytest.approx(distance * u ** (first[phase] + 1.0), rel=1e-6)
+
+
+def test_passages__that_follow_each_other_by_chance():
+    """A trajectory that is away in between passes twice: its second clearance is not divided by the growth."""
+    along = section_map(LINEAR, "u", 2.0)
+    paths = np.ones((1, 12, 2))
+    paths[0, 4], paths[0, 6] = (0.01, 0.04), (0.008, 0.0)
+    found = passages(paths, along.saddle(2.0, np.zeros(2), 1), 2, 0.05, along.geometry)
+    assert found[0, 0][0] == pytest.approx([0.01 + 0.04 / 1.7, 0.008])
+
+
+def test_sample_of__starts_in_one_band():
+    along = section_map(LOGISTIC, "r", 3.8565)
+    sample = sample_of(along, 3.8565, np.array([0.5]), OF_MAP)
+    assert sample.n_bands == 3
+    assert np.ptp(sample.starts) < 0.1 < 0.8 < np.ptp(sample.points)

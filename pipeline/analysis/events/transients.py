@@ -1,0 +1,186 @@
+"""Fit the power law of lifetimes beyond the value at which a chaotic set meets an orbit, or is lost into a transient.
+
+Beyond this value trajectories stay for a while where the set has been. Whatever the set has met, their mean lifetime is
+a power of the distance from the value (Grebogi, Ott and Yorke, Phys. Rev. Lett. 57, 1986, 1284). So where a set is lost
+and no orbit that it meets is proved, lifetimes give the value and the exponent, but not the orbit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pipeline.analysis.events.contact import (
+    AROUND,
+    AWAY,
+    SETTLE,
+    Approach,
+    Contact,
+    Effort,
+    Sample,
+    SectionMap,
+    last_stays,
+)
+
+LONGEST_SPAN = 8.0
+"""Largest distance at which lifetimes are taken, in units of that of the clearances."""
+
+FIRST_RATIO = 0.7
+"""Ratio of the first two distances at which lifetimes are taken; the others follow from the lifetimes."""
+
+SCATTER = 0.05
+"""Relative deviation of lifetimes from a power law that counts as one standard deviation: they have fine structure."""
+
+FEWEST_ESCAPES, FEWEST_LIFETIMES, MOST_LIFETIMES = 40, 4, 8
+"""Trajectories that leave at a parameter value, and fewest and most values of the parameter, for a fit of lifetimes."""
+
+ALL = 0.98
+"""Least share of trajectories that have left, and stay away for half of the time, at the value beyond the loss."""
+
+LANES = 64
+"""Most trajectories at a value."""
+
+HALVINGS = 10
+"""Bisections for the value up to which the set lives as long as trajectories are followed."""
+
+LARGEST_ERROR = 0.2
+"""Largest error of the exponent, as a share of it."""
+
+
+@dataclass(frozen=True)
+class Lifetimes:
+    """Lifetimes beyond contact, and the fitted law ``c |p - p_c|^-exponent``."""
+
+    values: tuple[float, ...]
+    means: tuple[float, ...]
+    exponent: float  # with p_c at the contact
+    exponent_error: float
+    value: float  # p_c, fitted without knowledge of the contact
+    value_error: float
+    free_exponent: tuple[float, float]  # the exponent fitted with it, and its error
+
+
+def lifetimes_of(approach: Approach, contact: Contact, beyond: float) -> Lifetimes | None:
+    """Fit a power law to mean lifetimes at several values beyond contact; None if there are too few of them."""
+    span = min(abs(beyond - contact.value), LONGEST_SPAN * contact.span) * float(np.sign(beyond - contact.value))
+    values: list[float] = []
+    means: list[float] = []
+    counts: list[int] = []
+    ratio = FIRST_RATIO
+    for _ in range(2 * MOST_LIFETIMES):
+        value = contact.value + span
+        mean, n = approach.lifetimes(value, 4 * approach.effort.length)
+        if (n < FEWEST_ESCAPES and values) or len(values) == MOST_LIFETIMES:
+            break
+        if n >= FEWEST_ESCAPES and mean >= SETTLE:
+            if means and mean > means[-1]:  # to the distance at which they are twice as long
+                power = np.log(mean / means[-1]) / np.log((values[-1] - contact.value) / span)
+                ratio = float(np.clip(0.5 ** (1.0 / power), 0.5, 0.9))
+            values, means, counts = [*values, value], [*means, mean], [*counts, n]
+        span *= ratio
+    if len(values) < FEWEST_LIFETIMES:
+        return None
+    return fit_lifetimes(values, means, counts, contact.value)
+
+
+def fit_lifetimes(values: Sequence[float], means: Sequence[float], counts: Sequence[int], contact: float) -> Lifetimes:
+    """Fit ``c |p - p_c|^-gamma`` to mean lifetimes: gamma with p_c at the contact, and p_c with both free.
+
+    Parameters
+    ----------
+    values, means, counts
+        Parameter values, mean lifetimes there, and numbers of trajectories that left, the nearest value last.
+    contact
+        Value of the contact.
+    """
+    away, logs = np.asarray(values) - contact, np.log(means)
+    unit, sigma = away[-1], np.sqrt(1.0 / np.asarray(counts) + SCATTER**2)
+
+    def residual(u: np.ndarray) -> np.ndarray:
+        shift = u[2] if len(u) == 3 else 0.0
+        return np.asarray((u[0] - u[1] * np.log(away / unit - shift) - logs) / sigma)
+
+    def fitted(start: list[float]) -> tuple[np.ndarray, np.ndarray]:
+        most = [np.inf, np.inf, 0.999][: len(start)]
+        found = least_squares(residual, start, bounds=([-np.inf] * len(start), most))
+        scatter = max(1.0, 2.0 * found.cost / max(len(logs) - len(start), 1))
+        return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac) * scatter))
+
+    fixed, errors = fitted([float(logs[-1]), 1.0])
+    free, free_errors = fitted([*fixed.tolist(), 0.0])
+    value, value_error = float(contact + unit * free[2]), float(abs(unit) * free_errors[2])
+    own = float(free[1]), float(free_errors[1])
+    return Lifetimes(tuple(values), tuple(means), float(fixed[1]), float(errors[1]), value, value_error, own)
+
+
+@dataclass(eq=False)
+class Place:
+    """Place of a chaotic set: its points, and starts on it, at the last value at which it was seen to live."""
+
+    along: SectionMap
+    starts: np.ndarray
+    points: np.ndarray
+    size: float
+    length: int  # sections
+
+    def stays(self, value: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the section points of trajectories at a value, and when each one was last near the set."""
+        paths = self.along.paths(value, self.starts, SETTLE + self.length)
+        return paths, last_stays(paths, self.points, AROUND * self.size, self.along.geometry)
+
+    def lifetime(self, value: float) -> tuple[float, int]:
+        """Return the mean lifetime of trajectories at a value, and the number of those that left.
+
+        The set is followed: if none left, its points at this value replace those before.
+        """
+        paths, until = self.stays(value)
+        left = until <= paths.shape[1] - AWAY * self.length
+        settled = until >= SETTLE
+        if not left.any():
+            self.points = paths[:, -max(len(self.points) // len(paths), 1) :].reshape(-1, paths.shape[2])
+            self.starts = paths[:, -1]
+        n = int(left[settled].sum())
+        return float((until[settled] - SETTLE).sum()) / max(n, 1), n
+
+
+def transient_of(along: SectionMap, sample: Sample, seen: float, beyond: float, effort: Effort) -> Lifetimes | str:
+    """Measure the lifetimes of a set that is lost between two values; return why there is no law, if there is none.
+
+    Returns
+    -------
+    Lifetimes
+        Its `value` and `free_exponent` are fitted together; `exponent` is the one at this value.
+    """
+    place = Place(along, sample.starts[:LANES], sample.points, sample.size(along.geometry), 4 * effort.length)
+    paths, until = place.stays(beyond)
+    if (until <= paths.shape[1] // 2).mean() < ALL:
+        return "beyond, its trajectories stay near it or come back"
+    low, high = seen, beyond
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        lives = place.lifetime(middle)[0] > place.length
+        low, high = (middle, high) if lives else (low, middle)
+    values: list[float] = []
+    means: list[float] = []
+    counts: list[int] = []
+    for k in range(HALVINGS):
+        value = low + (beyond - low) * 0.5**k
+        mean, n = place.lifetime(value)
+        if mean >= SETTLE and n >= FEWEST_ESCAPES:
+            values, means, counts = [*values, value], [*means, mean], [*counts, n]
+    if len(values) < FEWEST_LIFETIMES:
+        return "beyond, too few of its trajectories leave at times that can be measured"
+    values, means, counts = (x[-MOST_LIFETIMES:] for x in (values, means, counts))
+    found = fit_lifetimes(values, means, counts, low)
+    found = fit_lifetimes(values, means, counts, found.value)
+    exponent, error = found.free_exponent
+    if not (error <= LARGEST_ERROR * exponent and found.value_error <= 0.25 * abs(values[0] - found.value)):
+        return (
+            f"beyond, its trajectories leave at mean times, {means[0]:.3g} to {means[-1]:.3g}, that show no power law"
+        )
+    if (found.value - seen) * (beyond - seen) < 0.0:
+        return "the law of lifetimes beyond would have it lost where it lives"
+    return found
