@@ -11,7 +11,6 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
-from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
 from pipeline.analysis.branches.problems import Family
@@ -22,6 +21,7 @@ from pipeline.analysis.events.graph import at_ends
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.events.names import CRISES, GRAZING, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.one_event import is_own, same_as
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -369,55 +369,6 @@ def _merged(named: Sequence[Event]) -> list[Event]:
     return merged
 
 
-def _same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
-    """Return for each end of an attractor the number of the end that leads: ends at one bifurcation are one event.
-
-    The leading end is that of the orbit on which the bifurcation lies, or of the set that meets the orbit of a crisis.
-    """
-    groups: list[list[int]] = []
-    for k, one in enumerate(named):
-        own = next((group for group in groups if any(_is_same(scene, named[i], one) for i in group)), None)
-        if own is None:
-            groups.append([k])
-        else:
-            own.append(k)
-    found = [0] * len(named)
-    for group in groups:
-        lead = min(group, key=lambda k: (_is_seen_from_elsewhere(scene.located, named[k]), k))
-        for k in group:
-            found[k] = lead
-    return found
-
-
-def _is_seen_from_elsewhere(ds: xr.Dataset, one: Event) -> bool:
-    if isinstance(one.born, Crisis):
-        return one.born.lives_beyond
-    return not _is_own(ds, one.fate)
-
-
-def _is_same(scene: Scene, a: Event, b: Event) -> bool:
-    """Tell whether two ends are one event: of one kind, at one value, and of one orbit or of mirror images."""
-    if a.what != b.what or not abs(_value(a) - _value(b)) <= a.error + b.error:
-        return False
-    ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
-    if a.what in CRISES and (a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)):
-        return True  # one crisis told from both sides, or by both sets that merge
-    if min(j, k) >= 0:
-        points = ds["bifurcation_section"].values[[j, k]]
-        away = geometry_of(scene.attractors).distance(points[0], points[1, 0])
-        if j == k or np.nanmin(away) <= SAME_PLACE:
-            return True
-    return a.rises == b.rises and _are_mirrored(scene, a, b)
-
-
-def _are_mirrored(scene: Scene, a: Event, b: Event) -> bool:
-    """Tell whether two attractors are mirror images of each other at the ends of their stretches."""
-    ds, (i, j) = scene.attractors, (one.stretch.rows[one.rises] for one in (a, b))
-    if a.stretch.places[a.rises] != b.stretch.places[b.rises] or "mirror_partner" not in ds:
-        return False
-    return int(ds["mirror_partner"].values[i]) == int(ds["attractor"].values[j])
-
-
 # ---- dataset -----------------------------------------------------------------------------------
 
 
@@ -430,7 +381,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
     located, along, n = scene.located, scene.along, len(scene.along)
     beyond = [one.stretch.places[one.rises] + (1 if one.rises else -1) for one in named]
     bifurcations = np.array([one.fate.bifurcation for one in named], int)
-    own = [_is_own(located, one.fate) for one in named]
+    own = [is_own(located, one.fate) for one in named]
     degrees = [
         int(located["criticality"].values[one.fate.bifurcation])
         if one.fate.bifurcation >= 0 and one.what != BRANCHING
@@ -455,7 +406,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
-        "same_as": (_same_as(scene, named), "number of the event that this end belongs to", {}),
+        "same_as": (same_as(scene, named), "number of the event that this end belongs to", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {
@@ -531,10 +482,6 @@ def _bars(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) ->
     }
     places = [[(place, scene.ids_of(one.attractor, place)) for place in one.places] for one in stretches]
     return bars | at_ends(scene.attractors, scene.axis, scene.order, [one.rows for one in stretches], places)
-
-
-def _is_own(ds: xr.Dataset, fate: Fate) -> int:
-    return int(fate.bifurcation >= 0 and int(ds["of_branch"].values[fate.bifurcation]) == fate.branch)
 
 
 def _other_branch(ds: xr.Dataset, fate: Fate) -> int:
