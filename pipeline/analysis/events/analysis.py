@@ -92,14 +92,15 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
     stretches, ids = _continued(scene, _stretches(scene))
     crises = Crises(replace(scene, names=ids))
-    stretches = crises.split(stretches)
+    stretches = stretches if options.orbits else crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    named = [_aperiodic(scene, crises, one, named) for one in named]
+    if not options.orbits:
+        named = [_aperiodic(scene, crises, one, named) for one in named]
     return dataset_of(scene, stretches, _merged(named))
 
 
