@@ -103,33 +103,11 @@ class _Flood(Orbits):
     def __init__(self, grid: Grid, place: Array, orbits: list[Array]) -> None:
         super().__init__(grid, place, orbits)
         n = grid.system.n_states
+        numbers = "u end h shortest det det_before u_before gap sign limit reach end_at"
         walk: Any = [(k, "i8") for k in ("origin", "axis", "way", "period", "halvings", "stage", "tries")]
-        walk += [
-            (k, "f8")
-            for k in (
-                "u",
-                "end",
-                "h",
-                "shortest",
-                "det",
-                "det_before",
-                "u_before",
-                "gap",
-                "sign",
-                "limit",
-                "reach",
-                "end_at",
-            )
-        ]
-        walk += [
-            ("z", "f8", n),
-            ("slope", "f8", n),
-            ("half", "f8", n),
-            ("is_fold", "?"),
-            ("has_moved", "?"),
-            ("is_rough", "?"),
-            ("is_ending", "?"),
-        ]
+        walk += [(k, "f8") for k in numbers.split()]
+        walk += [(k, "f8", n) for k in ("z", "slope", "half")]
+        walk += [(k, "?") for k in ("is_fold", "has_moved", "is_rough", "is_ending")]
         self.walk: Any = np.zeros(0, walk)
 
     def run(self) -> None:
@@ -313,7 +291,9 @@ class _Flood(Orbits):
         at = w["u"] + w["way"] * ahead
         w["end_at"][passed] = at[passed]
         near = (ahead > 0.0) & (ahead <= 4.0 * np.abs(w["u"] - w["u_before"]))
-        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & (np.abs(at - before) <= AGREED * ahead))
+        with np.errstate(invalid="ignore"):  # both are infinite where the derivative stays constant
+            agrees = np.abs(at - before) <= AGREED * ahead
+        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & agrees)
 
     def _begin_half(self, w: Any, ready: Array, v: Values) -> None:
         """Go on with orbits of half the period: the next step must pass a doubling of theirs."""

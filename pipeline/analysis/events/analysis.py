@@ -12,14 +12,13 @@ import xarray as xr
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
 from pipeline.analysis.branches.kinds import KINDS
-from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
+from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises
 from pipeline.analysis.events.dataset import dataset_of
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
-from pipeline.analysis.events.names import CRISES, GRAZING, LIVES_ON, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -100,7 +99,8 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
     if not options.orbits:
-        named = [_aperiodic(scene, crises, one, named) for one in named]
+        breakups = Breakups(scene)
+        named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
     return dataset_of(scene, stretches, _merged(named))
 
 
@@ -184,7 +184,7 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
                 fates[one, rises] = (Fate(np.nan, why=why),) * 2
                 continue
             asked.append((one, rises))
-            orbits.append(Orbit(_family(scene, place, one.period), points[row][0], float(scene.along[place])))
+            orbits.append(Orbit(scene.family(place, one.period), points[row][0], float(scene.along[place])))
     for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
         if found is None:
             fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
@@ -252,25 +252,19 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     return replace(event, what=what, error=error)
 
 
-def _family(scene: Scene, place: int, period: int) -> Family:
-    """Return the family of orbits of a period at the parameters of a place on the axis."""
-    frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
-    return family_of(scene.base.model.system, period, frequency, packed, scene.axis, scene.scale)
-
-
 def _touching(scene: Scene, event: Event) -> Event:
     """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
     fate = event.fate
     line = next((line for line in scene.lines if line.branch == fate.branch), None)
     if line is None or fate.node not in (0, len(line.value) - 1):
         return event
-    family = _family(scene, event.stretch.places[event.rises], line.period)
+    family = scene.family(event.stretch.places[event.rises], line.period)
     found = grazing_of(line, fate.node, family)
     if found is None:
         return event
-    value, error, why = found
+    what, value, error, why = found
     fate = replace(fate, value=value, why=f"{fate.why}; {why}")
-    return replace(event, fate=fate, what=GRAZING, error=max(error, LOCATED * scene.scale))
+    return replace(event, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:
@@ -287,7 +281,7 @@ def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -
     return dict(counts.most_common()), int(here.sum())
 
 
-def _aperiodic(scene: Scene, crises: Crises, one: Event, named: Sequence[Event]) -> Event:
+def _aperiodic(scene: Scene, crises: Crises, breakups: Breakups, one: Event, named: Sequence[Event]) -> Event:
     """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by a crisis, if
     there is proof.
     """
@@ -296,17 +290,23 @@ def _aperiodic(scene: Scene, crises: Crises, one: Event, named: Sequence[Event])
     is_chaotic = SETS[one.stretch.kind] == "chaotic_set"
     place, way = one.stretch.places[one.rises], 1 if one.rises else -1
     heir = next(iter(one.to), -1)
-    facing = [
+    opposite = [
         other
         for other in named
         if other.rises != one.rises
         and other.stretch.attractor == heir
         and other.stretch.places[other.rises] == place + way
-        and other.fate.bifurcation >= 0
         and next(iter(other.to), -1) == one.stretch.attractor
     ]
+    facing = [other for other in opposite if other.fate.bifurcation >= 0]
     if not facing or len(one.to) > 1:
         why = _why_open(one, heir, named)
+        alone = [other for other in opposite if len(one.to) == len(other.to) == 1]
+        if alone and {SETS[x.stretch.kind] for x in (one, alone[0])} == {"torus", "chaotic_set"}:
+            broken = breakups.name(one, alone[0].stretch)
+            if broken.what != UNDECIDED:
+                return broken
+            why = broken.fate.why
         return crises.name(one, why) if is_chaotic else replace(one, fate=replace(one.fate, why=why))
     born = _born(scene, one.stretch, place, way, facing[0].fate)
     fate = replace(facing[0].fate, value=born.value, why=born.why)
@@ -323,7 +323,7 @@ def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> B
     points = all_points[stretch.rows[way > 0]]
     bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
     if may_pass(scene.located, fate.bifurcation, is_torus):
-        family = _family(scene, place, 1)
+        family = scene.family(place, 1)
         return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
     if not is_torus:
         return cascade_of(scene.located, fate, bracket, points, geometry)
@@ -341,7 +341,7 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
     if any(SETS[other.kind] == "chaotic_set" for other in beyond):
-        return f"{letter(heir)} is a chaotic set: whether the torus breaks up into it is not looked for"
+        return f"{letter(heir)} is a chaotic set, but the cells of the two do not all go on to each other"
     if len(one.to) > 1:
         return "its cells do not all go on to the same attractor"
     return "its cells do not go on to an orbit whose end is located and whose cells go on to it"
@@ -358,7 +358,7 @@ def _merged(named: Sequence[Event]) -> list[Event]:
             and last.stretch.attractor == one.stretch.attractor
             and (
                 last.fate.bifurcation == one.fate.bifurcation >= 0
-                or (last.what in CRISES and (last.what, last.fate.value) == (one.what, one.fate.value))
+                or (last.what in (*CRISES, BREAKUP) and (last.what, last.fate.value) == (one.what, one.fate.value))
             )
         ):
             merged[-1] = replace(last, after=one.stretch)

@@ -11,7 +11,7 @@ from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate
-from pipeline.analysis.events.names import CRISES
+from pipeline.analysis.events.names import BREAKUP, CRISES
 from pipeline.analysis.events.scene import Event, Scene
 
 
@@ -58,7 +58,9 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
     if a.what != b.what or not abs(a.fate.value - b.fate.value) <= a.error + b.error:
         return False
     ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
-    if a.what in CRISES and (a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)):
+    if a.what in (*CRISES, BREAKUP) and (
+        a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)
+    ):
         return True  # one crisis told from both sides, or by both sets that merge
     if min(j, k) >= 0:
         points = ds["bifurcation_section"].values[[j, k]]

@@ -12,6 +12,7 @@ from pipeline.analysis.events.graph import graph_of
 from pipeline.analysis.events.names import (
     BANDS,
     BOUNDARY,
+    BREAKUP,
     CASCADE,
     CRISES,
     GRAZING,
@@ -19,6 +20,7 @@ from pipeline.analysis.events.names import (
     LIVES_ON,
     LOCKING,
     RANGE_END,
+    SLIDING,
     TWINS,
     UNDECIDED,
 )
@@ -139,8 +141,8 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
     at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
-    if row["period_after"] >= 0 and row["what"] in CRISES:
-        return f"{who} changes at {at} as it {way}: {_crisis(row)}{where}"
+    if row["period_after"] >= 0 and row["what"] in (*CRISES, BREAKUP):
+        return f"{who} changes at {at} as it {way}: {_reason(row, doublings)}{where}"
     if row["period_after"] >= 0:
         changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"
         return f"{changes} at {at} as it {way}: {_reason(row, doublings)}{where}"
@@ -156,8 +158,12 @@ def _reason(row: Row, doublings: list[float]) -> str:
         return _end_of_set(row, doublings)
     if what in CRISES:
         return _crisis(row)
+    if what == BREAKUP:
+        return "break-up of the torus into a chaotic set"
     if what == GRAZING:
         return "grazing, a peak of it begins to touch a surface of impacts or switches"
+    if what == SLIDING:
+        return "grazing-sliding, its stay on the surface of a switch shrinks to a touch"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
