@@ -23,7 +23,21 @@ class PlaneOptions(AlongOptions):
     second_high: float = option(..., "Largest value of the second parameter.", unit="SI", flag="--second-to")
 
 
-class BranchOptions(AlongOptions):
+class StartOptions(Options):
+    """Options for a state from which to start."""
+
+    start: dict[str, float] = option(
+        {}, "Also start from this state, such as x=0.1,v=0; along branches the parameter may be among them."
+    )
+    start_period: int = option(
+        1,
+        "Period of the orbit near --start; branches take 0, and of a flow without a section any, as an equilibrium.",
+        unit="drive periods or returns",
+        ge=0,
+    )
+
+
+class BranchOptions(AlongOptions, StartOptions):
     """Options for continuing branches of periodic orbits."""
 
     max_period: int = option(
@@ -46,15 +60,6 @@ class BranchOptions(AlongOptions):
     )
     stable: bool = option(
         False, "Follow stable parts only, and a little of what lies beyond: much faster if there are many attractors."
-    )
-    start: dict[str, float] = option(
-        {}, "Also start from the orbit or equilibrium near a state, such as x=0.1,v=0; the parameter may be among them."
-    )
-    start_period: int = option(
-        1,
-        "Period of the orbit at --start; 0, and a flow without a section, take an equilibrium.",
-        unit="drive periods or returns",
-        ge=0,
     )
     all_equilibria: int = option(
         0,
@@ -93,7 +98,7 @@ class SensitivityOptions(BranchOptions):
     digest: str = option("", "Digest of the file of draws; found by itself.")
 
 
-class OrbitOptions(Options):
+class OrbitOptions(StartOptions):
     """Options for searching all periodic orbits at a parameter point."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point.")
@@ -115,7 +120,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=3,
+    version=4,
 )
 
 CURVES = Analysis(
@@ -130,7 +135,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
-    version=2,
+    version=3,
 )
 
 BANDS = Analysis(
@@ -170,7 +175,7 @@ ORBITS = Analysis(
     """Search all periodic orbits up to a period at a parameter point, stable or not, from many starts.
 
     Counts how many starts lead to each orbit, estimates how many orbits are missing, and checks the sum of the
-    indices.""",
+    indices. --start adds the orbit near a state, also of a longer period.""",
     OrbitOptions,
     compute="pipeline.analysis.branches.orbit_search:orbits",
     table="pipeline.analysis.branches.orbit_search:orbits_table",

@@ -56,68 +56,18 @@ derivative jumps. What that means here:
 The dataset
 -----------
 Dims ``branch``, ``point`` (in the order along a branch), ``phase`` (section points of an orbit in the order
-of time), ``state``, ``multiplier`` (by falling modulus), ``bifurcation``, and the model's dim of angles.
-Beyond a branch's own points and phases values are NaN, counts -1. ``side`` is there if the model has words
-for motions; parameters with other values than the run's own are variables of their name. Attributes
-``parameter``, ``parameter_units``, ``model``, ``left_out``: a line for each attractor that was not followed, and
-``stuck``: a line for each end that is stuck, with what was met there.
+of time), ``state``, ``multiplier`` (by falling modulus), ``bifurcation``, ``end`` (0: first, 1: last), and the model's
+dim of angles. Each variable's ``long_name`` says what it is (`dataset`). Beyond a branch's own points and phases values
+are NaN, counts -1. ``side`` is there if the model has words for motions; ``eigenvalue_...`` if there are equilibria;
+``limit_...`` if a period grows without bound; ``searched_...`` and ``box_...`` after a search of all orbits or
+equilibria. Parameters with other values than the run's own are variables of their name. Attributes ``parameter``,
+``parameter_units``, ``model``, ``left_out``: a line for each attractor that was not followed, and ``stuck``: a line for
+each end that is stuck, with what was met there.
 
-================================= ======================== ===================================================
-variable                          dims                     meaning
-================================= ======================== ===================================================
-``parameter``                     branch, point            value of the parameter
-``section``                       branch, point, phase,    section points, angles wrapped
-                                  state
-``multiplier_real``, ``_imag``    branch, point,           Floquet multipliers over the orbit's period
-                                  multiplier
-``n_unstable``                    branch, point            multipliers outside the unit circle
-``side``                          branch, point            class of the motion, from the whole orbit
-``residual``                      branch, point            scaled distance of the point from its image
-``period_s``                      branch, point            period of the orbit [s]
-``eigenvalue_real``, ``_imag``    branch, point,           eigenvalues of an equilibrium [1/s]; absent if there
-                                  multiplier               are no equilibria
-``orbit_period``, ``n_points``    branch                   drive periods or returns, 0 for equilibria; points
-``origin``                        branch                   bifurcation that it sprang from, -1 none
-``first_end``, ``last_end``       branch                   why it ends: at a bound of the parameter, closed on
-                                                           itself, on the orbit of half the period, after too
-                                                           many points, stuck (Newton's method fails for the
-                                                           shortest step), start (it sprang off there),
-                                                           equilibrium (a cycle of a flow that shrinks to a
-                                                           point there, as at a Hopf bifurcation), tangent
-                                                           (its cycles only touch the section),
-                                                           other_section (its cycles go on as a branch on
-                                                           the run's section), homoclinic or snic (their period
-                                                           grows without bound, see `limits`), unstable (with
-                                                           --stable: some points beyond its stable part)
-``limit_value``, ``_error``       branch, end              such an end's parameter value; absent if there is none,
-                                                           like all that follows
-``limit_state``                   branch, end, state       equilibrium at which the cycles come to rest
-``limit_eigenvalue_real``,        branch, end,             its eigenvalues [1/s]
-``_imag``                         multiplier
-``limit_slope``, ``_error``,      branch, end              slope of the law of the period, fitted, its error, and
-``_expected``                                              computed from the equilibrium
-``frequency``                     branch                   drive frequency, NaN if that is the parameter; a
-                                                           flow has none
-``rotation``                      branch, angle            mean turns per drive period or return
-``kind``, ``value``, ``bracket``  bifurcation              what, where, between parameter values how far apart
-``of_branch``, ``after``          bifurcation              its branch, and the point after which it comes
-``to_branch``                     bifurcation              the other branch through it, -1 none or unknown
-``n_unstable_before``, ``_after`` bifurcation              along the branch
-``rises_before``                  bifurcation              whether the parameter rises along the branch before
-``criticality``                   bifurcation              unknown, supercritical, subcritical, contradictory
-``critical_real``, ``_imag``      bifurcation              the multiplier on the circle
-``bifurcation_multiplier_real``,  bifurcation,             all of them
-``_imag``                         multiplier
-``bifurcation_section``           bifurcation, phase,      the orbit
-                                  state
-``bifurcation_side``              bifurcation              its side
-``bifurcation_period_s``          bifurcation              its period [s]; of a Hopf point that of its cycles
-``normal_form``, ``_error``       bifurcation              coefficient of the normal form, NaN if unknown
-``searched_value``, ...           searched                 parameter value where all orbits were searched, and
-                                                           those of the run's other axes (option ``isolas``)
-``coverage``                      searched                 estimated share of starts that lead to an orbit found
-``n_orbits``                      searched, times          orbits of this least period, with those on branches
-``index_sum``, ``index_verdict``  searched, times          sum of the indices of the fixed points of the map taken
-                                                           so many times; what it says (see `searching`)
-================================= ======================== ===================================================
+``first_end`` and ``last_end`` say why a branch ends: ``bound`` of the parameter, ``closed`` on itself, ``start`` (it
+sprang off there), ``period_halving`` (on the orbit of half the period), ``max_points``, ``stuck`` (Newton's method
+fails for the shortest step), ``equilibrium`` (a cycle of a flow that shrinks to a point, as at a Hopf bifurcation),
+``tangent`` (its cycles only touch the section), ``other_section`` (its cycles go on as a branch on the run's section),
+``homoclinic`` or ``snic`` (their period grows without bound, see `limits`), ``unstable`` (with --stable: some points
+beyond its stable part).
 """

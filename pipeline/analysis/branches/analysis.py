@@ -23,10 +23,11 @@ from pipeline.analysis.branches.kinds import (
     PITCHFORK,
 )
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, values
+from pipeline.analysis.tabular import Row, Words, aligned, counted, value_with_error, values
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
+from pipeline.specification.problems import SpecError, unknown_name
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -52,8 +53,6 @@ def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
 
 def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
     """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
-    from pipeline.specification.problems import SpecError
-
     if axis_name(parameter) == FREQUENCY_DIM and run.model.clock_hz is not None:
         swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
@@ -107,8 +106,6 @@ def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
     """Fill in the parameter interval of the branches; raise SpecError unless the second parameter differs from the
     first.
     """
-    from pipeline.specification.problems import SpecError
-
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
     second = options.second
     if axis_name(second) == axis_name(settled.parameter):
@@ -129,8 +126,19 @@ def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     bounds = (_ends(options), (options.second_low, options.second_high))
     second = axis_name(options.second)
     base = parameters_of(run.cube())
-    found = curves_from(located, base, second, bounds, options.curve_period)
-    return curves_dataset(found, axis_name(options.parameter), second, base.model)
+    left_out: dict[int, str] = {}
+    found = curves_from(located, base, second, bounds, options.curve_period, left_out=left_out)
+    lines = [f"{_place_of(located, k)}: {why}" for k, why in sorted(left_out.items()) if k >= 0]
+    return curves_dataset(found, axis_name(options.parameter), second, base.model).assign_attrs(
+        left_out="\n".join(lines)
+    )
+
+
+def _place_of(ds: xr.Dataset, k: int) -> str:
+    """Name a located bifurcation with its place."""
+    kind, period = KINDS[int(ds["kind"][k])], int(ds["orbit_period"][int(ds["of_branch"][k])])
+    name = parameter_name(str(ds.attrs["parameter"]))
+    return f"{kind}, {period_words(period)}, at {name} {float(ds['value'][k]):.7g}"
 
 
 def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:
@@ -141,8 +149,6 @@ def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:
 
 def interval_of(run: OpenRun, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Return the parameter interval of the branches; its default is the range that the run sweeps."""
-    from pipeline.specification.problems import SpecError, unknown_name
-
     base = parameters_of(run.cube())
     is_frequency = axis_name(parameter) == FREQUENCY_DIM
     if not is_frequency and parameter not in base.names:
@@ -178,8 +184,8 @@ def branches_table(ds: xr.Dataset) -> Table:
     """
     rows = table_of(ds)
     if not ds.sizes["branch"]:
-        lines = ["no branch: no closed orbit to begin with", *counted_lines(ds), *searched_lines(ds), *_left_out(ds)]
-        return Table(rows, lines, _why_none(ds))
+        lines = ["no branch: no closed orbit to begin with", *counted_lines(ds), *searched_lines(ds)]
+        return Table(rows, [*lines, *_listed(ds, "left_out")], _why_none(ds))
     head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
     return Table(
@@ -191,7 +197,7 @@ def branches_table(ds: xr.Dataset) -> Table:
             *counted_lines(ds),
             *searched_lines(ds),
             *_listed(ds, "stuck"),
-            *_left_out(ds),
+            *_listed(ds, "left_out"),
         ],
     )
 
@@ -287,12 +293,6 @@ def _saddle_quantity(ds: xr.Dataset, branch: int, end: int) -> float:
     return float(real[real > 0.0].min() + real[real < 0.0].max())
 
 
-def _to_error(value: float, error: float) -> str:
-    """Format a value with an error that may be small, to one digit of the error."""
-    decimals = int(np.clip(np.ceil(-np.log10(error)), 0, 12))
-    return f"{round(value, decimals) + 0.0:.{decimals}f} +- {error:.1g}"
-
-
 def _unbounded(ds: xr.Dataset) -> list[str]:
     """Return text lines on the ends of branches at which the period grows without bound; none if there are none."""
     lines = []
@@ -303,7 +303,7 @@ def _unbounded(ds: xr.Dataset) -> list[str]:
         own = (one["limit_eigenvalue_real"].values + 1j * one["limit_eigenvalue_imag"].values).round(12) + 0.0
         eigenvalues = ", ".join(f"{v.real:.5g}{v.imag:+.5g}i" if v.imag else f"{v.real:.5g}" for v in own)
         fitted, error, expected = (float(one[f"limit_slope{part}"]) for part in ("", "_error", "_expected"))
-        at = f"{name}_h = {_to_error(float(one['limit_value']), float(one['limit_error']))}"
+        at = f"{name}_h = {value_with_error(float(one['limit_value']), float(one['limit_error']))}"
         quantity = _saddle_quantity(ds, branch, end)
         if np.isfinite(quantity):
             n_unstable = int((own.real > 0.0).sum())
@@ -316,7 +316,7 @@ def _unbounded(ds: xr.Dataset) -> list[str]:
         lines += [
             f"  branch {branch}{_at(ds, branch)}: {what}; {at}",
             f"    eigenvalues {eigenvalues} [1/s]; {told}",
-            f"    slope of the period over {law}: {fitted:.5g} +- {error:.1g} fitted, {expected:.5g} computed",
+            f"    slope of the period over {law}: {fitted:.5g} ± {error:.0e} fitted, {expected:.5g} computed",
         ]
     return ["", "the period grows without bound", *lines] if lines else []
 
@@ -397,17 +397,18 @@ def _number(z: complex, period: int) -> str:
 
 
 def _windows(ds: xr.Dataset) -> list[str]:
-    lines = ["stable segments"]
-    for w in windows_of(ds):
-        ends = f"{w['from']:.7f} ({w['begins']}) to {w['to']:.7f} ({w['ends']})"
-        side = f", {w['side']}" if w["side"] else ""
-        what = f"period {w['period']}" if w["period"] else "equilibrium"
-        lines.append(f"  {what}{side}, branch {w['branch']}{_at(ds, w['branch'])}: {ends}")
-    return lines if len(lines) > 1 else ["no stable segment"]
+    lines = Counter(
+        f"  {period_words(w['period'])}{', ' if w['side'] else ''}{w['side']}, branch {w['branch']}"
+        f"{_at(ds, w['branch'])}: {w['from']:.7f} ({w['begins']}) to {w['to']:.7f} ({w['ends']})"
+        for w in windows_of(ds)
+    )
+    told = [line if n == 1 else f"{line}, and back by mirror images" for line, n in lines.items()]
+    return ["stable segments", *told] if told else ["no stable segment"]
 
 
-def _left_out(ds: xr.Dataset) -> list[str]:
-    return _listed(ds, "left_out")
+def period_words(period: int) -> str:
+    """Name orbits of a period, or equilibria, which have the period 0."""
+    return f"period {period}" if period else "equilibrium"
 
 
 def _listed(ds: xr.Dataset, name: str) -> list[str]:
@@ -447,7 +448,8 @@ def _detached(ds: xr.Dataset) -> list[str]:
         lines += ["", head] if branches else []
         for i in branches:
             line = ds["parameter"].values[i, : int(ds["n_points"][i])]
-            what = f"period {int(ds['orbit_period'][i])}, branch {i}{_at(ds, i)}"
+            line = np.append(line, ds["value"].values[ds["of_branch"].values == i])
+            what = f"{period_words(int(ds['orbit_period'][i]))}, branch {i}{_at(ds, i)}"
             lines.append(f"  {what}: {line.min():.7f} to {line.max():.7f}")
     return lines
 
@@ -555,7 +557,7 @@ def curves_table(ds: xr.Dataset) -> Table:
         lines += ["", f"{counted(missed, 'sign change')} of test functions could not be located: points may be missing"]
     if rows:
         lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
-    return Table(rows, lines)
+    return Table(rows, [*lines, *_listed(ds, "left_out")])
 
 
 def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
@@ -581,11 +583,7 @@ def _special_words(row: Row) -> Words:
     words = {name: word for name, word in words.items() if name not in COEFFICIENTS}
     told = ", ".join(f"{name} = {value:.5g}" for name, value in own.items())
     coefficients = {"normal form": told} if any(name in row for name in COEFFICIENTS) else {}
-    return words | {"period": _cycles(row["period"]), "error": f"{row['error']:.1g}"} | coefficients
-
-
-def _cycles(period: int) -> str:
-    return str(period) if period else "equilibrium"
+    return words | {"period": str(row["period"] or "equilibrium"), "error": f"{row['error']:.1g}"} | coefficients
 
 
 def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
@@ -593,8 +591,7 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     lines = [one[role].values[:n] for role in ("first", "second")]
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
     ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
-    period = int(told["orbit_period"])
-    what = f"{LABELS[told['kind']]} {told['kind']}, {f'period {period}' if period else 'equilibrium'}"
+    what = f"{LABELS[told['kind']]} {told['kind']}, {period_words(int(told['orbit_period']))}"
     if told["kind"] == HOMOCLINIC:
         quantity = one["saddle_quantity"].values[:n]
         what = f"{LABELS[HOMOCLINIC]} homoclinic, saddle quantity {quantity.min():.4g} to {quantity.max():.4g} 1/s"

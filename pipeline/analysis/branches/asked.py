@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +16,14 @@ from magpend_core.models.text.intervals import Rates
 from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at
 from pipeline.analysis.branches.boxes import Box, enclose_equilibria, search_equilibria
-from pipeline.analysis.branches.deflation import expected_index, search_orbits
+from pipeline.analysis.branches.deflation import expected_index, orbit_near
 from pipeline.analysis.branches.known import Start
-from pipeline.analysis.branches.problems import Family, parameter_units
-from pipeline.analysis.branches.searching import family_at, rows_of
-from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.searching import family_at, rows_of, where_variables
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
-from pipeline.products.branches import BranchOptions
+from pipeline.products.branches import BranchOptions, StartOptions
 from pipeline.specification.problems import SpecError, unknown_name
 
 COUNTS = ("proved", "border", "undecided", "jumps", "no_text")
@@ -33,9 +32,14 @@ COUNTS = ("proved", "border", "undecided", "jumps", "no_text")
 
 def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, float]) -> None:
     """Raise SpecError unless the options on starts name all states, with numbers in their bounds."""
-    model = run.model
-    if options.start:
-        _check_start(model, options, interval)
+    model, name, (low, high) = run.model, parameter_name(options.parameter), interval
+    problems = start_problems(model, options, name)
+    if not low <= (value := options.start.get(name, low)) <= high:
+        problems.append(f"--start: {name} = {value:g} is outside of {low:g} to {high:g}; change --from and --to.")
+    if options.start and 0 < options.max_period < options.start_period:
+        problems.append(f"--start-period {options.start_period} is above --period {options.max_period}; raise that.")
+    if problems:
+        raise SpecError(problems)
     if options.all_equilibria or options.within:
         if not has_equilibria(model):
             raise SpecError(
@@ -53,22 +57,17 @@ def has_equilibria(model: Model) -> bool:
     return model.autonomous and not model.is_map
 
 
-def _check_start(model: Model, options: BranchOptions, interval: tuple[float, float]) -> None:
-    name, states = parameter_name(options.parameter), model.state_names
-    known = (*states, name)
+def start_problems(model: Model, options: StartOptions, *others: str) -> list[str]:
+    """Return what is wrong with --start, which names all states and may name some other quantities."""
+    if not options.start:
+        return []
+    known = (*model.state_names, *others)
     problems = [f"--start: {unknown_name('state', one, known)}" for one in options.start if one not in known]
-    if missing := [state for state in states if state not in options.start]:
+    if missing := [state for state in model.state_names if state not in options.start]:
         problems.append(f"--start: give all states; missing: {', '.join(missing)}.")
-    low, high = interval
-    value = options.start.get(name, low)
-    if not low <= value <= high:
-        problems.append(f"--start: {name} = {value:g} is outside of {low:g} to {high:g}; change --from and --to.")
-    if 0 < options.max_period < options.start_period:
-        problems.append(f"--start-period {options.start_period} is above --period {options.max_period}; raise that.")
     if options.start_period == 0 and not has_equilibria(model):
         problems.append(f"--start-period 0: {model.name} has no equilibria; its orbits have period 1 or more.")
-    if problems:
-        raise SpecError(problems)
+    return problems
 
 
 def _box_problems(model: Model, within: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -107,7 +106,7 @@ def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, fl
             at = "".join(f", {parameter_name(n)} {v:g}" for n, v in {name: value, **where}.items())
             lines.append(f"start{at}: Newton's method found {what} from there")
         else:
-            starts.append(Start(_family(there, own_period), near, value))
+            starts.append(Start(replace(there, period=own_period), near, value))
     return starts, lines
 
 
@@ -116,14 +115,8 @@ def _closed_near(family: Family, state: np.ndarray, period: int) -> tuple[np.nda
     if not period:
         found = find_equilibria(family.system, state[None], family.parameters, max_iterations=100)
         return (wrap_angles(found.states[0], family.system) if found.converged[0] else None), 0
-    orbits = search_orbits(
-        state[None], np.array([period]), family.frequency_hz, family.parameters, family.system, rounds=0
-    )
-    return (orbits[0].points[0], orbits[0].period) if orbits else (None, period)
-
-
-def _family(one: Family, period: int) -> Family:
-    return family_of(one.system, period, one.frequency_hz, one.parameters, one.free[0], one.scales[0])
+    orbit = orbit_near(state, period, family.frequency_hz, family.parameters, family.system)
+    return (None, period) if orbit is None else (orbit.points[0], orbit.period)
 
 
 # ---- all equilibria ----------------------------------------------------------------------------
@@ -142,7 +135,7 @@ class Counted:
     @property
     def starts(self) -> list[Start]:
         """The equilibria as starts of branches."""
-        return [Start(_family(self.family, 0), state, self.value) for state in self.states]
+        return [Start(replace(self.family, period=0), state, self.value) for state in self.states]
 
     @property
     def jacobians(self) -> np.ndarray:
@@ -207,10 +200,8 @@ def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any
     """
     if not counted:
         return {}
-    first = counted[0]
-    columns = {"value": [one.value for one in counted], **{d: [one.where[d] for one in counted] for d in first.where}}
-    units = {n: parameter_units(first.family.free[0] if n == "value" else n, model) for n in columns}
-    about = f"sum of the signs of det(-J); {expected_index(first.family.system)} for all equilibria of a bounded flow"
+    expected = expected_index(counted[0].family.system)
+    about = f"sum of the signs of det(-J); {expected} for all equilibria of a bounded flow"
     numbers = {
         "n_equilibria": ([len(one.states) for one in counted], "equilibria in the box"),
         "n_stable_equilibria": ([one.n_stable for one in counted], "stable equilibria in the box"),
@@ -218,10 +209,7 @@ def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any
     }
     codes = np.array([COUNTS.index(one.verdict) for one in counted], np.int8)
     return {
-        **{
-            f"box_{n}": ("box", values, {"units": units[n], "long_name": "where equilibria were counted"})
-            for n, values in columns.items()
-        },
+        **where_variables("box", counted, model),
         **{n: ("box", np.array(v, np.int32), {"units": "1", "long_name": told}) for n, (v, told) in numbers.items()},
         "box_verdict": ("box", codes, {"long_name": "whether the number is proved", **code_flags(COUNTS)}),
     }

@@ -73,8 +73,7 @@ def bifurcation_data(branches: xr.Dataset) -> tuple[list[Datum], list[np.ndarray
     data, states, chosen = [], [], []
     for e, value in enumerate(branches["value"].values):
         kind, period = words[int(branches["kind"].values[e])], int(periods[e])
-        # a fold of equilibria has equations of its own
-        if kind in FOLLOWED and (period > 0 or kind == HOPF):
+        if kind in FOLLOWED:
             one = np.ones(1)
             data.append(Datum(f"{kind} {e}", kind, float(value), period, 0, (PARAMETER,), one * value, one))
             states.append(np.append(branches["bifurcation_section"].values[e, 0], value))

@@ -21,6 +21,9 @@ CONTRADICTORY = "contradictory"
 WIDTH = 1e-8
 """Width to which a bifurcation is bracketed [arclength]; in its scale, the parameter changes by less."""
 
+SHORT = 1e-4
+"""Length of a step that is not made shorter where a test function nearly vanishes [arclength]."""
+
 CERTAIN = 1e-4
 """Distance of all multipliers from the unit circle, or of all scaled eigenvalues from the imaginary axis, above which
 their number outside is certain: where two meet, each errs by the root of the error of the matrix."""
@@ -29,7 +32,7 @@ SAME_PLACE = 1e-4
 """Largest scaled distance between two locations of one branch point: there Newton's method is as exact as the root of
 its residual."""
 
-BESIDE = (0.0, 1e-3, 0.3)
+SHIFTS = (0.0, 1e-3, 0.3)
 """Shifts, in units of `WIDTH`, of a guess that may be a branch point itself, where no tangent is unique."""
 
 Test = Callable[[Point], float]
@@ -141,6 +144,7 @@ class Watch:
     skip_first: bool = False
     found: list[Bifurcation] = field(default_factory=list)
     n_steps: int = 0
+    _last: Point | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
         """Locate the bifurcations between two successive points. Return False if the change of stability needs a
@@ -150,8 +154,11 @@ class Watch:
             self.n_steps += 1
             return True
         kinds = [kind for kind in TESTS if TESTS[kind](a) * TESTS[kind](b) < 0.0]
-        long = np.linalg.norm(b.u - a.u) > 100.0 * self.settings.shortest_step
+        step = float(np.linalg.norm(b.u - a.u))
+        long = step > 100.0 * self.settings.shortest_step
         if long and not _explains(kinds, n_unstable(b) - n_unstable(a)):
+            return False
+        if step > SHORT and BRANCHING not in kinds and self._turned_back(a, b, step):
             return False
         located = []
         for kind in kinds:
@@ -159,13 +166,25 @@ class Watch:
             if one is None and long:
                 return False
             if one is None:
-                one = yield from locate(self.problem, a, b, kind, self.settings, BESIDE)
+                one = yield from locate(self.problem, a, b, kind, self.settings, SHIFTS)
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
         self.found += tell_apart(located, a)
         self.n_steps += 1
+        self._last = a
         return True
+
+    def _turned_back(self, a: Point, b: Point, step: float) -> bool:
+        """Return whether the test function of branch points goes to 0 at a point, and away from it at the next.
+
+        Then the step may have left a branch that turns at a pitchfork for the one that passes straight through.
+        """
+        if self._last is None:
+            return False
+        before, here, there = (_branching_test(point) for point in (self._last, a, b))
+        ahead = here + (here - before) * step / float(np.linalg.norm(a.u - self._last.u))
+        return here * ahead < 0.0 < here * there
 
 
 def _explains(kinds: list[str], change: int) -> bool:
@@ -335,7 +354,7 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
-        if (one.kind == TORUS and not _is_torus(one)) or (one.kind == HOPF and not _is_pair(one)):
+        if (one.kind == TORUS and not has_torus(one.point)) or (one.kind == HOPF and not _is_pair(one)):
             continue
         if one.kind == FOLD and any(np.abs(one.point.u - u).max() < SAME_PLACE for u in branching):
             continue
@@ -343,11 +362,11 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     return sorted(kept, key=lambda one: float(a.tangent @ (one.point.u - a.u)))
 
 
-def _is_torus(one: Bifurcation) -> bool:
-    """Return whether a located zero is a torus bifurcation (complex multipliers), and not a neutral saddle (real
+def has_torus(point: Point) -> bool:
+    """Return whether a zero of the torus test is a bifurcation (complex multipliers), and not a neutral saddle (real
     multipliers).
     """
-    multipliers = multipliers_of(one.point)
+    multipliers = multipliers_of(point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)
 

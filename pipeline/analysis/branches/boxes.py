@@ -85,7 +85,7 @@ class Enclosed:
         return np.asarray(0.5 * (np.array(self.low) + np.array(self.high)))
 
 
-def enclose_equilibria(rates: Rates, box: Box, most: int = MOST_BOXES) -> Enclosed:
+def enclose_equilibria(rates: Rates, box: Box) -> Enclosed:
     """Enclose all equilibria of a box; parts in which they touch, or nearly do, stay undecided.
 
     Parameters
@@ -94,14 +94,12 @@ def enclose_equilibria(rates: Rates, box: Box, most: int = MOST_BOXES) -> Enclos
         Enclosures of rates and Jacobian; without an obstacle.
     box
         Box of states.
-    most
-        Most boxes that are looked at.
     """
     search = _Search(rates, box)
     turn = np.where(box.is_full, TURN, 0.0)
     pending = [((box.low - turn)[None], (box.high + turn)[None])]
     n_seen = 0
-    while pending and n_seen < most:
+    while pending and n_seen < MOST_BOXES:
         low, high = pending.pop()
         if len(low) > BATCH:
             pending.append((low[BATCH:], high[BATCH:]))

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from magpend_core.models.model import Model
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.bifurcations import n_unstable
+from pipeline.analysis.branches.equilibrium_curves import EquilibriumCurve
 from pipeline.analysis.branches.following import end_of_crossings, problem_of
-from pipeline.analysis.branches.kinds import HOPF
 from pipeline.analysis.branches.lockstep import Steps, run_together
-from pipeline.analysis.branches.problems import BifurcationProblem, Family, HopfProblem
+from pipeline.analysis.branches.problems import BifurcationProblem, Family
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 
 Array = NDArray[np.float64]
@@ -167,7 +167,10 @@ def _solved(table: OrbitData, datum: Datum, packed: Array, guess: Array, tangent
     value = float(packed[along.model.parameter_names.index(second)])
     family = replace(family, free=(along.parameter, second), scales=(family.scales[0], abs(value) or 1.0))
     u = family.unknowns(guess[:-1], [guess[-1], value])
-    problem = HopfProblem(family) if datum.kind == HOPF else BifurcationProblem(family, datum.kind)
+    problem: BifurcationProblem | EquilibriumCurve = BifurcationProblem(family, datum.kind)
+    if not datum.period:
+        problem = EquilibriumCurve(family, datum.kind)
+        u = problem.start(u)
     found = yield from correct(problem, u, np.append(np.zeros(len(u) - 1), 1.0), LOCATED)
     return found
 
@@ -187,7 +190,8 @@ def raw_of(table: OrbitData, datum: Datum, point: Point) -> Array:
     """Return section point and parameter value of a solution [SI]."""
     scales = np.asarray(table.along.model.system.scales)
     n = len(scales)
-    return np.append(point.u[:n] * scales, point.u[n] * (table.along.high - table.along.low))
+    value = point.u[n] if datum.kind == ORBIT else point.u[-2]
+    return np.append(point.u[:n] * scales, value * (table.along.high - table.along.low))
 
 
 def solution_of(table: OrbitData, packed: Array, points: Sequence[Point | None]) -> Solution:

@@ -9,6 +9,8 @@ those of power series (`magpend_core.jets`), so that no derivative is a differen
 point               normal form                                                                coefficients
 =================== ========================================================================== =======================
 cusp                w' = c w^3                                                                 c [1/s]
+degenerate          w' = quintic w^5                                                           quintic [1/s]
+pitchfork
 Bogdanov-Takens     w0' = w1, w1' = a w0^2 + b w0 w1, a > 0                                    a [1/s2], b [1/s]
 generalised Hopf    w' = i omega w + c1 w |w|^2 + c2 w |w|^4                                   lyapunov2 = Re c2 / omega
 zero-Hopf           x' = b x^2 + c |z|^2 + ..., z' = i omega z + d x z + e x^2 z, after a      s = sign(b c),
@@ -27,7 +29,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.jets import Monomials, monomials, rates_on
-from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import Family
 
 NO_TERM = 1e-9
@@ -54,6 +55,14 @@ class Rest:
         states = np.zeros((len(a), len(of.exponents)), complex)
         states[:, 1], states[:, 2] = a, b
         return self.rates(of, states)[:, of.position((1, 1))]
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve linear equations; NaN if the matrix is singular."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return np.full(len(right), np.nan)
 
 
 def null_vectors(matrix: np.ndarray, value: complex = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -141,6 +150,11 @@ def _carried(of: Monomials, states: np.ndarray, flow: np.ndarray) -> np.ndarray:
 def cusp(rest: Rest) -> dict[str, float]:
     """Return the cubic coefficient c of a cusp."""
     return {"c": normal_form(rest, [0j], 3)[0, (3,)].real}
+
+
+def degenerate_pitchfork(rest: Rest) -> dict[str, float]:
+    """Return the coefficient of the fifth degree of a pitchfork without a cubic term."""
+    return {"quintic": normal_form(rest, [0j], 5)[0, (5,)].real}
 
 
 def bogdanov_takens(rest: Rest) -> dict[str, float]:

@@ -44,8 +44,8 @@ CUSP, GENERALISED, CHENCINER = "cusp", "generalised_doubling", "chenciner"
 R1, R2, R3, R4 = "r1", "r2", "r3", "r4"
 FOLD_FLIP, FOLD_TORUS = "fold_flip", "fold_neimark_sacker"
 DOUBLING_TORUS, DOUBLE_TORUS = "doubling_neimark_sacker", "double_neimark_sacker"
-OF_EQUILIBRIA = BT, GENERALISED_HOPF, ZERO_HOPF, DOUBLE_HOPF = (
-    *("bogdanov_takens", "generalised_hopf", "zero_hopf", "double_hopf"),
+OF_EQUILIBRIA = BT, GENERALISED_HOPF, ZERO_HOPF, DOUBLE_HOPF, DEGENERATE = (
+    *("bogdanov_takens", "generalised_hopf", "zero_hopf", "double_hopf", "degenerate_pitchfork"),
 )
 """Points of codimension two on curves of equilibria, beside the cusp (see `equilibrium_curves`)."""
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.tabular import aligned, counted, words_of
+from pipeline.analysis.tabular import Row, aligned, counted, words_of
 from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.specification.tables import FREQUENCY
@@ -19,22 +21,27 @@ _VERDICTS = {
 }
 
 
+def _places(ds: xr.Dataset, dim: str) -> Iterator[tuple[xr.Dataset, Row]]:
+    """Yield the results of a search at each place, and the parameter values there as words."""
+    word = str(ds.attrs.get(RATE, FREQUENCY))
+    own = [n for n in map(str, ds.data_vars) if n.startswith(f"{dim}_") and n not in (f"{dim}_value", f"{dim}_verdict")]
+    axes = {f"{dim}_value": str(ds.attrs["parameter"]), **{n: n.removeprefix(f"{dim}_") for n in own}}
+    for k in range(ds.sizes[dim]):
+        one = ds.isel({dim: k})
+        yield one, {parameter_name(dims_in_own_words([d], word)[0]): f"{float(one[n]):.7g}" for n, d in axes.items()}
+
+
 def searched_lines(ds: xr.Dataset) -> list[str]:
     """Return text lines on the points at which all orbits were searched; none if there was no search."""
     if "searched_value" not in ds:
         return []
-    word = str(ds.attrs.get(RATE, FREQUENCY))
-    dims = {n: str(n).removeprefix("searched_") for n in ds.data_vars if str(n).startswith("searched_")}
-    dims["searched_value"] = str(ds.attrs["parameter"])
-    names = {n: parameter_name(dims_in_own_words([dim], word)[0]) for n, dim in dims.items()}
     rows = []
-    for k in range(ds.sizes["searched"]):
-        one = ds.isel(searched=k)
+    for one, where in _places(ds, "searched"):
         told = {words_of(ds["index_verdict"])[code] for code in one["index_verdict"].values.tolist()}
         counts = zip(ds["times"].values.tolist(), one["n_orbits"].values, one["index_sum"].values, strict=True)
         rows.append(
             {
-                **{name: f"{float(one[n]):.7g}" for n, name in names.items()},
+                **where,
                 **{f"period {p}": f"{n} ({total:+d})" for p, n, total in counts},
                 "coverage": f"{float(one['coverage']):.0%}" if np.isfinite(one["coverage"]) else "?",
                 "sum": _VERDICTS["missing" if "missing" in told else told.pop()],
@@ -57,20 +64,14 @@ def counted_lines(ds: xr.Dataset) -> list[str]:
     """Return text lines on the equilibria that were counted; none if there was no count."""
     if "box_verdict" not in ds:
         return []
-    axes = [str(n) for n in ds.data_vars if str(n).startswith("box_") and n not in ("box_verdict", "box_value")]
-    names = {"box_value": parameter_name(str(ds.attrs["parameter"]))}
-    names |= {n: parameter_name(n.removeprefix("box_")) for n in axes}
-    verdicts = words_of(ds["box_verdict"])
-    rows = []
-    for k in range(ds.sizes["box"]):
-        one = ds.isel(box=k)
-        rows.append(
-            {
-                **{told: f"{float(one[n]):.7g}" for n, told in names.items()},
-                "equilibria": str(int(one["n_equilibria"])),
-                "stable": str(int(one["n_stable_equilibria"])),
-                "sum of indices": f"{int(one['equilibria_index_sum']):+d}",
-                "their number": _NUMBERS[verdicts[int(one["box_verdict"])]],
-            }
-        )
+    rows = [
+        {
+            **where,
+            "equilibria": str(int(one["n_equilibria"])),
+            "stable": str(int(one["n_stable_equilibria"])),
+            "sum of indices": f"{int(one['equilibria_index_sum']):+d}",
+            "their number": _NUMBERS[words_of(ds["box_verdict"])[int(one["box_verdict"])]],
+        }
+        for one, where in _places(ds, "box")
+    ]
     return ["", f"all equilibria of the box, at {counted(len(rows), 'value')}", *aligned(rows)]

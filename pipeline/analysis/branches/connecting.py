@@ -103,33 +103,11 @@ class _Flood(Orbits):
     def __init__(self, grid: Grid, place: Array, orbits: list[Array]) -> None:
         super().__init__(grid, place, orbits)
         n = grid.system.n_states
+        numbers = "u end h shortest det det_before u_before gap sign limit reach end_at"
         walk: Any = [(k, "i8") for k in ("origin", "axis", "way", "period", "halvings", "stage", "tries")]
-        walk += [
-            (k, "f8")
-            for k in (
-                "u",
-                "end",
-                "h",
-                "shortest",
-                "det",
-                "det_before",
-                "u_before",
-                "gap",
-                "sign",
-                "limit",
-                "reach",
-                "end_at",
-            )
-        ]
-        walk += [
-            ("z", "f8", n),
-            ("slope", "f8", n),
-            ("half", "f8", n),
-            ("is_fold", "?"),
-            ("has_moved", "?"),
-            ("is_rough", "?"),
-            ("is_ending", "?"),
-        ]
+        walk += [(k, "f8") for k in numbers.split()]
+        walk += [(k, "f8", n) for k in ("z", "slope", "half")]
+        walk += [(k, "?") for k in ("is_fold", "has_moved", "is_rough", "is_ending")]
         self.walk: Any = np.zeros(0, walk)
 
     def run(self) -> None:

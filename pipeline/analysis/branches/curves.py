@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import multipliers_of
+from pipeline.analysis.branches.bifurcations import has_torus
+from pipeline.analysis.branches.center_manifold import null_vectors
 from pipeline.analysis.branches.codimension_two import (
     BT,
+    DEGENERATE,
     DOUBLE_HOPF,
     DOUBLING_TORUS,
     FOLD_FLIP,
@@ -29,8 +32,8 @@ from pipeline.analysis.branches.codimension_two import (
     SpecialPoint,
     merged,
 )
+from pipeline.analysis.branches.dataset import column, filled
 from pipeline.analysis.branches.equilibrium_curves import (
-    EQUILIBRIUM_KINDS,
     PERSISTS,
     EquilibriumCurve,
     EquilibriumDetector,
@@ -90,6 +93,11 @@ CURVE_ENDS = (
 GENERATIONS = 3
 """Number of generations of curves that spring from points of codimension two."""
 
+LOST = "Newton's method finds no curve through it"
+UNFOLDED = "the second parameter unfolds it: the branches come apart, and a fold may remain; it has no curve"
+OF_ORBITS = "branch points of periodic orbits are not continued, those of equilibria are"
+"""Reasons why a located point has no curve."""
+
 SPRINGING = {
     R1: ((FOLD, 1), (TORUS, 1)),
     R2: ((DOUBLING, 1), (TORUS, 1), (TORUS, 2)),
@@ -101,6 +109,7 @@ SPRINGING = {
     GENERALISED_HOPF: ((FOLD, 1),),
     ZERO_HOPF: ((FOLD, 0), (HOPF, 0), (TORUS, 1)),
     DOUBLE_HOPF: ((HOPF, 0), (TORUS, 1)),
+    DEGENERATE: ((FOLD, 0),),
 }
 """Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit; at
 equilibria 0 for equilibria, 1 for cycles."""
@@ -115,7 +124,7 @@ BESIDE = (0.02, 0.005)
 """Scaled distances from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins."""
 
 AMPLITUDES = (0.02, 0.05, 0.1)
-"""Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
+"""Scaled distances, tried in turn, of the first orbit of a curve from the point at which the curve begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +154,7 @@ def curves_from(
     bounds: Bounds,
     max_period: int,
     generations: int = GENERATIONS,
+    left_out: dict[int, str] | None = None,
 ) -> list[Curve]:
     """Continue the bifurcations located on branches as curves in the plane of the branches' parameter and a second one.
 
@@ -162,6 +172,8 @@ def curves_from(
         Longest period of the orbits; 0 takes the longest of the branches.
     generations
         Number of generations of curves that spring from points of codimension two.
+    left_out
+        Gets the number of each located point that has no curve, with the reason.
 
     Returns
     -------
@@ -169,10 +181,11 @@ def curves_from(
         Curves in the order of the located points they start from, none twice; then those of homoclinic orbits.
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
-    starts = _starts(branches, parameters, second, bounds, longest)
+    left_out = {} if left_out is None else left_out
+    starts = _starts(branches, parameters, second, bounds, longest, left_out)
     nodes = saddle_nodes_of(branches, parameters, second, bounds, longest)
     starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
-    found = continue_curves(starts, bounds, CURVE, longest, generations)
+    found = continue_curves(starts, bounds, CURVE, longest, generations, left_out)
     takens = [p for p in merged({i: c.special for i, c in enumerate(found)}) if p.kind == BT]
     beside = [loop_near(point, away) for point in takens for away in BESIDE]
     loops = loops_of(branches, parameters, second, bounds, longest) + [loop for loop in beside if loop is not None]
@@ -192,18 +205,22 @@ def continue_curves(
     settings: Settings = CURVE,
     max_period: int = 0,
     generations: int = GENERATIONS,
+    left_out: dict[int, str] | None = None,
 ) -> list[Curve]:
     """Follow each bifurcation in both directions in the parameter plane, until a bound, its own start or a resonance.
 
-    Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
+    Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`. Starts
+    without a curve go to `left_out`, with the reason.
     """
+    left_out = {} if left_out is None else left_out
     problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
     firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
+    left_out |= {s[0]: LOST for s, f in zip(starts, firsts, strict=True) if f is None}
     curves: list[Curve] = []
     seen: list[SpecialPoint] = []
     for _ in range(1 + generations):
-        _follow_all(ready, curves, bounds, settings)
+        _follow_all(ready, curves, bounds, settings, left_out)
         points = merged({i: curve.special for i, curve in enumerate(curves)})
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
@@ -226,7 +243,9 @@ Ready = tuple[int, CurveProblem, Point]
 """Number of a located point (-1: none), the problem of its curve, and the curve's first point."""
 
 
-def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
+def _follow_all(
+    ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings, left_out: dict[int, str]
+) -> None:
     """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
     ready = [r for r in ready if not any(_passes(curve, r[1], r[2]) for curve in curves)]
     traces = run_together(
@@ -235,6 +254,9 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
     for i, (number, problem, first) in enumerate(ready):
         (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
+        if not all(_persists(problem, point) for point in points):
+            left_out[number] = UNFOLDED
+            continue
         is_known = any(_passes(curve, problem, first) for curve in curves)
         if not is_known and (number >= 0 or len(points) > 2):
             ends = back.end, ahead.end
@@ -265,6 +287,9 @@ def _rest_sprung(problem: EquilibriumCurve, at: SpecialPoint) -> Steps[tuple[Cur
     own = 2.0 * np.pi / at.point.value.seconds
     omega = omegas[0] if len(omegas) == 1 else max(omegas, key=lambda one: abs(one - own))
     u = problem.start(at.point.u, omega)
+    if at.kind == DEGENERATE:
+        right, _ = null_vectors(at.family.scaled(at.point.value.monodromy))
+        return (yield from _first_beside(problem, u, right))
     if problem.kind == FOLD:
         value = yield Query(problem, u)
         problem = EquilibriumCurve(problem.family, kind_of_zero(problem.family, u, value))
@@ -277,14 +302,21 @@ def _cycles_sprung(
     problem: BifurcationProblem, at: SpecialPoint, omega: float
 ) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first small cycle on a curve of bifurcations of cycles that starts at a point of codimension two."""
-    family, n = problem.family, problem.family.system.n_states
-    direction = cycle_direction(family, at.point, omega)
+    n = problem.family.system.n_states
+    direction = cycle_direction(problem.family, at.point, omega)
     assert direction is not None
-    normal = np.append(direction, [0.0, 0.0])
+    return (yield from _first_beside(problem, np.concatenate([at.point.u[:n], at.point.u[-2:]]), direction))
+
+
+def _first_beside(
+    problem: CurveProblem, u: np.ndarray, direction: np.ndarray
+) -> Steps[tuple[CurveProblem, Point] | None]:
+    """Find a first point of a curve at some small distance from unknowns, along a direction of the states."""
+    normal = np.append(direction, np.zeros(len(u) - len(direction)))
     for amplitude in AMPLITUDES:
-        guess = np.concatenate([at.point.u[:n], at.point.u[-2:]]) + amplitude * normal
-        found = yield from correct(problem, guess, normal / np.linalg.norm(normal), CURVE)
-        if found is not None and not end_of_crossings(family, found):
+        guess = u + amplitude * normal
+        found = yield from correct(problem, guess, normal / np.linalg.norm(normal), _own(CURVE, problem))
+        if found is not None and not (problem.family.period and end_of_crossings(problem.family, found)):
             return problem, found
     return None
 
@@ -297,15 +329,12 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[CurveP
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
     _, q, _ = critical_vectors(at.family.scaled(at.point.value.monodromy), DOUBLING)
-    normal = np.append(q.real, [0.0, 0.0])
-    for amplitude in AMPLITUDES:
-        found = yield from correct(problem, at.point.u + amplitude * normal, normal, CURVE)
-        if found is not None:
-            return problem, found
-    return None
+    return (yield from _first_beside(problem, at.point.u, q.real))
 
 
-def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
+def _starts(
+    ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int, left_out: dict[int, str]
+) -> list[CurveStart]:
     """Select the located bifurcations to continue. Each comes with its family of orbits and its start in scaled
     unknowns.
     """
@@ -315,7 +344,10 @@ def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds,
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
-        if period > max_period or kind not in (TESTS if period else EQUILIBRIUM_KINDS):
+        if period > max_period:
+            continue
+        if period and kind not in TESTS:
+            left_out[k] = OF_ORBITS
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
@@ -334,7 +366,7 @@ def _own(settings: Settings, problem: CurveProblem) -> Settings:
 def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     value = yield Query(problem, u)
     found = (yield from correct(problem, u, kernel_of(value), _own(settings, problem))) if value.is_finite else None
-    if found is None or not _persists(problem, found):
+    if found is None:
         return None
     tangent = kernel_of(found.value)
     return replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))
@@ -362,7 +394,7 @@ def _follow(
         here = points[-1]
         if not is_inside(here.u):
             return "bound"
-        if problem.kind == TORUS and not _has_torus(here):
+        if problem.kind == TORUS and not has_torus(here):
             return "resonance"
         if problem.kind == HOPF and not np.isfinite(here.value.seconds):
             return BT
@@ -392,12 +424,6 @@ def _follow(
     if found.end in ("resonance", BT):
         found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
-
-
-def _has_torus(point: Point) -> bool:
-    multipliers = multipliers_of(point)
-    pairs = multipliers[multipliers.imag > 0.0]
-    return bool(len(pairs)) and bool(np.abs(np.abs(pairs) - 1.0).min() < 1e-4)
 
 
 def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
@@ -446,78 +472,76 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
         Tells names and units.
     """
     names = curves[0].family.system.state_names if curves else (model.state_names if model else ())
-    n = max((len(c.points) for c in curves), default=0)
-    values = np.full((len(curves), n, 2), np.nan)
-    section = np.full((len(curves), n, len(names)), np.nan)
-    residual = np.full((len(curves), n), np.nan)
-    quantity = np.full((len(curves), n), np.nan)
-    for i, curve in enumerate(curves):
-        values[i, : len(curve.points)] = curve.values
-        section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
-        residual[i, : len(curve.points)] = [p.residual for p in curve.points]
-        if curve.kind == HOMOCLINIC:
-            quantity[i, : len(curve.points)] = [saddle_quantity(p.value.monodromy) for p in curve.points]
-    dims = ("curve", "point")
-    one, units = {"units": "1"}, state_units(model)
-
-    def codes(i: int) -> np.ndarray:
-        return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
-
-    kinds = np.array([CURVE_KINDS.index(c.kind) for c in curves], np.int8)
-
-    def numbers(values: list[int]) -> np.ndarray:
-        return np.array(values, np.int32)
-
+    points = [((i, j), (c, point)) for i, c in enumerate(curves) for j, point in enumerate(c.points)]
+    shape = (len(curves), max((len(c.points) for c in curves), default=0))
+    units = [parameter_units(name, model) for name in (first, second)]
+    variables = filled(
+        ("curve", "point"),
+        shape,
+        points,
+        {"state": len(names)},
+        {
+            "first": ((), units[0], first, lambda c, point: c.family.values(point.u)[0]),
+            "second": ((), units[1], second, lambda c, point: c.family.values(point.u)[1]),
+            "section": (
+                ("state",),
+                state_units(model),
+                "a section point, or the saddle",
+                lambda c, point: c.family.state(point.u),
+            ),
+            "residual": ((), "1", "largest residual, test function included", lambda _, point: point.residual),
+            "saddle_quantity": (
+                (),
+                "1/s",
+                "sum of the leading eigenvalues of the saddle of a homoclinic orbit",
+                lambda c, point: saddle_quantity(point.value.monodromy) if c.kind == HOMOCLINIC else np.nan,
+            ),
+        },
+    )
+    ends = [[CURVE_ENDS.index(c.ends[i]) for c in curves] for i in (0, 1)]
+    kinds = [CURVE_KINDS.index(c.kind) for c in curves]
+    columns = {
+        "kind": column(kinds, "int8", "kind of bifurcation", **code_flags(CURVE_KINDS)),
+        "orbit_period": column([c.family.period for c in curves], "int32", "period, 0 for equilibria"),
+        "start": column([c.start for c in curves], "int32", "located point"),
+        "n_missed": column([c.n_missed for c in curves], "int32", "sign changes that could not be located"),
+        "n_points": column([len(c.points) for c in curves], "int32", "points of the curve"),
+        "first_end": column(ends[0], "int8", "why it begins", **code_flags(CURVE_ENDS)),
+        "last_end": column(ends[1], "int8", "why it ends", **code_flags(CURVE_ENDS)),
+    }
+    variables |= {name: ("curve", *own) for name, own in columns.items()}
     told = {} if model is None else {"model": model_attribute(model), **section_attributes(model.crossing)}
     return xr.Dataset(
-        {
-            "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
-            "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
-            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point, or the saddle"}),
-            "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
-            "saddle_quantity": (
-                dims,
-                quantity,
-                {"units": "1/s", "long_name": "sum of the leading eigenvalues of the saddle of a homoclinic orbit"},
-            ),
-            "kind": ("curve", kinds, {**one, **code_flags(CURVE_KINDS)}),
-            "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
-            "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
-            "n_missed": (
-                "curve",
-                numbers([c.n_missed for c in curves]),
-                {**one, "long_name": "sign changes that could not be located"},
-            ),
-            "n_points": ("curve", numbers([len(c.points) for c in curves]), one),
-            "first_end": ("curve", codes(0), {**one, **code_flags(CURVE_ENDS)}),
-            "last_end": ("curve", codes(1), {**one, **code_flags(CURVE_ENDS)}),
-            **_special_points(curves, first, second, model, len(names)),
-        },
+        variables | _special_points(curves, (first, second), units, state_units(model), len(names)),
         coords={"state": list(names)},
         attrs={"first_parameter": first, "second_parameter": second, **told},
     )
 
 
 def _special_points(
-    curves: Sequence[Curve], first: str, second: str, model: Model | None, n_states: int
-) -> dict[str, tuple[object, ...]]:
+    curves: Sequence[Curve], names: tuple[str, str], units: Sequence[str], states: str, n_states: int
+) -> dict[str, Any]:
     """Return the points of codimension two on all curves as dataset variables, each point once."""
     found = merged({i: curve.special for i, curve in enumerate(curves)})
-    values = np.array([one.values for one in found]).reshape(-1, 2)
-    brackets = np.array([one.bracket for one in found]).reshape(-1, 2)
-    section = np.array([one.family.state(one.point.u) for one in found]).reshape(-1, n_states)
-    one, kinds = {"units": "1"}, code_flags(POINT_KINDS)
-    variables: dict[str, tuple[object, ...]] = {
-        "special_kind": ("special", np.array([POINT_KINDS.index(p.kind) for p in found], np.int8), {**one, **kinds}),
-        "special_curve": ("special", np.array([p.curve for p in found], np.int32), one),
-        "special_period": ("special", np.array([p.family.period for p in found], np.int32), one),
-        "special_section": (("special", "state"), section, {"units": state_units(model)}),
+    kinds = [POINT_KINDS.index(one.kind) for one in found]
+    codes = {
+        "special_kind": column(kinds, "int8", "kind of point", **code_flags(POINT_KINDS)),
+        "special_curve": column([one.curve for one in found], "int32", "curve on which it was located"),
+        "special_period": column([one.family.period for one in found], "int32", "period, 0 for equilibria"),
     }
-    for name in sorted({name for p in found for name in p.coefficients}):
-        about = {"units": COEFFICIENTS[name], "long_name": f"normal form coefficient {name}"}
-        variables[f"special_{name}"] = ("special", np.array([p.coefficients.get(name, np.nan) for p in found]), about)
-    for i, (role, name) in enumerate((("first", first), ("second", second))):
-        units = {"units": parameter_units(name, model)}
-        variables[f"special_{role}"] = ("special", values[:, i], {**units, "long_name": name})
-        variables[f"special_{role}_error"] = ("special", brackets[:, i], {**units, "long_name": f"error of {name}"})
-    return variables
+    columns: dict[str, Any] = {
+        "special_section": (("state",), states, "a section point", lambda one: one.family.state(one.point.u))
+    }
+    for i, (role, name) in enumerate(zip(("first", "second"), names, strict=True)):
+        columns[f"special_{role}"] = ((), units[i], name, lambda one, i=i: one.values[i])
+        columns[f"special_{role}_error"] = ((), units[i], f"error of {name}", lambda one, i=i: one.bracket[i])
+    for name in sorted({name for one in found for name in one.coefficients}):
+        about = f"normal form coefficient {name}"
+        columns[f"special_{name}"] = (
+            *((), COEFFICIENTS[name], about),
+            lambda one, name=name: one.coefficients.get(name, np.nan),
+        )
+    items = [((k,), (one,)) for k, one in enumerate(found)]
+    return {name: ("special", *own) for name, own in codes.items()} | filled(
+        ("special",), (len(found),), items, {"state": n_states}, columns
+    )

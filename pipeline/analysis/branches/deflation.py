@@ -118,6 +118,14 @@ def search_orbits(
     return sorted(found, key=lambda one: (one.period, -one.n_hits))
 
 
+def orbit_near(
+    state: np.ndarray, period: int, frequency_hz: float, packed: np.ndarray, system: System
+) -> FoundOrbit | None:
+    """Return the orbit that Newton's method finds from a state, of a period or a part of it; None if it finds none."""
+    found = search_orbits(state[None], np.array([period]), frequency_hz, packed, system, rounds=0)
+    return found[0] if found else None
+
+
 def starts_around(
     section: np.ndarray, n: int, seed: int, system: System, reach: np.ndarray | None = None
 ) -> np.ndarray:
@@ -228,15 +236,19 @@ def add_orbits(
     polished = polish_orbits(np.tile(packed, (n, 1)), np.full(n, frequency_hz), states, periods, system=system)
     for row in np.flatnonzero(polished.converged):
         points = polished.points[row, : polished.orbit_period[row]]
-        place = next((k for k, one in enumerate(found) if _is_same(one, points, system)), -1)
+        place = place_of(found, points, system)
         if place < 0:
             found.append(FoundOrbit(points, polished.derivative[row], int(number == 0), number))
         elif number == 0:
             found[place] = replace(found[place], n_hits=found[place].n_hits + 1)
 
 
-def _is_same(one: FoundOrbit, points: np.ndarray, system: System) -> bool:
-    return one.period == len(points) and bool(scaled_distance(one.points, points[0], system).min() < SAME_ON_BRANCH)
+def place_of(found: Sequence[FoundOrbit], points: np.ndarray, system: System) -> int:
+    """Return the index of an orbit, given by its section points, among those that are known; -1 if it is not."""
+    for k, one in enumerate(found):
+        if one.period == len(points) and scaled_distance(one.points, points[0], system).min() < SAME_ON_BRANCH:
+            return k
+    return -1
 
 
 # ---- completeness ------------------------------------------------------------------------------

@@ -7,16 +7,21 @@ Govaerts, Numerical Methods for Bifurcations of Dynamical Equilibria, 2000).
 ============================ ========================= =======================================================
 point                        on curves of              test function
 ============================ ========================= =======================================================
-``cusp``                     folds                     <p, B(q, q)>
-``bogdanov_takens``          folds; Hopf points        <p, q>; kappa
+``cusp``                     folds, transcriticals     <p, B(q, q)>
+``degenerate_pitchfork``     pitchforks                cubic coefficient, times <p, q>
+``bogdanov_takens``          folds; branch points;     <p, q>; the same; kappa
+                             Hopf points
 ``generalised_hopf``         Hopf points               the first Lyapunov coefficient
-``zero_hopf``                folds; Hopf points        product of l_i + l_j of others; of others
+``zero_hopf``                folds, branch points;     product of l_i + l_j of others; of others
+                             Hopf points
 ``double_hopf``              Hopf points               product of l_i + l_j of others
 ============================ ========================= =======================================================
 
 A Hopf point is a pair of eigenvalues with the sum 0 and the product kappa, an unknown of its own. So the equations stay
 regular where another pair is imaginary (double Hopf), and where kappa, the square of the frequency, passes 0
 (Bogdanov-Takens); there the curve ends, since beyond it the pair is real. No test function is a difference quotient.
+Points where two curves of branch points cross, or where the critical eigenvalue has no slope along the first parameter,
+are not looked for.
 """
 
 from __future__ import annotations
@@ -32,23 +37,25 @@ from pipeline.analysis.branches.center_manifold import (
     Rest,
     bogdanov_takens,
     cusp,
+    degenerate_pitchfork,
     double_hopf,
     lyapunov,
     null_vectors,
+    solved,
     zero_hopf,
 )
 from pipeline.analysis.branches.codimension_two import (
     BT,
     CUSP,
+    DEGENERATE,
     DOUBLE_HOPF,
     GENERALISED_HOPF,
     ZERO_HOPF,
     Detector,
     SpecialPoint,
 )
-from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, PITCHFORK, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import FOLD, HOPF, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.normal_forms import solved
 from pipeline.analysis.branches.problems import (
     PARAMETER_STEP,
     STATE_STEP,
@@ -59,9 +66,6 @@ from pipeline.analysis.branches.problems import (
     Value,
     hopf_test,
 )
-
-EQUILIBRIUM_KINDS = (FOLD, HOPF, *BRANCH_POINTS)
-"""Kinds of bifurcations of equilibria that are followed in two parameters."""
 
 INNER = 1e-3
 """Step of the differences by the first parameter inside of the equations of a branch point, of fourth order."""
@@ -120,7 +124,9 @@ class EquilibriumCurve(FamilyProblem):
         if not (np.isfinite(rates).all() and np.isfinite(jacobian).all()):
             nothing = np.full((self.size - 1, self.size), np.nan)
             return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobian, is_rest=True)
-        right, left = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
+        vectors = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
+        # of either sign where the singular value is 0 but for rounding, which would turn the imperfection's
+        right, left = (v * np.copysign(1.0, v[np.argmax(np.abs(v))]) for v in vectors)
         steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
         found = np.array(
             [self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))]
@@ -214,18 +220,20 @@ class EquilibriumDetector(Detector):
     def _tests(self, point: Point, frame: _Vectors | None) -> Steps[tuple[_Vectors, dict[str, float]]]:  # type: ignore[override]
         rest = self._rest(point)
         vectors, kind = _Vectors.of(rest.matrix, frame), self.problem.kind
-        if kind == FOLD:
-            values = np.linalg.eigvals(rest.matrix)
-            others = np.delete(values, int(np.argmin(np.abs(values))))
-            bend = rest.second(vectors.right, vectors.right).real @ vectors.left
-            tests = {CUSP: float(bend), BT: float(vectors.left @ vectors.right), ZERO_HOPF: _pairs(others)}
-        elif kind == HOPF:
+        if kind == HOPF:
             kappa = float(point.u[len(rest.matrix)])
             others = self._others(point)
             tests = {BT: kappa, ZERO_HOPF: float(np.prod(others * self.problem.unit).real), DOUBLE_HOPF: _pairs(others)}
             tests[GENERALISED_HOPF] = lyapunov(rest, _omega(point))[0] if kappa > 0.0 else np.nan
         else:
-            tests = {}
+            values = np.linalg.eigvals(rest.matrix)
+            others = np.delete(values, int(np.argmin(np.abs(values))))
+            product = float(vectors.left @ vectors.right)
+            tests = {BT: product, ZERO_HOPF: _pairs(others)}
+            if kind == PITCHFORK:  # by symmetry B(q, q) has no part along p
+                tests[DEGENERATE] = cusp(rest)["c"] * product
+            else:
+                tests[CUSP] = float(rest.second(vectors.right, vectors.right).real @ vectors.left)
         return vectors, tests
         yield  # type: ignore[unreachable]  # a computation that asks for nothing
 
@@ -248,6 +256,8 @@ class EquilibriumDetector(Detector):
         point, rest, is_hopf = one.point, self._rest(one.point), self.problem.kind == HOPF
         if one.kind == CUSP:
             found = partial(cusp, rest)
+        elif one.kind == DEGENERATE:
+            found = partial(degenerate_pitchfork, rest)
         elif one.kind == BT:
             found = partial(bogdanov_takens, rest)
         elif one.kind == GENERALISED_HOPF:

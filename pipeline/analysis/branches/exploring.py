@@ -19,7 +19,7 @@ import numpy as np
 from magpend_core.orbits import crossed_state, section_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import SAME_PLACE, Bifurcation, settle_sides
+from pipeline.analysis.branches.bifurcations import SAME_PLACE, SHIFTS, TESTS, Bifurcation, locate, settle_sides
 from pipeline.analysis.branches.following import (
     Branch,
     Half,
@@ -33,9 +33,9 @@ from pipeline.analysis.branches.following import (
     problem_of,
 )
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF
-from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others
+from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others, shorter_orbit
 from pipeline.analysis.branches.limits import settle_limits
-from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.lockstep import Steps, run_alone, run_together
 from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 from pipeline.analysis.tolerances import BRANCH_RTOL
@@ -139,10 +139,8 @@ def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
 
 
 def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:
-    firsts = run_together(
-        [first_point(problem_of(s.family), s.family.unknowns(s.state, [s.value]), scope.settings) for s in starts]
-    )
-    pairs = [(s.family, p) for s, p in zip(starts, firsts, strict=True) if p is not None]
+    firsts = run_together([_first(start, scope.settings) for start in starts])
+    pairs = [pair for pair in firsts if pair is not None]
     halves = run_together(
         [
             half_branch(family, way, scope.low, scope.high, scope.settings)
@@ -152,7 +150,23 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
         what,
     )
     found = iter(joined(family, *halves[2 * i : 2 * i + 2]) for i, (family, _) in enumerate(pairs))
-    return [None if p is None else next(found) for p in firsts]
+    return [None if pair is None else next(found) for pair in firsts]
+
+
+def _first(start: Start, settings: Settings) -> Steps[tuple[Family, Point] | None]:
+    """Return the first point of a branch and the family of its least period; None if Newton's method fails.
+
+    At a period doubling a starting orbit of twice the period may be the single one but for its error.
+    """
+    family, u = start.family, start.unknowns
+    while True:
+        point = yield from first_point(problem_of(family), u, settings)
+        if point is None:
+            return None
+        shorter = shorter_orbit(family, point)
+        if shorter is None:
+            return family, point
+        family, u = shorter
 
 
 # ---- switching ---------------------------------------------------------------------------------
@@ -203,10 +217,9 @@ def _half_orbit(branch: Branch, which: int) -> Start:
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies."""
-    worse_above = (at.n_unstable_after > at.n_unstable_before) == at.rises_before
     reach = min(4, len(child.points))  # a branch that leaves the interval soon is short
     inner = child.points[reach - 1 if end == 0 else -reach]
-    return "supercritical" if (inner.u[-1] > at.point.u[-1]) == worse_above else "subcritical"
+    return _side_criticality(at, 1 if inner.u[-1] > at.point.u[-1] else -1)
 
 
 def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
@@ -526,7 +539,19 @@ def _move(one: Bifurcation, turning: Branch) -> None:
     one.after, one.child = place - 1, turning
     straight.bifurcations = sorted([*straight.bifurcations, one], key=lambda own: own.after)
     straight.origin, turning.origin = None, turning.origin or one
+    _relocate(one, straight, place)
     settle_sides(straight.points, straight.bifurcations)
+
+
+def _relocate(one: Bifurcation, branch: Branch, place: int) -> None:
+    """Locate a branch point again between the points of the branch that passes straight through it: on the branch that
+    turns there it is known to the root of its residual alone.
+    """
+    beside, test = branch.points[max(place - 1, 0) : place + 1], TESTS[BRANCHING]
+    if len(beside) == 2 and test(beside[0]) * test(beside[1]) < 0.0:
+        found = run_alone(locate(problem_of(branch.family), *beside, BRANCHING, Settings(), SHIFTS))
+        if found is not None:
+            one.point, one.bracket = found.point, found.bracket
 
 
 def _drop(one: Bifurcation, branch: Branch) -> None:
@@ -540,7 +565,7 @@ def _drop(one: Bifurcation, branch: Branch) -> None:
 
 
 def _side_criticality(at: Bifurcation, side: int) -> str:
-    """Decide whether a pitchfork is sub- or supercritical, from the side on which the branch that turns there lies."""
+    """Decide whether a bifurcation is sub- or supercritical, from the side of the branch that turns there."""
     if at.n_unstable_before == at.n_unstable_after:
         return ""
     worse = 1 if (at.n_unstable_after > at.n_unstable_before) == at.rises_before else -1

@@ -28,6 +28,10 @@ TANGENT = 0.01
 """A branch of cycles ends where the crossing speed times the period is below this distance [scales of the state
 that crosses]."""
 
+CROSSING_STEPS, NEAR_CROSSING = (1.0, 5.0, 25.0, 0.2, 0.04, 0.008), 5.0
+"""First steps from a branch point onto its second branch, in units of `first_step`, tried in turn, and the largest
+distance of the first orbit from the point, in units of the step."""
+
 REST = 0.5
 """At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""
 
@@ -263,10 +267,7 @@ def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
     """Return the start of the doubled branch at a period doubling: the same orbit traversed twice, with the new
     branch's tangent.
     """
-    double = Family(
-        family.system, 2 * family.period, family.frequency_hz, family.parameters, family.free, family.scales
-    )
-    value = yield Query(OrbitProblem(double), at.point.u)
+    value = yield Query(OrbitProblem(replace(family, period=2 * family.period)), at.point.u)
     if not value.is_finite:
         return None
     matrix = family.scaled(at.point.value.monodromy)
@@ -296,9 +297,10 @@ def crossing_half(
     level = kernel.T @ np.array([-kernel[1, -1], kernel[0, -1]])
     slanted = float(level @ normal)
     ways = ([level / slanted] if abs(slanted) > 0.1 * np.linalg.norm(level) else []) + [normal]
-    for step, direction in product(settings.first_step * np.array([1.0, 5.0, 25.0]), ways):
+    for step, direction in product(settings.first_step * np.array(CROSSING_STEPS), ways):
         first = yield from correct(problem, at.point.u + step * direction, normal, settings)
-        if first is not None:
+        # far away the plane meets the known branch again
+        if first is not None and np.linalg.norm(first.u - at.point.u) < NEAR_CROSSING * step:
             found = yield from half_branch(family, first, low, high, settings)
             found.trace.points.insert(0, start)
             for one in found.bifurcations:

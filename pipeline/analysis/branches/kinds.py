@@ -29,6 +29,7 @@ LABELS = {
     "generalised_hopf": "GH",
     "zero_hopf": "ZH",
     "double_hopf": "HH",
+    "degenerate_pitchfork": "DP",
     "neutral_saddle": "NSS",
     "saddle_node_homoclinic": "NCH",
 }
@@ -39,7 +40,7 @@ transcritical point is a branch point to both.
 """
 
 COEFFICIENTS = {
-    **{"a": "1/s2", "b": "1/s", "c": "1/s", "e": "1/s", "p11": "1/s", "p22": "1/s"},
+    **{"a": "1/s2", **dict.fromkeys(("b", "c", "e", "p11", "p22", "quintic"), "1/s")},
     **dict.fromkeys(("lyapunov2", "s", "theta", "delta"), "1"),
 }
 """Coefficients of the normal forms of equilibria at points of codimension two, with their units (`center_manifold`)."""

@@ -8,7 +8,7 @@ the orbit's parameter, leads to the same orbit, within what the residuals of the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from pipeline.analysis.tolerances import SAME_ON_BRANCH
 
 GUESS = 0.05
 """Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""
+
+INEXACT = 1e-12
+"""Error of the residual of an orbit [scaled]."""
 
 SAME_VALUE = 1e-12
 """Largest distance of two values of the parameter that are one but for rounding [scale of the parameter]."""
@@ -67,12 +70,25 @@ def _is_same(start: Start, polished: Point | None, point: Point) -> bool:
 
 
 def error_of(point: Point) -> float:
-    """Bound the distance of a point from the exact orbit by its residual: near a bifurcation it is the residual's
-    root.
+    """Bound the distance of a point from the exact orbit, by its residual and the derivative's least singular value.
+
+    Both vanish towards a bifurcation: at a distance x from the orbit as x^2 and 2 x near a fold, and as x^3 and 3 x^2
+    where branches cross symmetrically, as those of twice the period at a doubling.
     """
     least = float(np.linalg.svd(point.value.derivative[:, :-1], compute_uv=False)[-1])
-    residual = point.residual
-    return residual / max(least, np.sqrt(residual)) if residual > 0.0 else 0.0
+    residual = 3.0 * (point.residual + INEXACT)
+    return float(residual / max(least, residual ** (2.0 / 3.0)))
+
+
+def shorter_orbit(family: Family, point: Point) -> tuple[Family, np.ndarray] | None:
+    """Return the family and the unknowns of the orbit of a part of the period that a point is within its error; None if
+    there is none.
+    """
+    for period in (p for p in range(1, family.period) if family.period % p == 0):
+        away = np.array([family.mismatch(point.u, x) for x in point.value.images[period - 1 :: period]])
+        if np.abs(away).max() <= 3.0 * error_of(point):
+            return replace(family, period=period), point.u + np.append(away.mean(axis=0), 0.0)
+    return None
 
 
 def at_value(family: Family, guess: np.ndarray) -> Steps[Point | None]:

@@ -1,9 +1,9 @@
 """Compute normal form coefficients of bifurcations; their signs show whether the bifurcating orbits are stable.
 
-The coefficients need the second and third derivatives B and C of the section map (of the rates, for equilibria)
-along the critical eigenvectors. They are differences of its exact first derivative A at neighbours of the orbit.
-With A q = mu q, A^T p = conj(mu) p, |q| = 1, <p, q> = 1, all in scaled states (Kuznetsov, Elements of Applied
-Bifurcation Theory, 3rd ed., 2004, Sects. 5.4 and 9.1; for Hopf points Eq. 5.62):
+Of orbits the coefficients need the second and third derivatives B and C of the section map along the critical
+eigenvectors. They are differences of its exact first derivative A at neighbours of the orbit. With A q = mu q,
+A^T p = conj(mu) p, |q| = 1, <p, q> = 1, all in scaled states (Kuznetsov, Elements of Applied Bifurcation Theory, 3rd
+ed., 2004, Sects. 5.4 and 9.1):
 
 =============== ====================================================================================
 fold            <p, B(q, q)> / 2; it vanishes at a cusp
@@ -12,12 +12,12 @@ Neimark-Sacker  Re(conj(mu) <p, C(q, q, q') + 2 B(q, (1 - A)^-1 B(q, q')) + B(q'
                 negative: supercritical
 pitchfork       <p, C(q, q, q) - 3 B(q, (A - 1)^+ B(q, q))> / 6; negative: supercritical
 transcritical   <p, B(q, q)> / 2, which is 0 at a pitchfork
-Hopf point      Re <p, C(q, q, q') - 2 B(q, A^-1 B(q, q')) + B(q', (2 i w - A)^-1 B(q, q))> / (2 w), the first
-                Lyapunov coefficient [1/s]; negative: supercritical
 =============== ====================================================================================
 
 q' is the conjugate of q, and ^+ the inverse on the complement of q. Each coefficient is computed with steps of
-many sizes. The one that changes least from size to size is taken; the change is its error.
+many sizes. The one that changes least from size to size is taken; the change is its error. Those of equilibria are
+coefficients of the flow on the centre manifold (`center_manifold`), of a Hopf point the first Lyapunov coefficient;
+negative: supercritical.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.engine.system import System
-from magpend_core.pointwise import jacobian_at
-from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
+from pipeline.analysis.branches.bifurcations import CONTRADICTORY, WIDTH, Bifurcation
+from pipeline.analysis.branches.center_manifold import Rest, lyapunov, normal_form, null_vectors, solved
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import Ends, Family, Rows, Value
@@ -84,14 +84,14 @@ class Case:
         """Return scaled unknowns displaced along the critical eigenvector to both sides, as points for finite
         differences.
         """
-        parts = [self.q.real, self.q.imag] if self.kind in (TORUS, HOPF) else [self.q.real]
+        parts = [self.q.real, self.q.imag] if self.kind == TORUS else [self.q.real]
         shifts = np.concatenate([np.outer(sign * self.steps, part) for part in parts for sign in (1.0, -1.0)])
         return np.asarray(self.u + np.pad(shifts, ((0, 0), (0, len(self.u) - len(self.q)))))
 
     def coefficients(self, form: Form, neighbours: np.ndarray) -> np.ndarray:
         """Compute a normal form coefficient by finite differences, for each step size except the largest.
 
-        `neighbours` are the derivatives of the map, or Jacobians, at `self.neighbours()`, unscaled.
+        `neighbours` are the derivatives of the map at `self.neighbours()`, unscaled.
         """
         scaled = np.array([self.family.scaled(one) for one in neighbours])
         parts = np.split(scaled, len(scaled) // (2 * len(self.steps)))
@@ -104,17 +104,38 @@ def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
     """Compute the normal form coefficients of bifurcations. Store in them their criticality and the kinds of branch
     points.
     """
-    cases = [Case(family, one.kind, one.point.u, one.point.value.monodromy) for family, one in bifurcations]
-    for (_, one), case, matrices in zip(bifurcations, cases, _matrices(cases), strict=True):
+    for family, one in bifurcations:
+        if not family.period:
+            _judge_rest(family, one)
+    ones = [(family, one) for family, one in bifurcations if family.period]
+    cases = [Case(family, one.kind, one.point.u, one.point.value.monodromy) for family, one in ones]
+    for (_, one), case, matrices in zip(ones, cases, _matrices(cases), strict=True):
         if one.kind == BRANCHING:
-            _tell_branch_point(one, case, matrices)
+            forms = (settled(case.coefficients(form, matrices)) for form in (_quadratic, _cubic, _size))
+            (square, error, _), (cubic, cubic_error, _), (size, *_) = forms
+            _tell_branch_point(one, (square, error), (cubic, cubic_error), size)
         else:
-            _judge(one, case, matrices)
+            one.coefficient, one.coefficient_error, _ = settled(case.coefficients(FORMS[one.kind], matrices))
+            _judge_sign(one)
 
 
-def _judge(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
-    one.coefficient, one.coefficient_error, _ = settled(case.coefficients(FORMS[one.kind], matrices))
-    _judge_sign(one)
+def _judge_rest(family: Family, one: Bifurcation) -> None:
+    """Compute the coefficients at an equilibrium by power series, whose error is that of rounding."""
+    rest = Rest(family, one.point.u, family.scaled(one.point.value.monodromy))
+    one.coefficient_error = 0.0
+    if one.kind == HOPF:
+        (one.coefficient,) = lyapunov(rest, one.critical_multiplier.imag)
+        _judge_sign(one)
+        return
+    found = normal_form(rest, [0j], 3)
+    square, cubic = (found[0, (degree,)].real for degree in (2, 3))
+    if one.kind == FOLD:
+        one.coefficient = square
+        return
+    right, left = null_vectors(rest.matrix)
+    bends = [rest.second(right, along).real for along in np.eye(len(right))]
+    size = 0.5 * float(np.linalg.norm(bends) / max(abs(left @ right), np.finfo(float).tiny))
+    _tell_branch_point(one, (square, 0.0), (cubic, 0.0), size)
 
 
 def _judge_sign(one: Bifurcation) -> None:
@@ -125,31 +146,29 @@ def _judge_sign(one: Bifurcation) -> None:
         one.criticality = CONTRADICTORY if one.criticality not in ("", found) else found
 
 
-def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
-    square, error, _ = settled(case.coefficients(_quadratic, matrices))
-    size, _, _ = settled(case.coefficients(_size, matrices))
+def _tell_branch_point(one: Bifurcation, square: tuple[float, float], cubic: tuple[float, float], size: float) -> None:
+    """Tell a pitchfork from a transcritical point by the quadratic coefficient, in units of its bound `size`; both
+    coefficients come with their errors.
+    """
     by_arms, one.criticality = one.criticality, ""
-    if not np.isfinite(square + size):
+    if not np.isfinite(square[0] + size):
         return
-    if abs(square) > max(SAME * size, 3.0 * error):
-        one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square, error
-    elif error <= SAME * size:
-        one.kind = PITCHFORK
-        one.coefficient, one.coefficient_error, _ = settled(case.coefficients(_cubic, matrices))
-        one.criticality = by_arms
+    # from where the point was located to where it is
+    error = square[1] + 3.0 * float(np.nan_to_num(abs(cubic[0]))) * WIDTH
+    if abs(square[0]) > max(SAME * size, 3.0 * error):
+        one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square[0], error
+    elif error <= SAME * size or by_arms:
+        one.kind, one.criticality = PITCHFORK, by_arms
+        one.coefficient, one.coefficient_error = cubic
         _judge_sign(one)
 
 
 def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
-    """Compute, for each bifurcation, the monodromy matrices or Jacobians at states near the orbit."""
+    """Compute, for each bifurcation, the monodromy matrices at states near the orbit."""
     found: dict[int, np.ndarray] = {}
     by_system: dict[str, list[int]] = {}
     for i, case in enumerate(cases):
-        if case.family.period:
-            by_system.setdefault(case.family.system.label, []).append(i)
-        else:
-            rows = case.family.rows(case.neighbours())
-            found[i] = jacobian_at(case.family.system, rows.states, rows.parameters[0])
+        by_system.setdefault(case.family.system.label, []).append(i)
     for chosen in by_system.values():
         ends = integrated([cases[i].family.rows(cases[i].neighbours()) for i in chosen], cases[chosen[0]].family.system)
         found |= {i: one.monodromy for i, one in zip(chosen, ends, strict=True)}
@@ -188,20 +207,14 @@ class CoefficientProblem:
 
 
 def critical_vectors(matrix: np.ndarray, kind: str) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return the critical multiplier or eigenvalue of a matrix, its eigenvector q, and the adjoint eigenvector p with
-    <p, q> = 1.
-    """
+    """Return the critical multiplier of a matrix, its eigenvector q, and the adjoint eigenvector p with <p, q> = 1."""
     values, vectors = np.linalg.eig(matrix)
     upper = np.where(values.imag > 0.0, 0.0, np.inf)
-    away = {
-        TORUS: np.abs(np.abs(values) - 1.0) + upper,
-        HOPF: np.abs(values.real) + upper,
-        DOUBLING: np.abs(values + 1.0),
-    }.get(kind, np.abs(values - 1.0))
+    away = {TORUS: np.abs(np.abs(values) - 1.0) + upper, DOUBLING: np.abs(values + 1.0)}.get(kind, np.abs(values - 1.0))
     k = int(np.argmin(away))
     left_values, left = np.linalg.eig(matrix.T)
     q, p = vectors[:, k], left[:, int(np.argmin(np.abs(left_values - values[k].conj())))]
-    if kind not in (TORUS, HOPF):
+    if kind != TORUS:
         q, p = q.real.astype(complex), p.real.astype(complex)
     q = q / np.linalg.norm(q)
     with np.errstate(divide="ignore", invalid="ignore"):  # at R1 and R2 p is normal to q
@@ -235,14 +248,6 @@ Form = Callable[[Case, Sequence[Bend]], float]
 """Computes a coefficient from the derivatives along the real and, if it is complex, imaginary part of q."""
 
 
-def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve linear equations; NaN if the matrix is singular."""
-    try:
-        return np.asarray(np.linalg.solve(matrix, right))
-    except np.linalg.LinAlgError:
-        return np.full(len(right), np.nan)
-
-
 def _quadratic(case: Case, bends: Sequence[Bend]) -> float:
     (bend,) = bends
     return float(0.5 * np.vdot(case.p, bend.first @ case.q).real)
@@ -270,15 +275,10 @@ def _cubic(case: Case, bends: Sequence[Bend]) -> float:
     return float(np.vdot(case.p, bend.second @ case.q - 3.0 * bend.first @ inner).real / 6.0)
 
 
-def _complex_parts(case: Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives B(q, .), B(conj(q), .) and C(q, q, conj(q)) of the map for a complex eigenvector q."""
-    real, imag = bends
-    along, against = real.first + 1j * imag.first, real.first - 1j * imag.first
-    return along, against, (real.second + imag.second) @ case.q
-
-
 def _torus(case: Case, bends: Sequence[Bend]) -> float:
-    along, against, third = _complex_parts(case, bends)
+    real, imag = bends
+    along, against = real.first + 1j * imag.first, real.first - 1j * imag.first  # B(q, .), B(conj(q), .)
+    third = (real.second + imag.second) @ case.q
     one, mu, q = np.eye(len(case.q)), case.critical, case.q
     mean = solved(one - case.matrix, along @ q.conj())
     double = solved(mu * mu * one - case.matrix, along @ q)
@@ -286,16 +286,7 @@ def _torus(case: Case, bends: Sequence[Bend]) -> float:
     return float((np.conj(mu) * np.vdot(case.p, total)).real / 2.0)
 
 
-def _hopf(case: Case, bends: Sequence[Bend]) -> float:
-    along, against, third = _complex_parts(case, bends)
-    one, omega, q = np.eye(len(case.q)), case.critical.imag, case.q
-    mean = solved(case.matrix.astype(complex), along @ q.conj())
-    double = solved(2j * omega * one - case.matrix, along @ q)
-    total = third - 2.0 * along @ mean + against @ double
-    return float(np.vdot(case.p, total).real / (2.0 * omega))
-
-
-FORMS: dict[str, Form] = {FOLD: _quadratic, DOUBLING: _doubling, TORUS: _torus, HOPF: _hopf}
+FORMS: dict[str, Form] = {FOLD: _quadratic, DOUBLING: _doubling, TORUS: _torus}
 
 _SUPERCRITICAL = {DOUBLING: 1.0, TORUS: -1.0, HOPF: -1.0, PITCHFORK: -1.0}
 """Sign of the coefficient at a supercritical bifurcation."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
+from pipeline.analysis.branches.asked import start_problems
 from pipeline.analysis.branches.deflation import (
     FoundOrbit,
     coverage,
     expected_index,
     index_sums,
+    orbit_near,
+    place_of,
     search_orbits,
     starts_around,
 )
@@ -31,11 +35,17 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.products.branches import OrbitOptions
 from pipeline.products.product import Table
+from pipeline.specification.problems import SpecError
 
 
 def needs_point(run: OpenRun, options: OrbitOptions) -> None:
-    """Raise ValueError unless the options choose exactly one parameter point."""
+    """Raise ValueError unless the options choose exactly one parameter point, and --start names all states."""
     point_of(run.cube(), options)
+    problems = start_problems(run.model, options)
+    if options.start and not options.start_period:
+        problems = ["--start-period 0: this analysis takes orbits; give their period, 1 or more."]
+    if problems:
+        raise SpecError(problems)
 
 
 def point_of(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
@@ -45,7 +55,9 @@ def point_of(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
 
 
 def orbits(run: OpenRun, options: OrbitOptions) -> xr.Dataset:
-    """Search for all periodic orbits, stable or not, up to a given period at one parameter point."""
+    """Search for all periodic orbits, stable or not, up to a given period at one parameter point, and for that near
+    --start.
+    """
     cube = run.cube()
     point, base = point_of(cube, options), parameters_of(cube)
     frequency, packed = parameters_at(point, base)
@@ -60,12 +72,19 @@ def orbits(run: OpenRun, options: OrbitOptions) -> xr.Dataset:
         system,
         rounds=options.rounds,
     )
-    return _dataset(found, system, options, point)
+    asked = None
+    if options.start:
+        state = np.array([options.start[name] for name in system.state_names])
+        asked = orbit_near(state, options.start_period, frequency, packed, system)
+    if asked is not None and place_of(found, asked.points, system) < 0:
+        found.append(replace(asked, n_hits=0))  # no random start led to it
+    place = -1 if asked is None else place_of(found, asked.points, system)
+    return _dataset(found, system, options, point).assign_attrs({"start_orbit": place} if options.start else {})
 
 
 def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, point: xr.Dataset) -> xr.Dataset:
     model = model_of(point)
-    section = np.full((len(found), options.max_period, system.n_states), np.nan)
+    section = np.full((len(found), max([options.max_period, *(o.period for o in found)]), system.n_states), np.nan)
     multipliers = np.full((len(found), system.n_states), np.nan, np.complex128)
     for i, one in enumerate(found):
         section[i, : one.period] = one.points
@@ -105,11 +124,19 @@ def orbits_table(ds: xr.Dataset) -> Table:
     rows = [_row(ds.isel(orbit=i)) for i in range(ds.sizes["orbit"])]
     lines = [f"{counted(len(rows), 'orbit')} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]
     lines += [*aligned([_words(row) for row in rows], ""), ""]
+    if "start_orbit" in ds.attrs:
+        lines.append(_start_line(rows, int(ds.attrs["start_orbit"])))
     if np.isfinite(ds.attrs["coverage"]):
         lines.append(f"coverage: {100.0 * ds.attrs['coverage']:.1f} % of the starts lead to one of them (estimate)")
     if "expected_index_sum" in ds.attrs:
         lines += _index_lines(ds, int(ds.attrs["expected_index_sum"]))
     return Table(rows, lines, "" if rows else "no periodic orbit was found; try more --starts.")
+
+
+def _start_line(rows: list[Row], place: int) -> str:
+    if place < 0:
+        return "--start: Newton's method found no orbit from there; try another state, or another --start-period"
+    return f"--start: leads to orbit {place + 1} of the table, of period {rows[place]['period']}"
 
 
 def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:

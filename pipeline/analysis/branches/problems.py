@@ -405,32 +405,6 @@ class EquilibriumProblem(FamilyProblem):
         return self._unit
 
 
-@dataclass(frozen=True, eq=False)
-class HopfProblem(FamilyProblem):
-    """Equations for equilibria at a Hopf point, with two free parameters: the rates and `hopf_test` are zero."""
-
-    n_free = 2
-    family: Family
-
-    def rows(self, u: np.ndarray) -> Rows:
-        """Return no trajectories to integrate: the equations for equilibria need none."""
-        return self.family.rows(u[None][:0])
-
-    def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the scaled rates and the Hopf test function, and their derivatives by central differences."""
-        n, scales = self.family.system.n_states, np.asarray(self.system.scales)
-        steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
-        rows = self.family.rows(np.concatenate([u[None], u + np.diag(steps), u - np.diag(steps)]))
-        at = list(zip(rows.states[:, None], rows.parameters, strict=True))
-        jacobians = [jacobian_at(self.system, state, p)[0] for state, p in at]
-        norm = float(np.linalg.norm(self.family.scaled(jacobians[0]))) or 1.0
-        tests = np.array([hopf_test(j) if np.isfinite(j).all() else np.nan for j in jacobians])
-        rates = np.array([rates_at(self.system, state, p)[0] for state, p in at]) / scales / norm
-        both = np.column_stack([rates, tests])
-        derivative = (both[1 : 1 + self.size] - both[1 + self.size :]).T / (2.0 * steps)
-        return Value(both[0], derivative, rows.states[:1], jacobians[0], is_rest=True)
-
-
 OneParameter = OrbitProblem | EquilibriumProblem
 """The problems with one free parameter, whose solutions are branches."""
 

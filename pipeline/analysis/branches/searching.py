@@ -83,15 +83,7 @@ class Place:
 
     def starts(self) -> list[Start]:
         """Return the orbits found as starts of branches."""
-        own = self.family
-        return [
-            Start(
-                family_of(own.system, one.period, own.frequency_hz, own.parameters, own.free[0], own.scales[0]),
-                one.points[0],
-                self.value,
-            )
-            for one in self.found
-        ]
+        return [Start(replace(self.family, period=one.period), one.points[0], self.value) for one in self.found]
 
     def add_branches(self, branches: Sequence[Branch], longest: int) -> None:
         """Add the orbits of branches that pass this point, up to a longest period."""
@@ -180,6 +172,16 @@ def _hindrance(cells: xr.Dataset, parameters: Parameters) -> str:
     return "unfinished" if np.isin(status, (PENDING, *FAILED)).any() else ""
 
 
+def where_variables(dim: str, places: Sequence[Any], model: Model) -> dict[str, Any]:
+    """Return variables of the parameter's value (``..._value``) at some places, and of those of other axes."""
+    columns = {"value": [p.value for p in places], **{d: [p.where[d] for p in places] for d in places[0].where}}
+    units = {name: parameter_units(places[0].family.free[0] if name == "value" else name, model) for name in columns}
+    return {
+        f"{dim}_{name}": (dim, values, {"units": units[name], "long_name": "where it was searched"})
+        for name, values in columns.items()
+    }
+
+
 def searched_variables(
     places: Sequence[Place], branches: Sequence[Branch], periods: np.ndarray, model: Model
 ) -> dict[str, Any]:
@@ -197,15 +199,10 @@ def searched_variables(
     counts = [[sum(one.period == p for one in place.found) for p in periods.tolist()] for place in places]
     sums = [list(index_sums(place.found, int(periods[-1])).values()) for place in places]
     codes = [[VERDICTS.index(verdict) for verdict in place.verdicts(periods)] for place in places]
-    columns = {"value": [p.value for p in places], **{d: [p.where[d] for p in places] for d in places[0].where}}
-    units = {name: parameter_units(places[0].family.free[0] if name == "value" else name, model) for name in columns}
     about = f"whether the indices add up to {expected_index(places[0].system)}"
     both = ("searched", "times")
     return {
-        **{
-            f"searched_{name}": ("searched", values, {"units": units[name], "long_name": "where orbits were searched"})
-            for name, values in columns.items()
-        },
+        **where_variables("searched", places, model),
         "coverage": ("searched", [p.coverage for p in places], {"units": "1", "long_name": "share of starts"}),
         "n_orbits": (both, np.array(counts, np.int32), {"units": "1", "long_name": "orbits of this least period"}),
         "index_sum": (both, np.array(sums, np.int32), {"units": "1", "long_name": "sum of the fixed-point indices"}),

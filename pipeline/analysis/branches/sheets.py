@@ -151,7 +151,8 @@ class Orbits:
             own = rows < m
             images[rows[own], : ends.images.shape[1]] = ends.images[own] / self.scales
         one_minus = np.eye(n) - derivatives[:m] * self.scales / self.scales[:, None]
-        det, sign = np.linalg.det(one_minus), np.sign(np.linalg.det(2.0 * np.eye(n) - one_minus))
+        with np.errstate(invalid="ignore", over="ignore"):  # a trajectory that diverged has no derivative
+            det, sign = np.linalg.det(one_minus), np.sign(np.linalg.det(2.0 * np.eye(n) - one_minus))
         one_minus[det == 0.0] = np.nan
         right = np.full((m, n, 1 + len(wanted)), np.nan)
         right[:, :, 0] = self._difference(last[:m], states[:m])

@@ -17,7 +17,7 @@ from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.ragged import points_of_rows
 from pipeline.analysis.tabular import sets_of
 from pipeline.analysis.tolerances import RECURRENCE
-from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
+from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, split_dims
 
 TRIES = 16
 """Most recurrences tried per period."""
@@ -140,16 +140,6 @@ def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
     return float(packed[family.system.parameter_names.index(name)])
 
 
-def _dims(ds: xr.Dataset) -> list[str]:
-    return [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
-
-
-def _points(ds: xr.Dataset) -> list[xr.Dataset]:
-    dims = _dims(ds)
-    indices = np.ndindex(*(ds.sizes[d] for d in dims))
-    return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]
-
-
 def parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
     """Return the frequency [Hz] and the packed parameters at one parameter point of a run's result cube."""
     axes = {n: float(point.coords[n]) for n in base.names if n in point.coords and not point.coords[n].dims}
@@ -183,8 +173,10 @@ def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: f
     """
     system = parameters.model.system
     starts = []
-    for point in _points(cube):
-        dims = [d for d in point["status"].dims if is_start_dim(str(d))]
+    axes, _ = split_dims(cube["status"])
+    for index in np.ndindex(*(cube.sizes[d] for d in axes)):
+        point = cube.isel(dict(zip(axes, index, strict=True)))
+        dims = point["status"].dims
         section = point["section"].transpose(*dims, "period_index", "state").values
         section = section.reshape(-1, *section.shape[len(dims) :])[point["status"].values.ravel() == BOUNDED]
         if not len(section):

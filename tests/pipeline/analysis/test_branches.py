@@ -23,6 +23,7 @@ from pipeline.analysis.branches.lockstep import Query, run_alone, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem, Value, doubling_test, fold_test, torus_test
 from pipeline.analysis.branches.starting_orbits import orbits_near
 from tests.core.cells import run_cells, scipy_end, stroboscopic_map
+from tests.core.flows import model_of
 
 DUFFING, VAN_DER_POL = load_model("duffing").system, load_model("forced-van-der-pol").system
 
@@ -275,6 +276,42 @@ def test_explore__symmetry_breaking():
         assert pitchfork.child is not None
         ends = [orbits.values(pitchfork.child.points[i].u)[0] for i in (0, -1)]
         assert ends == pytest.approx([2.5, 2.5])  # the symmetric branch ends at 0.1
+
+
+@pytest.mark.slow
+def test_explore__pitchforks_of_a_doubled_orbit():
+    """The damped Meissner equation with a cubic spring: x(t + T) = -x(t), until the multiplier +1 of one period."""
+    equations = {"x": "v", "v": "-c*v - (d + 0.5*sign(cos(2*pi*f*t)))*x - x**3"}
+    model = model_of(equations, {"c": 0.1, "d": 0.3})
+    frequency, parameters = 1.0 / (2.0 * np.pi), model.load().pack()
+    reached, _ = stroboscopic_map(
+        parameters[None], np.array([frequency]), np.array([[0.5, 0.1]]), 400, system=model.system
+    )
+    orbits = family(frequency, parameters, "d", 0.3, period=2, system=model.system)
+    scope = Scope(0.05, 0.35, max_period=2, max_generations=0)
+    (branch,) = explore([Start(orbits, reached[0, -1], 0.3)], scope)
+    rows = table_of(dataset_of([branch], "d", None))
+    assert [row["type"] for row in rows] == ["pitchfork", "pitchfork"]
+    assert [(row["unstable_below"], row["unstable_above"]) for row in rows] == [("0", "1"), ("1", "0")]
+
+    def broken(unknowns):
+        z = np.append(unknowns[:2], [1.0, 0.0, 0.0, 1.0])
+        for sign, quarters in ((1.0, 1.0), (-1.0, 2.0), (1.0, 1.0)):
+            stiffness = unknowns[2] + 0.5 * sign
+
+            def rates(t, z, k=stiffness):
+                m = np.reshape(z[2:], (2, 2))
+                return [z[1], -0.1 * z[1] - k * z[0] - z[0] ** 3, *m[1], *(-(k + 3.0 * z[0] ** 2) * m[0] - 0.1 * m[1])]
+
+            z = scipy_end(rates, z, quarters * np.pi / 2.0)
+        return [*(z[:2] + unknowns[:2]), fold_test(z[2:].reshape(2, 2))]
+
+    for one, value in zip(
+        sorted(branch.bifurcations, key=lambda b: b.point.u[-1]), (0.0878658, 0.1839501), strict=True
+    ):
+        found = fsolve(broken, np.append(orbits.state(one.point.u), value), xtol=1e-13)
+        assert orbits.values(one.point.u)[0] == pytest.approx(found[2], abs=1e-8)
+        assert found[2] == pytest.approx(value, abs=6e-8)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from scipy.optimize import brentq, fsolve
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import curves_table
-from pipeline.analysis.branches.curves import continue_curves, curves_dataset
+from pipeline.analysis.branches.curves import UNFOLDED, continue_curves, curves_dataset
 from pipeline.analysis.branches.equilibrium_curves import EquilibriumCurve
 from pipeline.analysis.branches.problems import Family
 from tests.core.flows import model_of
@@ -198,6 +198,51 @@ def test_branch_points(rate, kind):
     assert continue_curves([(0, other, kind, start)], ((-1.0, 1.0), (-1.0, 1.0))) == []
 
 
+def test_branch_points__double_zero():
+    """x'' = p x + q x' - x^3 - 2 x^2 x': pitchforks at p = 0, Hopf points at q = 0 > p."""
+    model = disguised({"x": "y", "y": "p*x + q*y - x^3 - 2*x^2*y", "z": "-z + x^2"}, {"p": 0.0, "q": 0.0})
+    curves = curves_of(model, "pitchfork", bent([0, 0, 0]), [0.0, -0.5], generations=1)
+    assert sorted(c.kind for c in curves) == ["hopf", "pitchfork"]
+    p, q = on(curves, "hopf").T
+    np.testing.assert_allclose(q, 0.0, atol=1e-9)
+    assert p.min() < -0.9
+    row = only(curves, "bogdanov_takens")
+    np.testing.assert_allclose([row["p"], row["q"]], 0.0, atol=1e-8)
+
+
+def test_branch_points__without_a_quadratic_or_cubic_term():
+    """x' = p x + q x^2 - 1.3 x^3 has a cusp; x' = p x + q x^3 - .6 x^5, where folds with q^2 = -2.4 p begin."""
+    model = disguised({"x": "p*x + q*x^2 - 13*x^3/10", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
+    curves = curves_of(model, "transcritical", bent([0, 0]), [0.0, -0.5], generations=0)
+    row = only(curves, "cusp")
+    np.testing.assert_allclose([row["p"], row["q"], row["c"]], [0.0, 0.0, -1.3], atol=1e-8)
+    model = disguised({"x": "p*x + q*x^3 - 3*x^5/5", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
+    curves = curves_of(model, "pitchfork", bent([0, 0]), [0.0, -0.5], generations=1)
+    row = only(curves, "degenerate_pitchfork")
+    np.testing.assert_allclose([row["p"], row["q"], row["quintic"]], [0.0, 0.0, -0.6], atol=1e-7)
+    p, q = on(curves, "fold").T
+    np.testing.assert_allclose(q**2, -2.4 * p, atol=1e-8)
+    assert q.max() > 0.9
+
+
+def test_branch_points__zero_hopf():
+    """A pitchfork at p = 0 with a pair (q + 1.3 i): at the origin."""
+    rates = {"x": "p*x - x^3 + x*(y^2 + z^2)", "y": "(q + x^2)*y - 13*z/10", "z": "(q + x^2)*z + 13*y/10"}
+    model = disguised(rates, {"p": 0.0, "q": 0.0})
+    row = only(curves_of(model, "pitchfork", bent([0, 0, 0]), [0.0, -0.5], generations=0), "zero_hopf")
+    np.testing.assert_allclose([row["p"], row["q"]], 0.0, atol=1e-8)
+
+
+def test_branch_points__unfolded_by_the_second_parameter():
+    """x' = p x - x^3 + q: the pitchfork at q = 0 has no curve, and is left out with a reason."""
+    model = model_of({"x": "p*x - x**3 + q"}, {"p": 0.0, "q": 0.0})
+    family = Family(model.system, 0, 1.0, model.load().pack(), ("p", "q"), (2.0, 2.0))
+    start = EquilibriumCurve(family, "pitchfork").start(family.unknowns(np.zeros(1), [0.0, 0.0]))
+    left_out = {}
+    assert continue_curves([(7, family, "pitchfork", start)], ((-1, 1), (-1, 1)), left_out=left_out) == []
+    assert left_out == {7: UNFOLDED}
+
+
 # ---- mechanics ---------------------------------------------------------------------------------
 
 FOLLOWER = model_of(
@@ -244,13 +289,13 @@ def test_follower_force():
     """Flutter by Routh and Hurwitz, divergence where det K = 0; both meet at the double zero."""
     flutter = brentq(lambda load: routh(follower_polynomial(load, 1.0)), 1.0, 2.0, xtol=1e-12)
     bounds = ((0.2, 4.0), (0.0, 1.2))
-    curves = curves_of(FOLLOWER, "hopf", [0, 0, 0, 0], [flutter, 1.0], bounds)
+    curves = curves_of(FOLLOWER, "hopf", [0, 0, 0, 0], [flutter, 1.0], bounds, generations=1)
     curve, sprung = curves
     assert (curve.kind, sprung.kind) == ("hopf", "pitchfork")
     assert "bogdanov_takens" in curve.ends
     assert max(least_sum(follower_polynomial(*values)) for values in curve.values) < 1e-9
     buckling = brentq(lambda load: follower_polynomial(load, 0.2)[-1], 0.1, 0.8, xtol=1e-12)
-    (divergence,) = curves_of(FOLLOWER, "pitchfork", [0, 0, 0, 0], [buckling, 0.2], bounds)
+    (divergence,) = curves_of(FOLLOWER, "pitchfork", [0, 0, 0, 0], [buckling, 0.2], bounds, generations=0)
     for values in (*divergence.values, *sprung.values):
         assert abs(follower_polynomial(*values)[-1]) < 1e-9
     known = fsolve(lambda x: follower_polynomial(*x)[-2:], curve.special[0].values + 1e-3, xtol=1e-12)

@@ -7,8 +7,10 @@ import json
 import numpy as np
 import pytest
 from matplotlib.text import Text
+from scipy.optimize import fsolve
 
 import magpend
+from pipeline.analysis.branches.analysis import branches_table
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
@@ -116,6 +118,76 @@ def test_logistic__cascade(tmp_path):
     assert len(doublings) >= 6
     a, b, c = doublings[-3:]
     assert c - (c - b) ** 2 / ((c - b) - (b - a)) == pytest.approx(3.569945672, abs=1e-6)
+
+
+def logistic(folder, values, model=LOGISTIC):
+    """Return a run of the logistic map at some values of r, long enough to settle apart from bifurcations."""
+    spec = magpend.Spec("sweep", model).with_axis("r", values=values).with_start_list([[0.3]])
+    return magpend.run(spec.with_integration(n_transient=4000, n_keep=60, max_orbit_period=16), folder, workers=0)
+
+
+def test_logistic__grid_values_on_bifurcations(tmp_path):
+    """Cells at r = 1 and 3 end on an orbit of twice the period, but for their error: each branch is there once."""
+    for values, ends, known, periods in (
+        ([1.0, 2.0, 3.0], (0.5, 3.2), {"transcritical": 1.0, "period_doubling": 3.0}, [1, 1, 2]),
+        ([3.0], (2.9, 3.1), {"period_doubling": 3.0}, [1, 2]),
+    ):
+        ds = logistic(tmp_path / str(len(values)), values).branches(low=ends[0], high=ends[1])
+        rows = branches_table(ds).rows
+        assert sorted(ds["orbit_period"].values) == periods
+        assert [(row["type"], row["period"]) for row in rows] == [(kind, 1) for kind in known]
+        # where branches cross Newton's method is as exact as the root of its residual
+        assert [row["r"] for row in rows] == pytest.approx(list(known.values()), abs=1e-6)
+        assert rows[-1]["r"] == pytest.approx(3.0, abs=1e-8)
+
+
+def test_logistic__orbits_near_a_start(tmp_path, command):
+    """At r = 4 the orbit of period 3 through sin(pi/7)^2 has the multiplier 2^3; x = 3/4 has -2."""
+    run = logistic(tmp_path / "run", [4.0])
+    near = {"starts": 2, "max_period": 1, "rounds": 0}
+    ds = run.orbits(start={"x": 0.188}, start_period=3, **near)
+    one = ds.isel(orbit=int(ds.attrs["start_orbit"]))
+    assert (int(one["orbit_period"]), int(one["n_hits"])) == (3, 0)
+    found = np.sort(one["section"].values[:, 0])
+    np.testing.assert_allclose(found, np.sin(np.pi * np.array([1.0, 2.0, 3.0]) / 7.0) ** 2, atol=1e-10)
+    np.testing.assert_allclose(one["multiplier_real"], 8.0, atol=1e-7)
+    ds = run.orbits(start={"x": 0.74}, **near)
+    one = ds.isel(orbit=int(ds.attrs["start_orbit"]))
+    np.testing.assert_allclose([one["section"].values[0, 0], one["multiplier_real"].values[0]], [0.75, -2.0], atol=1e-9)
+    words = ("--start", "x=0.188", "--start-period", "3", "--period", "1")
+    out, _ = command(tmp_path, "analyse", "orbits", tmp_path / "run", *words)
+    assert "--start: leads to orbit" in out
+    for options, told in (({"y": 1.0}, "missing: x"), ({"x": 0.5}, "1 or more")):
+        with pytest.raises(SpecError, match=told):
+            run.orbits(start=options, start_period=int("y" in options))
+
+
+TWICE = magpend.model("x' = r*y*(1 - y)", define={"y": "r*x*(1 - x)"}, kind="map", r=3.2)
+"""The logistic map taken twice. It maps an orbit to its mirror image: doublings of odd periods become pitchforks."""
+
+
+def test_twice__pitchfork_that_turns_sharply(tmp_path):
+    """Steps across the tips of the broken orbits lead to the symmetric one: a branch must not go on there."""
+
+    def doubling(x):
+        z, slope = x[0], 1.0
+        for _ in range(3):
+            slope *= x[1] * (1.0 - 2.0 * z)
+            z = x[1] * z * (1.0 - z)
+        return [z - x[0], slope + 1.0]
+
+    run = logistic(tmp_path / "run", [3.83, 3.8425], TWICE)
+    known = fsolve(doubling, [0.5, 3.8415], xtol=1e-13)[1]
+    ds = run.branches(low=3.82, high=3.848, max_period=3)
+    table = branches_table(ds)
+    (fold, pitchfork, *doublings) = table.rows
+    assert [row["type"] for row in table.rows] == ["fold", "pitchfork", "period_doubling", "period_doubling"]
+    assert fold["r"] == pytest.approx(1.0 + np.sqrt(8.0), abs=1e-8)
+    assert pitchfork["r"] == pytest.approx(known, abs=1e-8)
+    assert pitchfork["criticality"] == "supercritical"
+    assert doublings[0]["r"] == pytest.approx(doublings[1]["r"], abs=1e-8)
+    assert ds.sizes["branch"] == 2
+    assert sum("and back by mirror images" in line for line in table.lines) == 1
 
 
 def texts(panels):

@@ -64,6 +64,20 @@ def test_neimark_sacker__of_a_flow_seen_at_even_times():
     assert torus.coefficient == pytest.approx(PERIOD * 1.2 * hopf.coefficient, rel=1e-5)
 
 
+def test_equilibria__with_a_bent_centre_manifold_and_an_eigenvalue_near_one():
+    """y = x^2/2 turns x' = x y into x^3/2; at the fold x' = -x^2 with q = (1, 1)/sqrt(2). The third state stays 0."""
+    rates = {"x": "p*x + x*y", "y": "-2*y + x^2"}, {"x": "p - x^2", "y": "x - y"}
+    known = ("pitchfork", 0.5), ("fold", np.sqrt(0.5))
+    for own, start, (kind, value) in zip(rates, ([0.0, 0.0, 0.0], [1.0, 1.0, 0.0]), known, strict=True):
+        model = model_of({**own, "z": "9*z/10"}, {"p": 0.0})
+        family = Family(model.system, 0, FREQUENCY, model.load().pack(), ("p",), (1.0,))
+        at = start[0] - 0.3 * (kind == "pitchfork")
+        branch, *_ = explore([Start(family, np.array(start), at)], Scope(-0.5, 1.2, 1, max_generations=1))
+        one = only(branch, kind)
+        assert abs(one.coefficient) == pytest.approx(value, abs=1e-6)
+        assert one.criticality == ("subcritical" if kind == "pitchfork" else "")
+
+
 @pytest.mark.parametrize("b", [-1.0, 0.5])
 def test_branch_point__pitchfork(b):
     """x' = b x^3 at mu = 0: the map is x + b T x^3 + ..."""

@@ -121,7 +121,7 @@ export class ParameterPlane {
     if (!chosen) return;
     const { kind, period, x, y } = this.found.curves[chosen.curve], [first, second] = this.found.axes;
     const values = `${first.name} = ${number(x[chosen.point], 7)}, ${second.name} = ${number(y[chosen.point], 7)}`;
-    this.readout.textContent = `${kind}, period ${period}: ${values}`;
+    this.readout.textContent = `${kind}, ${period ? `period ${period}` : "equilibrium"}: ${values}`;
   }
 
   // ---- painting ----------------------------------------------------------------------------
