@@ -83,6 +83,7 @@ ANALYSES = {
     "chaos": "sweep",
     "dimension": f"sweep {POINT} --n-max 2000",
     "spectrum": f"sweep {POINT} --averages 3",
+    "series": f"sweep {POINT} --attractor A --periods 60 --samples 16",
     "branches": "walk --period 1",
     "manifolds": f"{SWEPT} --length 0.5 --chord 0.1",
     "tangency": f"{SWEPT} --parameter amplitude --from 0.3 --to 0.31 --length 0.5",

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy import special
-from scipy.special import chdtri, gammaincinv
+from scipy.special import chdtri, gammaincinv, stdtrit
 
 Interval = Literal["wilson", "clopper-pearson"]
 
@@ -112,6 +112,12 @@ def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95
     tail = 0.5 * (1.0 - confidence)
     low = 2.0 * time_at_risk / float(chdtri(2 * n_left + 2, tail))
     return low, 2.0 * time_at_risk / _quantile(tail, 2 * n_left)
+
+
+def half_width(parts: npt.ArrayLike) -> float:
+    """Compute half of Student's 95 % interval of a mean, from independent values of it."""
+    values = np.asarray(parts, np.float64)
+    return float(stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def _quantile(share: float, n: int) -> float:

@@ -66,7 +66,7 @@ NEEDS = {
 """What a run at constant parameters lacks for the analyses of each other kind of motion."""
 
 
-NOT_OF_MAPS = ("response",)
+NOT_OF_MAPS = ("response", "spectrum", "series")
 """Analyses of the motion between sections, which a map has not."""
 
 

@@ -14,6 +14,7 @@ from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.events.names import (
     BANDS,
     BOUNDARY,
+    BREAKUP,
     CASCADE,
     GRAZING,
     INTERIOR,
@@ -21,6 +22,7 @@ from pipeline.analysis.events.names import (
     LOCKING,
     NAMES,
     RANGE_END,
+    SLIDING,
     TWINS,
     UNDECIDED,
 )
@@ -56,6 +58,8 @@ _OTHERS = {
     **{name: ("h", kind.upper(), f"intermittency {kind.upper()}") for kind, name in INTERMITTENCY.items()},
     LOCKING: (">", "", "locking"),
     GRAZING: ("<", "", "grazing"),
+    SLIDING: ("<", "S", "grazing-sliding"),
+    BREAKUP: ("8", "", "break-up of a torus"),
 }
 """Marker, label and name of the events that are no bifurcations of a branch."""
 

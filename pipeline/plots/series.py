@@ -6,7 +6,11 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from pipeline.analysis.run import OpenRun
 from pipeline.plots import labels, style
+from pipeline.plots.figure import frame_of, noted, values_of
+from pipeline.products.figures import SeriesFigureOptions
+from pipeline.products.spectrum import SeriesOptions
 
 MOST_SHOWN = 600
 """Most rows of the recurrence matrix that are drawn."""
@@ -37,6 +41,13 @@ def plot_series(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     fig.suptitle(f"{ds.attrs['channel']}: {ds.attrs['motion']}", x=0.01, ha="left", fontsize=fig.look.title)
     style.finish(fig)
     return fig
+
+
+def draw_series(run: OpenRun, options: SeriesFigureOptions) -> style.DataFigure:
+    """Draw the figure ``series`` of a run."""
+    at, notes = values_of(run, options)
+    found = run.derive("series", **{**options.part(SeriesOptions), "at": at})
+    return noted(plot_series(found, frame=frame_of(options)), notes)
 
 
 def _told(ds: xr.Dataset, name: str, form: str) -> str:

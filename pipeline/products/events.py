@@ -25,8 +25,9 @@ EVENTS = Analysis(
     """Name the bifurcation at which each attractor begins, changes its period and ends along the swept parameter.
 
     Follows the branch of each orbit from the last value at which cells end on it. Ends of chaotic sets and tori are
-    named where doublings, a Neimark-Sacker point, slow passages near an orbit beyond (intermittency, locking) or the
-    touch of an unstable orbit (crises) prove them; all others are not decided.""",
+    named where doublings, a Neimark-Sacker point, slow passages near an orbit beyond (intermittency, locking), the
+    touch of an unstable orbit (crises) or exponents in between (break-up of a torus) prove them; all others are not
+    decided.""",
     EventOptions,
     compute=f"{_ROOM}:events",
     table="pipeline.analysis.events.sentences:events_table",
@@ -34,5 +35,5 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
-    version=4,
+    version=5,
 )

@@ -13,7 +13,7 @@ from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, Options, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
-from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
+from pipeline.products.spectrum import SeriesOptions, SpectraOptions, SpectrumOptions
 from pipeline.products.transfer import TransferOptions
 
 Per = Literal["s", "period"]
@@ -142,6 +142,10 @@ class SpectrumFigureOptions(SpectrumOptions, FigureOptions):
     """Options of a figure of spectra at one parameter point."""
 
     axis: Axis = option("", _AXIS)
+
+
+class SeriesFigureOptions(SeriesOptions, FigureOptions):
+    """Options of a figure of a motion's time series."""
 
 
 class WaterfallOptions(SpectraOptions, FigureOptions):
@@ -277,6 +281,14 @@ SPECTRUM = Figure(
     SpectrumFigureOptions,
     "pipeline.plots.spectrum:draw_spectrum",
     needs="pipeline.analysis.spectrum.analysis:needs_axis",
+    panels="several",
+)
+
+SERIES = Figure(
+    "series",
+    "Draw a motion's delay portrait, return map, divergence of neighbours, correlation sums, recurrences and spectrum.",
+    SeriesFigureOptions,
+    "pipeline.plots.series:draw_series",
     panels="several",
 )
 

@@ -65,7 +65,12 @@ ANALYSES: Registry[Analysis] = Registry(
             "transfer": ("transfer", "a sweep"),
             "overlaps": ("tipping", "a sweep along the parameter that changes"),
         },
-        "Chaos and spectra": {"chaos": ("chaos", ""), "dimension": ("chaos", ""), "spectrum": ("spectrum", "")},
+        "Chaos and spectra": {
+            "chaos": ("chaos", ""),
+            "dimension": ("chaos", ""),
+            "spectrum": ("spectrum", ""),
+            "series": ("spectrum", "one motion (--at, --attractor or --cell)"),
+        },
         "Orbits and branches, stable or not": {
             "branches": ("branches", ""),
             "events": ("events", "a sweep or continuation along one parameter"),
@@ -109,6 +114,7 @@ _FIGURES = {
         "dimension": _POINT,
         "spectrum": f"{_POINT}, or a cell",
         "waterfall": _ONE,
+        "series": f"one attractor of {_POINT}, or a cell",
     },
     "Orbits and branches, stable or not": {
         "branches": "",

@@ -7,14 +7,35 @@ from typing import Literal
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.spectrum.analysis"
+_MOTIONS = "pipeline.analysis.spectrum.motions"
+_SERIES = "pipeline.analysis.series.analysis"
 
 
-class SpectraOptions(Options):
-    """Options of the spectra of attractors, at a parameter point or at all."""
+class MotionOptions(Options):
+    """Options that choose motions of a run, and a quantity of them."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run; by default all values.")
     attractor: str = option("", "Letter or id of one attractor; by default all that are there.")
     channel: str = option("", "State or quantity; by default the model's first state.")
+
+
+class CellOptions(MotionOptions):
+    """Options that choose motions of a run also by a cell."""
+
+    cell: int | None = option(None, "Number of a cell: only the motion on which it ends.", ge=0)
+
+
+class SeriesOptions(CellOptions):
+    """Options of what a time series says of the dynamics of a motion."""
+
+    periods: int = option(250, "Length of the series.", unit="drive periods or returns", ge=20, le=100_000)
+    samples: int = option(32, "Samples in a drive period or return.", ge=4, le=4096)
+    seed: int = option(0, "Seed of the surrogates.", ge=0)
+
+
+class SpectraOptions(MotionOptions):
+    """Options of the spectra of attractors, at a parameter point or at all."""
+
     window: str = option("hann", "Window of each segment, by its name in scipy.signal, such as hann or flattop.")
     segment: int = option(
         64, "Length of a segment; its inverse is the resolution.", unit="drive periods or returns", ge=4, le=100_000
@@ -28,10 +49,8 @@ class SpectraOptions(Options):
     )
 
 
-class SpectrumOptions(SpectraOptions):
+class SpectrumOptions(SpectraOptions, CellOptions):
     """Options of spectra."""
-
-    cell: int | None = option(None, "Number of a cell: only the spectrum of the motion on which it ends.", ge=0)
 
 
 SPECTRUM = Analysis(
@@ -45,7 +64,22 @@ SPECTRUM = Analysis(
     compute=f"{_ROOM}:spectrum",
     table=f"{_ROOM}:spectrum_table",
     needs=f"{_ROOM}:needs_channel",
-    settle=f"{_ROOM}:settle_spectrum",
+    settle=f"{_MOTIONS}:settle_motion",
     builds_on=("attractors",),
     figure="spectrum",
+)
+
+SERIES = Analysis(
+    "series",
+    """Measure period, largest exponent, dimension and recurrences of a motion's time series, each with an interval.
+
+    The motion of one attractor or one cell is sampled like a recording, and analysed as recordings analyse does. A
+    result that the length of the series forbids is not decided, and the table says why.""",
+    SeriesOptions,
+    compute=f"{_SERIES}:series",
+    table=f"{_SERIES}:series_table",
+    needs=f"{_MOTIONS}:needs_motion",
+    settle=f"{_MOTIONS}:settle_motion",
+    builds_on=("attractors",),
+    figure="series",
 )

@@ -214,7 +214,7 @@ def with_events(ds: xr.Dataset, events: xr.Dataset) -> xr.Dataset:
     numbers = []
     for direction, i, x in jumps:
         own = np.flatnonzero((rises == (direction > 0)) & (ids == i) & (ends == x))
-        numbers.append(int(own[0]) if own.size else -1)
+        numbers.append(int(events["same_as"].values[own[0]]) if own.size else -1)
     known = np.array(numbers, np.int64)
     names = words_of(events["what"])
     columns = {"what": np.where(known >= 0, events["what"].values[known] + 1, 0) if len(events["what"]) else known + 1}

@@ -291,7 +291,9 @@ class _Flood(Orbits):
         at = w["u"] + w["way"] * ahead
         w["end_at"][passed] = at[passed]
         near = (ahead > 0.0) & (ahead <= 4.0 * np.abs(w["u"] - w["u_before"]))
-        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & (np.abs(at - before) <= AGREED * ahead))
+        with np.errstate(invalid="ignore"):  # both are infinite where the derivative stays constant
+            agrees = np.abs(at - before) <= AGREED * ahead
+        return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & agrees)
 
     def _begin_half(self, w: Any, ready: Array, v: Values) -> None:
         """Go on with orbits of half the period: the next step must pass a doubling of theirs."""

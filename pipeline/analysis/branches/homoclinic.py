@@ -335,7 +335,7 @@ def lay_nodes(loop: Loop, cut: float) -> tuple[HomoclinicProblem, np.ndarray] | 
     before, after = _time_to(lambda t: leaving(-t), radius), _time_to(arriving, radius)
     inner = loop.times[last] - loop.times[first]
     seconds = before + inner + after
-    fastest = float(rest.eigenvalues[0].real.max())
+    fastest = float(np.abs(rest.eigenvalues[0].real).max())
     n_segments = int(np.clip(np.ceil(fastest * seconds / STRETCH), LEAST_SEGMENTS, MOST_SEGMENTS))
     nodes = np.empty((n_segments + 1, len(saddle)))
     for k, t in enumerate(np.linspace(0.0, seconds, n_segments + 1)):

@@ -13,9 +13,10 @@ orbit.
 
 Schema
 ------
-Dims ``event``, ``outcome``, ``doubling``, ``stretch`` (neighbouring parameter values at which an attractor has one kind
-and period) and ``end``: the first and the last value of a stretch. Stretches are the nodes of a graph, whose edges are
-the events: ``stretch_of`` leads to each ``to_stretch``.
+Dims ``event`` (an end of an attractor), ``outcome``, ``doubling``, ``stretch`` (neighbouring parameter values at which
+an attractor has one kind and period) and ``end``: the first and the last value of a stretch. Stretches are the nodes of
+a graph, whose edges are the events: ``stretch_of`` leads to each ``to_stretch``. Ends at one bifurcation are one event,
+see ``same_as``.
 
 ============================== ================= ==========================================================
 variable                       dims              meaning
@@ -33,6 +34,9 @@ variable                       dims              meaning
 ``is_own``                     event             1 if the bifurcation lies on its branch, 0 if the branch
                                                  springs from it or turns there
 ``n_cells``                    event             cells of the attractor at ``seen``
+``same_as``                    event             number of the event that this end belongs to, its own or another:
+                                                 attractors that end or begin at one bifurcation or crisis, and mirror
+                                                 images, have one event
 ``to_attractor``, ``to_cells`` event, outcome    ids on which they end at ``beyond`` (-1: none, -2: they
                                                  diverge), with their numbers, the largest first
 ``stretch_of``                 event             stretch that ends

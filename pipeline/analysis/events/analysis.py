@@ -11,16 +11,16 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
+from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING, KINDS
-from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
+from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises, Crisis
 from pipeline.analysis.events.graph import at_ends
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
-from pipeline.analysis.events.names import CRISES, GRAZING, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -92,14 +92,17 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    crises = Crises(scene)
-    stretches = crises.split(_stretches(scene))
+    stretches, ids = _continued(scene, _stretches(scene))
+    crises = Crises(replace(scene, names=ids))
+    stretches = crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
+    names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    named = [_aperiodic(scene, crises, one, named) for one in named]
+    breakups = Breakups(scene)
+    named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
     return _dataset(scene, stretches, _merged(named))
 
 
@@ -126,6 +129,42 @@ def _stretches(scene: Scene) -> list[Stretch]:
     return [one for number in sorted(found) for one in found[number]]
 
 
+def _continued(scene: Scene, stretches: Sequence[Stretch]) -> tuple[list[Stretch], dict[tuple[int, int], int]]:
+    """Join neighbouring chaotic sets whose cells all go on to each other: ids of such sets rest on distance alone.
+
+    Return also the id of the joined stretch by the place and the id of each one.
+    """
+    names = {(place, one.attractor): one.attractor for one in stretches for place in _places(one)}
+    scene = replace(scene, names=names)
+    joined: list[Stretch] = []
+    found = dict(names)
+    for one in sorted(stretches, key=lambda one: one.places):
+        k = next((k for k, before in enumerate(joined) if _is_continued(scene, before, one)), -1)
+        if k < 0:
+            joined.append(one)
+            continue
+        before = joined[k]
+        joined[k] = replace(before, places=(before.places[0], one.places[1]), rows=(before.rows[0], one.rows[1]))
+        found |= {(place, one.attractor): before.attractor for place in _places(one)}
+    return joined, found
+
+
+def _places(one: Stretch) -> range:
+    return range(one.places[0], one.places[1] + 1)
+
+
+def _is_continued(scene: Scene, before: Stretch, after: Stretch) -> bool:
+    """Tell whether a chaotic set follows another one at the next value, and all cells of each go on to the other."""
+    is_chaotic = {SETS[one.kind] for one in (before, after)} == {"chaotic_set"}
+    if not is_chaotic or before.places[1] + 1 != after.places[0]:
+        return False
+    ids = [int(scene.attractors["attractor"].values[row]) for row in (before.rows[1], after.rows[0])]
+    here, there = before.places[1], after.places[0]
+    up, _ = _cells(scene, ids[0], True, here, there)
+    down, _ = _cells(scene, ids[1], False, there, here)
+    return set(up) - {-1} == {ids[1]} and set(down) - {-1} == {ids[0]}
+
+
 Fates = dict[tuple[Stretch, bool], tuple[Fate, Fate]]
 """Fates of the orbits at the first (False) and the last value of stretches, as the parameter falls and rises."""
 
@@ -147,7 +186,7 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
                 fates[one, rises] = (Fate(np.nan, why=why),) * 2
                 continue
             asked.append((one, rises))
-            orbits.append(Orbit(_family(scene, place, one.period), points[row][0], float(scene.along[place])))
+            orbits.append(Orbit(scene.family(place, one.period), points[row][0], float(scene.along[place])))
     for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
         if found is None:
             fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
@@ -180,7 +219,7 @@ def _joined(stretches: Sequence[Stretch], fates: Fates) -> tuple[list[Stretch], 
             k = len(joined) - 1
         if right:
             open_ends[(*right, one.period)] = k
-        names |= {(place, one.attractor): joined[k].attractor for place in range(one.places[0], one.places[1] + 1)}
+        names |= {(place, one.attractor): joined[k].attractor for place in _places(one)}
     return joined, kept, names
 
 
@@ -215,25 +254,19 @@ def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
     return replace(event, what=what, error=error)
 
 
-def _family(scene: Scene, place: int, period: int) -> Family:
-    """Return the family of orbits of a period at the parameters of a place on the axis."""
-    frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
-    return family_of(scene.base.model.system, period, frequency, packed, scene.axis, scene.scale)
-
-
 def _touching(scene: Scene, event: Event) -> Event:
     """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
     fate = event.fate
     line = next((line for line in scene.lines if line.branch == fate.branch), None)
     if line is None or fate.node not in (0, len(line.value) - 1):
         return event
-    family = _family(scene, event.stretch.places[event.rises], line.period)
+    family = scene.family(event.stretch.places[event.rises], line.period)
     found = grazing_of(line, fate.node, family)
     if found is None:
         return event
-    value, error, why = found
+    what, value, error, why = found
     fate = replace(fate, value=value, why=f"{fate.why}; {why}")
-    return replace(event, fate=fate, what=GRAZING, error=max(error, LOCATED * scene.scale))
+    return replace(event, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:
@@ -250,7 +283,7 @@ def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -
     return dict(counts.most_common()), int(here.sum())
 
 
-def _aperiodic(scene: Scene, crises: Crises, one: Event, named: Sequence[Event]) -> Event:
+def _aperiodic(scene: Scene, crises: Crises, breakups: Breakups, one: Event, named: Sequence[Event]) -> Event:
     """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by a crisis, if
     there is proof.
     """
@@ -259,17 +292,23 @@ def _aperiodic(scene: Scene, crises: Crises, one: Event, named: Sequence[Event])
     is_chaotic = SETS[one.stretch.kind] == "chaotic_set"
     place, way = one.stretch.places[one.rises], 1 if one.rises else -1
     heir = next(iter(one.to), -1)
-    facing = [
+    opposite = [
         other
         for other in named
         if other.rises != one.rises
         and other.stretch.attractor == heir
         and other.stretch.places[other.rises] == place + way
-        and other.fate.bifurcation >= 0
         and next(iter(other.to), -1) == one.stretch.attractor
     ]
+    facing = [other for other in opposite if other.fate.bifurcation >= 0]
     if not facing or len(one.to) > 1:
         why = _why_open(one, heir, named)
+        alone = [other for other in opposite if len(one.to) == len(other.to) == 1]
+        if alone and {SETS[x.stretch.kind] for x in (one, alone[0])} == {"torus", "chaotic_set"}:
+            broken = breakups.name(one, alone[0].stretch)
+            if broken.what != UNDECIDED:
+                return broken
+            why = broken.fate.why
         return crises.name(one, why) if is_chaotic else replace(one, fate=replace(one.fate, why=why))
     born = _born(scene, one.stretch, place, way, facing[0].fate)
     fate = replace(facing[0].fate, value=born.value, why=born.why)
@@ -286,7 +325,7 @@ def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> B
     points = all_points[stretch.rows[way > 0]]
     bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
     if may_pass(scene.located, fate.bifurcation, is_torus):
-        family = _family(scene, place, 1)
+        family = scene.family(place, 1)
         return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
     if not is_torus:
         return cascade_of(scene.located, fate, bracket, points, geometry)
@@ -304,7 +343,7 @@ def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
     if any(SETS[other.kind] == "chaotic_set" for other in beyond):
-        return f"{letter(heir)} is a chaotic set: whether the torus breaks up into it is not looked for"
+        return f"{letter(heir)} is a chaotic set, but the cells of the two do not all go on to each other"
     if len(one.to) > 1:
         return "its cells do not all go on to the same attractor"
     return "its cells do not go on to an orbit whose end is located and whose cells go on to it"
@@ -321,13 +360,62 @@ def _merged(named: Sequence[Event]) -> list[Event]:
             and last.stretch.attractor == one.stretch.attractor
             and (
                 last.fate.bifurcation == one.fate.bifurcation >= 0
-                or (last.what in CRISES and (last.what, last.fate.value) == (one.what, one.fate.value))
+                or (last.what in (*CRISES, BREAKUP) and (last.what, last.fate.value) == (one.what, one.fate.value))
             )
         ):
             merged[-1] = replace(last, after=one.stretch)
         else:
             merged.append(one)
     return merged
+
+
+def _same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
+    """Return for each end of an attractor the number of the end that leads: ends at one bifurcation are one event.
+
+    The leading end is that of the orbit on which the bifurcation lies, or of the set that meets the orbit of a crisis.
+    """
+    groups: list[list[int]] = []
+    for k, one in enumerate(named):
+        own = next((group for group in groups if any(_is_same(scene, named[i], one) for i in group)), None)
+        if own is None:
+            groups.append([k])
+        else:
+            own.append(k)
+    found = [0] * len(named)
+    for group in groups:
+        lead = min(group, key=lambda k: (_is_seen_from_elsewhere(scene.located, named[k]), k))
+        for k in group:
+            found[k] = lead
+    return found
+
+
+def _is_seen_from_elsewhere(ds: xr.Dataset, one: Event) -> bool:
+    if isinstance(one.born, Crisis):
+        return one.born.lives_beyond
+    return not _is_own(ds, one.fate)
+
+
+def _is_same(scene: Scene, a: Event, b: Event) -> bool:
+    """Tell whether two ends are one event: of one kind, at one value, and of one orbit or of mirror images."""
+    if a.what != b.what or not abs(_value(a) - _value(b)) <= a.error + b.error:
+        return False
+    ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
+    if a.what in CRISES and (a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)):
+        return True  # one crisis told from both sides, or by both sets that merge
+    if min(j, k) >= 0:
+        points = ds["bifurcation_section"].values[[j, k]]
+        away = geometry_of(scene.attractors).distance(points[0], points[1, 0])
+        if j == k or np.nanmin(away) <= SAME_PLACE:
+            return True
+    return a.rises == b.rises and _are_mirrored(scene, a, b)
+
+
+def _are_mirrored(scene: Scene, a: Event, b: Event) -> bool:
+    """Tell whether two attractors are mirror images of each other at the ends of their stretches."""
+    ds, (i, j) = scene.attractors, (one.stretch.rows[one.rises] for one in (a, b))
+    if a.stretch.places[a.rises] != b.stretch.places[b.rises] or "mirror_partner" not in ds:
+        return False
+    return int(ds["mirror_partner"].values[i]) == int(ds["attractor"].values[j])
 
 
 # ---- dataset -----------------------------------------------------------------------------------
@@ -367,6 +455,7 @@ def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event])
         "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
         "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
         "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
+        "same_as": (_same_as(scene, named), "number of the event that this end belongs to", {}),
         "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
     }
     variables: dict[str, object] = {

@@ -28,8 +28,11 @@ from magpend_core.engine.lanes import Cells
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.orbits import polish_orbits, section_map
 from magpend_core.status import Status
+from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.problems import Family, Rows
+from pipeline.analysis.events.scene import Scene
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
 
 NEAR, WIDEST = (0.03, 0.018, 0.05), 0.25
 """Distances within which a trajectory passes an orbit, tried in turn, and the largest one if a set is further away, as
@@ -157,6 +160,11 @@ class SectionMap:
         rows = self.rows(value, found.points[0, :period])
         ends = section_map(rows.parameters, rows.frequency_hz, rows.states, period, system=system)
         return _saddle(found.points[0, :period], ends.derivatives, np.asarray(self.geometry.scales))
+
+
+def map_along(scene: Scene, place: int) -> SectionMap:
+    """Return the section map along the parameter, with the other parameters of a place on the axis."""
+    return SectionMap(scene.family(place, 1), geometry_of(scene.attractors), PORTRAIT_RTOL)
 
 
 def _saddle(points: np.ndarray, derivatives: np.ndarray, scales: np.ndarray) -> Saddle | None:

@@ -15,9 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.deflation import search_orbits, starts_around
-from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.contact import (
     SETTLE,
@@ -31,6 +29,7 @@ from pipeline.analysis.events.contact import (
     contact_of,
     count_bands,
     lifetimes_of,
+    map_along,
     sample_of,
 )
 from pipeline.analysis.events.lines import at
@@ -38,7 +37,6 @@ from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TWINS
 from pipeline.analysis.events.scene import Event, Scene, Stretch
 from pipeline.analysis.ragged import points_of_rows, rows_at
 from pipeline.analysis.sets import nearest_distances
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter
 
@@ -175,11 +173,7 @@ class Crises:
         return None
 
     def _map(self, place: int) -> tuple[SectionMap, Effort]:
-        scene = self.scene
-        model = scene.base.model
-        frequency, packed = parameters_at(scene.attractors.isel({scene.axis: int(scene.order[place])}), scene.base)
-        family = family_of(model.system, 1, frequency, packed, scene.axis, scene.scale)
-        return SectionMap(family, geometry_of(scene.attractors), PORTRAIT_RTOL), OF_MAP if model.is_map else OF_FLOW
+        return map_along(self.scene, place), OF_MAP if self.scene.base.model.is_map else OF_FLOW
 
     def _orbits(self, along: SectionMap, sample: Sample, seen: float, effort: Effort) -> list[Saddle]:
         """Return the saddle orbits at a parameter value: those of located branches, and those around the set."""

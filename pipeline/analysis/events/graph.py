@@ -97,24 +97,28 @@ def _node(one: xr.Dataset, k: int, ends: Mapping[str, int], ended: Mapping[tuple
     return row
 
 
-def graph_of(ds: xr.Dataset, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def graph_of(ds: xr.Dataset, ends: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the graph of events as node-link data, which ``networkx.node_link_graph(data, edges="edges")`` reads.
 
     Parameters
     ----------
     ds
         From the analysis ``events``.
+    ends
+        A row for each end of an attractor, with the number of its event.
     rows
-        Its table: a row for each event.
+        The table: a row for each event.
 
     Returns
     -------
     dict
         ``nodes`` as in `nodes_of`. ``edges``: from the stretch that ends to each stretch on which its cells go on, with
-        their number ``cells``, the number of the ``event`` and its row, of which ``sentence`` tells it in words. The
-        ends of the range are no events. Nodes ``diverged`` and ``no attractor`` are there if cells end so.
+        their number ``cells``, the number of the ``event`` and the row of this end; ``sentence`` tells the event in
+        words. Attractors that end or begin at one event have edges with one number. The ends of the range are no
+        events. Nodes ``diverged`` and ``no attractor`` are there if cells end so.
     """
-    edges = [edge for k in range(ds.sizes["event"]) for edge in _edges(ds, rows[k], k)]
+    told = {row["event"]: row["sentence"] for row in rows}
+    edges = [edge for k, end in enumerate(ends) for edge in _edges(ds, {**end, "sentence": told[end["event"]]}, k)]
     nodes = nodes_of(ds)
     nodes += [{"id": name, "name": name} for name in NOWHERE.values() if any(e["target"] == name for e in edges)]
     name, unit = parameter_name(str(ds.attrs["parameter"])), str(ds.attrs["parameter_units"])
@@ -123,7 +127,7 @@ def graph_of(ds: xr.Dataset, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any
 
 
 def _edges(ds: xr.Dataset, row: Mapping[str, Any], k: int) -> Iterator[Row]:
-    """Yield the edges of an event; an event that no cell shows leads to the stretch beyond it, or to no attractor."""
+    """Yield the edges of an end; an end that no cell shows leads to the stretch beyond it, or to no attractor."""
     if row["what"] == RANGE_END:
         return
     to, cells = ds["to_stretch"].values[k].tolist(), ds["to_cells"].values[k].tolist()
@@ -136,5 +140,5 @@ def _edges(ds: xr.Dataset, row: Mapping[str, Any], k: int) -> Iterator[Row]:
         going.setdefault(after, 0)
     for key, (stretch, n) in enumerate(going.items()):
         target = NOWHERE.get(stretch, stretch)
-        yield {"source": int(ds["stretch_of"].values[k]), "target": target, "key": f"{k}.{key}", "event": k,
-               "cells": n, **row}  # fmt: skip
+        yield {"source": int(ds["stretch_of"].values[k]), "target": target, "key": f"{k}.{key}", "cells": n,
+               **row}  # fmt: skip

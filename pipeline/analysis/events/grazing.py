@@ -4,6 +4,10 @@ The map of the section has no derivative where an orbit touches such a surface w
 method stops there and the branch is stuck. Up to it the orbit and the height of its peak below the surface are smooth
 in the parameter (di Bernardo et al., Piecewise-smooth Dynamical Systems, 2008, chapter 6). So the value at which the
 peak reaches the surface follows from the last orbits of the branch.
+
+An orbit that sticks to the surface of a switch may end at the same place, seen from the other side (grazing-sliding,
+ibid., chapter 8): its stay shrinks to a touch. It shortens as the root of the distance, so that the parameter is a
+smooth function of the length of the stay.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from pipeline.analysis.branches.known import at_value
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.events.lines import Line
+from pipeline.analysis.events.names import GRAZING, SLIDING
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
 SAMPLES = 4000
@@ -30,6 +35,15 @@ CORNER = 3.0
 
 ROUNDED = 1e-9
 """Values of the surface's function, in units of its range, that are 0 at neighbouring instants: sliding, or at rest."""
+
+STUCK, TANGENT = 1e-12, 100.0
+"""Value of a switch's function, in units of its range, up to which an orbit sticks. Largest value of the function one
+stay before an orbit comes to stick, in units of its range and of the square of the stay's share of the period: beyond
+it the orbit comes in across the surface, and not along it.
+"""
+
+RESOLVED = 4.0 / SAMPLES**2
+"""Error of a short stay, as a share of the period: its beginning and its end are seen between two instants."""
 
 NODES, APART = 30, 2.0
 """Last points of a branch that are looked at, and the least ratio of the heights of those that are used."""
@@ -44,8 +58,8 @@ REACH = 1e-4
 """Largest distance of the touch from the last orbit, and largest error, in units of the interval of the parameter."""
 
 
-def grazing_of(line: Line, node: int, family: Family) -> tuple[float, float, str] | None:
-    """Return the value at which an orbit begins to touch a surface, its error and the evidence; None if it does not.
+def grazing_of(line: Line, node: int, family: Family) -> tuple[str, float, float, str] | None:
+    """Return the name of the touch at which an orbit ends, its value, error and evidence; None if there is no touch.
 
     Parameters
     ----------
@@ -60,18 +74,30 @@ def grazing_of(line: Line, node: int, family: Family) -> tuple[float, float, str
     nodes = range(node, max(node - NODES, -1), -1) if node else range(min(NODES, len(line.value)))
     guesses = [family.unknowns(line.points[i][0], [line.value[i]]) for i in nodes if line.bifurcation[i] < 0]
     points = [p for p in run_together([at_value(family, guess) for guess in guesses]) if p is not None]
-    peaks = [_peaks(family, point) for point in points]
     values = np.array([family.values(point.u)[0] for point in points])
-    found = [_touch(values, [peak[of] for peak in peaks]) for of in range(len(peaks[0]) if peaks else 0)]
-    scale = family.scales[0]
-    for of, touch in enumerate(found):
-        if touch is not None and abs(touch[0] - values[0]) <= REACH * scale and touch[1] <= REACH * scale:
-            surface = of // 2
-            n = surface + 1 if surface < system.n_switches else surface + 1 - system.n_switches
-            what = f"{'switch' if surface < system.n_switches else 'impact'} {n}"
-            heights = ", ".join(f"{-peak:.1e}" for peak in touch[2])
-            return touch[0], touch[1], f"a peak of the orbit comes as near to the surface of {what} as {heights}"
+    orbits = [_heights(family, point, np.linspace(0.0, point.value.seconds, SAMPLES)) for point in points]
+    peaks = [_peaks(h, rate, p.value.seconds / (SAMPLES - 1)) for (h, rate), p in zip(orbits, points, strict=True)]
+    stays = [_stays(family, point, h) for (h, _), point in zip(orbits, points, strict=True)]
+    for name, measured in ((GRAZING, peaks), (SLIDING, stays)):
+        for of in range(len(measured[0]) if measured else 0):
+            touch = _touch(values, [one[of] for one in measured])
+            if name == SLIDING and touch is not None:
+                other = _touch(values, [one[of] - RESOLVED for one in measured])
+                touch = None if other is None else (touch[0], touch[1] + abs(other[0] - touch[0]), touch[2])
+            if touch is not None and max(abs(touch[0] - values[0]), touch[1]) <= REACH * family.scales[0]:
+                return name, touch[0], touch[1], _evidence(name, of, touch[2], system.n_switches)
     return None
+
+
+def _evidence(name: str, of: int, heights: Sequence[float], n_switches: int) -> str:
+    """Say how near peaks come to a surface, or how short the stays on it are."""
+    surface = of // 2 if name == GRAZING else of
+    is_switch = surface < n_switches
+    what = f"{'switch' if is_switch else 'impact'} {surface + 1 - (0 if is_switch else n_switches)}"
+    listed = ", ".join(f"{-height:.1e}" for height in heights)
+    if name == GRAZING:
+        return f"a peak of the orbit comes as near to the surface of {what} as {listed}"
+    return f"the orbit sticks to the surface of {what} for {listed} of its period"
 
 
 def _touch(values: np.ndarray, peaks: Sequence[float]) -> tuple[float, float, list[float]] | None:
@@ -103,22 +129,54 @@ def _at_zero(y: np.ndarray, x: np.ndarray) -> float:
     return float(table[0])
 
 
-def _peaks(family: Family, point: Point) -> list[float]:
-    """Return the highest smooth peak of an orbit below each surface, and above it with the sign changed, as shares of
-    the range of the surface's function; NaN if there is none.
-    """
+def _heights(family: Family, point: Point, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the functions of all surfaces and their rates at some instants of an orbit, shape (n, surface)."""
     system, rows, seconds = family.system, family.rows(point.u[None]), point.value.seconds
     frequency, packed = float(rows.frequency_hz[0]), rows.parameters
-    times = np.linspace(0.0, seconds, SAMPLES)
     is_flow = crossed_state(system) is not None
     drive = Drive(np.array([seconds]) if is_flow else np.full(family.period, 1.0 / frequency))
     orbit = sample(system, packed, rows.states, [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
-    values, rates = surfaces_at(system, np.mod(times, 1.0 / frequency), orbit.states[0], packed[0], frequency)
+    return surfaces_at(system, np.mod(times, 1.0 / frequency), orbit.states[0], packed[0], frequency)
+
+
+def _peaks(values: np.ndarray, rates: np.ndarray, step: float) -> list[float]:
+    """Return the highest smooth peak of an orbit below each surface, and above it with the sign changed, as shares of
+    the range of the surface's function; NaN if there is none.
+    """
     found: list[float] = []
     for h, rate in zip(values.T, rates.T, strict=True):
         extent = max(float(np.ptp(h)), 1e-300)
-        found += [_peak(sign * h, sign * rate, times[1]) / extent for sign in (1.0, -1.0)]
+        found += [_peak(sign * h, sign * rate, step) / extent for sign in (1.0, -1.0)]
     return found
+
+
+def _stays(family: Family, point: Point, values: np.ndarray) -> list[float]:
+    """Return minus the share of its period for which an orbit sticks to the surface of each switch.
+
+    NaN if it does not stick, more than once, at its ends, or if it comes in across the surface.
+    """
+    times = np.linspace(0.0, point.value.seconds, SAMPLES)
+    found = []
+    for of, h in enumerate(values.T[: family.system.n_switches]):
+        extent = max(float(np.ptp(h)), 1e-300)
+        on = np.flatnonzero(np.abs(h) <= max(ROUNDED * extent, float(np.abs(h).min())))
+        share = np.nan
+        n = len(on)
+        before = on[0] - n
+        if before >= 0 and on[-1] < SAMPLES - 1 and abs(h[before]) <= TANGENT * extent * (n / SAMPLES) ** 2:
+            near = np.linspace(times[on[0] - 1], times[on[-1] + 1], SAMPLES)
+            share = _stay(_heights(family, point, near)[0][:, of] / extent) * (near[-1] - near[0]) / times[-1]
+        found.append(-share)
+    return found
+
+
+def _stay(h: np.ndarray) -> float:
+    """Return the share of some instants at which a function is 0; NaN if that is not one stay between others."""
+    on = np.flatnonzero(np.abs(h) <= STUCK)
+    n = len(on)
+    if not 0 < n == on[-1] - on[0] + 1 or on[0] == 0 or on[-1] == len(h) - 1:
+        return np.nan
+    return n / (len(h) - 1)
 
 
 def _peak(h: np.ndarray, rate: np.ndarray, step: float) -> float:

@@ -13,10 +13,10 @@ CRISES = (BOUNDARY, INTERIOR, BANDS, TWINS)
 INTERMITTENCY = {kind: f"intermittency_{kind}" for kind in ("i", "ii", "iii")}
 """Names of intermittency by its type."""
 
-LOCKING, GRAZING = "locking", "grazing"
+LOCKING, GRAZING, BREAKUP, SLIDING = "locking", "grazing", "torus_breakup", "grazing_sliding"
 
 NAMES = (
     *(UNDECIDED, RANGE_END, LIVES_ON, *KINDS, *LIMITS, CASCADE, *CRISES),
-    *(*INTERMITTENCY.values(), LOCKING, GRAZING),
+    *(*INTERMITTENCY.values(), LOCKING, GRAZING, BREAKUP, SLIDING),
 )
 """Names of events. An attractor *lives on* if it is stable up to the bound of the branches, but no cell found it."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import gcd
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -39,8 +40,26 @@ TYPES = {FOLD: "i", TORUS: "ii", DOUBLING: "iii"}
 EXPONENTS = {FOLD: -0.5, TORUS: -1.0, DOUBLING: -1.0}
 """Exponents of the length over the distance from the bifurcation."""
 
-MEASURED = {FOLD: (10, 16, 4096), TORUS: (6, 32, 16384), DOUBLING: (6, 32, 16384)}
-"""Numbers of distances, each half of the one before, of trajectories at each, and of their sections."""
+
+class Effort(NamedTuple):
+    """Trajectories near a bifurcation, and the laminar phases of which lengths are fitted."""
+
+    n_values: int  # distances, each half of the one before
+    many: int  # trajectories at each
+    n_sections: int  # of each trajectory
+    longest: float  # length, as a share of the sections
+    n_phases: int  # least number at a value
+
+
+_OF_CHAOS = Effort(6, 32, 16384, 1.0 / 12.0, 60)
+
+MEASURED = {
+    FOLD: Effort(10, 16, 4096, 1.0 / 12.0, 60),
+    TORUS: _OF_CHAOS,
+    DOUBLING: _OF_CHAOS,
+    LOCKING: Effort(10, 8, 8192, 0.25, 16),
+}
+"""Effort by the bifurcation of the orbit, and of tori: they pass it in equal times, of which a few tell the length."""
 
 POWERS = {FOLD: 6, TORUS: 2, DOUBLING: 2}
 """Powers m in the ratio of means that is the length of laminar phases."""
@@ -50,11 +69,11 @@ GATE, OF_GAP = 0.1, 0.25
 the least distance between two section points of the orbit.
 """
 
-LEAST_LENGTH, OF_SECTIONS = 10.0, 1.0 / 12.0
-"""Lengths that are fitted: at least these periods of the orbit, and at most this share of the sections."""
+LEAST_LENGTH = 10.0
+"""Least length that is fitted, in periods of the orbit."""
 
-LEAST_PHASES, LEAST_VALUES, MOST_VALUES = 60, 4, 6
-"""Least number of laminar phases at a value, and numbers of values that are fitted, the nearest ones."""
+LEAST_VALUES, MOST_VALUES = 4, 6
+"""Numbers of values that are fitted, the nearest ones."""
 
 GROUPS = 8
 """Groups of trajectories whose spread gives the error of a length."""
@@ -127,11 +146,12 @@ def passage_of(
         return Born("", told)
     ghost = ds["bifurcation_section"].values[k]
     ghost = ghost[np.isfinite(ghost).all(axis=-1)]
-    distances = abs(bracket[1] - value) * 0.5 ** np.arange(MEASURED[kind][0])
+    effort = MEASURED[LOCKING if is_torus else kind]
+    distances = abs(bracket[1] - value) * 0.5 ** np.arange(effort.n_values)
     values = value + np.sign(bracket[1] - value) * distances
-    sections = _sections(family, values, points, *MEASURED[kind][1:])
+    sections = _sections(family, values, points, effort.many, effort.n_sections)
     found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
-    fitted = scaling(found, kind, len(ghost))
+    fitted = scaling(found, kind, len(ghost), effort)
     born = replace(_judged(found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
     if born.what != LOCKING or fitted is None:
         return born
@@ -235,14 +255,14 @@ def _ratio(lengths: np.ndarray, power: int) -> float:
     return float((lengths**power).sum() / (lengths ** (power - 1)).sum()) if len(lengths) else np.nan
 
 
-def scaling(found: Phases, kind: str, period: int) -> tuple[float, float, np.ndarray] | None:
+def scaling(found: Phases, kind: str, period: int, effort: Effort) -> tuple[float, float, np.ndarray] | None:
     """Fit the power with which the lengths grow near the bifurcation, with its error.
 
     The difference between the exponents without the farthest and without the nearest distance is part of the error.
     Return also the numbers of the distances; None if there are too few.
     """
-    longest = OF_SECTIONS * MEASURED[kind][2]
-    serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= LEAST_PHASES)
+    longest = effort.longest * effort.n_sections
+    serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= effort.n_phases)
     chosen = np.flatnonzero(serves)[-MOST_VALUES:]
     if len(chosen) < LEAST_VALUES:
         return None

@@ -9,6 +9,8 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Parameters
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.lines import Fate, Line
 from pipeline.analysis.events.names import UNDECIDED
@@ -61,6 +63,11 @@ class Scene:
     def scale(self) -> float:
         """Length of the axis."""
         return float(np.ptp(self.along))
+
+    def family(self, place: int, period: int) -> Family:
+        """Return the family of orbits of a period, or of equilibria (0), at the parameters of a place on the axis."""
+        frequency, packed = parameters_at(self.attractors.isel({self.axis: int(self.order[place])}), self.base)
+        return family_of(self.base.model.system, period, frequency, packed, self.axis, self.scale)
 
     def ids_of(self, attractor: int, place: int) -> list[int]:
         """Return the ids that an attractor has at a place."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
@@ -10,6 +12,7 @@ from pipeline.analysis.events.graph import graph_of
 from pipeline.analysis.events.names import (
     BANDS,
     BOUNDARY,
+    BREAKUP,
     CASCADE,
     CRISES,
     GRAZING,
@@ -17,6 +20,7 @@ from pipeline.analysis.events.names import (
     LIVES_ON,
     LOCKING,
     RANGE_END,
+    SLIDING,
     TWINS,
     UNDECIDED,
 )
@@ -47,11 +51,13 @@ _LIMITS = {"homoclinic": "homoclinic end (HOM) at a saddle", "snic": "saddle nod
 def events_table(ds: xr.Dataset) -> Table:
     """Return the table of events: a row for each, with its sentence and evidence.
 
+    ``event`` is the number of its end that leads, see ``same_as`` in the schema; the sentence names the others.
     ``value`` and ``value_error`` have the unit of the swept parameter; ``seen`` and ``beyond`` are the values of the
     run between which cells leave the attractor, ``to_attractor`` is the id on which most of them go on. In JSON the
     table is a graph, see `pipeline.analysis.events.graph`.
     """
-    rows = [_row(ds, k) for k in range(ds.sizes["event"])]
+    ends = [_row(ds, k) for k in range(ds.sizes["event"])]
+    rows = [_with_others(ds, row, ends) for k, row in enumerate(ends) if row["event"] == k]
     own = [row for row in rows if row["what"] not in (RANGE_END, LIVES_ON)]
     n_open = sum(row["what"] == UNDECIDED for row in own)
     lines = [f"{counted(len(own), 'event')}, {n_open} not decided"]
@@ -66,7 +72,7 @@ def events_table(ds: xr.Dataset) -> Table:
     if ds.attrs.get("refined"):
         more = f"{counted(int(ds.attrs['n_further']), 'further value')} of {parameter_name(str(ds.attrs['parameter']))}"
         lines.append(f"rests on {more} in {ds.attrs['refined']}, whose letters these are")
-    graph = graph_of(ds, rows)
+    graph = graph_of(ds, ends, rows)
     nodes = [node for node in graph["nodes"] if "attractor" in node]
     length = max(node["high"] for node in nodes) - min(node["low"] for node in nodes) if nodes else 1.0
     digits = int(9 - np.floor(np.log10(length or 1.0)))
@@ -93,16 +99,35 @@ def _own(row: Row) -> str:
 
 
 def _row(ds: xr.Dataset, k: int) -> Row:
+    """Return the row of an end, with the number of its event."""
     one = ds.isel(event=k)
-    row = values(one, *_NAMES)
+    row = {"event": int(one["same_as"]), **values(one, *_NAMES)}
     to, cells = one["to_attractor"].values.tolist(), one["to_cells"].values.tolist()
     row |= {"to_attractor": to[0], "to_cells": cells[0]}
-    doublings = [x for x in one["doublings"].values.tolist() if np.isfinite(x)]
+    return {"label": LABELS.get(row["what"], ""), **row}
+
+
+def _with_others(ds: xr.Dataset, row: Row, ends: Sequence[Row]) -> Row:
+    """Return the row of an event, whose sentence names all attractors that begin, change or end there."""
+    one = ds.isel(event=row["event"])
+    to, cells = one["to_attractor"].values.tolist(), one["to_cells"].values.tolist()
     going = {i: n for i, n in zip(to, cells, strict=True) if n}
-    return {"label": LABELS.get(row["what"], ""), **row, "sentence": _sentence(ds, row, going, doublings)}
+    doublings = [x for x in one["doublings"].values.tolist() if np.isfinite(x)]
+    others = [end for k, end in enumerate(ends) if end["event"] == row["event"] != k]
+    return {**row, "sentence": _sentence(ds, row, going, doublings, _where(row, others))}
 
 
-def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[float]) -> str:
+def _where(row: Row, others: Sequence[Row]) -> str:
+    """Say which other attractors begin, change or end at an event."""
+    begin = [f"{letter(end['attractor'])} ({_own(end)})" for end in others if end["rises"] != row["rises"]]
+    same = [f"{letter(end['attractor'])} ({_own(end)})" for end in others if end["rises"] == row["rises"]]
+    told = [f"{' and '.join(begin)} begin{'s' * (len(begin) == 1)}"] if begin else []
+    verb = "change" if row["period_after"] >= 0 else "end"
+    told += [f"{' and '.join(same)} {verb}{'s' * (len(same) == 1)} too"] if same else []
+    return f", where {' and '.join(told)}" if told else ""
+
+
+def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[float], where: str) -> str:
     name, unit = parameter_name(str(ds.attrs["parameter"])), str(ds.attrs["parameter_units"])
     unit = "" if unit == "1" else f" {unit}"
     own, way = _own(row), "rises" if row["rises"] else "falls"
@@ -116,14 +141,14 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
     at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
-    if row["period_after"] >= 0 and row["what"] in CRISES:
-        return f"{who} changes at {at} as it {way}: {_crisis(row)}"
+    if row["period_after"] >= 0 and row["what"] in (*CRISES, BREAKUP):
+        return f"{who} changes at {at} as it {way}: {_reason(row, doublings)}{where}"
     if row["period_after"] >= 0:
         changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"
-        return f"{changes} at {at} as it {way}: {_reason(row, doublings)}"
+        return f"{changes} at {at} as it {way}: {_reason(row, doublings)}{where}"
     late = (row["value"] - beyond) * (1 if row["rises"] else -1) > row["value_error"]
     unseen = f" (no cell finds it beyond {seen:.10g})" if late else ""
-    return f"{who} ends at {at} as it {way}{unseen}: {_reason(row, doublings)}{cells}"
+    return f"{who} ends at {at} as it {way}{unseen}: {_reason(row, doublings)}{where}{cells}"
 
 
 def _reason(row: Row, doublings: list[float]) -> str:
@@ -133,8 +158,12 @@ def _reason(row: Row, doublings: list[float]) -> str:
         return _end_of_set(row, doublings)
     if what in CRISES:
         return _crisis(row)
+    if what == BREAKUP:
+        return "break-up of the torus into a chaotic set"
     if what == GRAZING:
         return "grazing, a peak of it begins to touch a surface of impacts or switches"
+    if what == SLIDING:
+        return "grazing-sliding, its stay on the surface of a switch shrinks to a touch"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "

@@ -13,7 +13,8 @@ variable                         meaning
 ``arrived``, ``_low``, ``_high``  share of timed initial states that have arrived within `within` periods
 ``mean_time``, ``_stderr``,      time until arrival of the timed initial states [drive periods or returns]
 ``longest_time``, ``n_timed``
-``weighted_time``                mean of these times, each weighed by the density
+``weighted_time``,               mean of these times, each weighed by the density, and share of the density of the
+``weighted_arrived``             timed initial states that has arrived within `within` periods
 ``reactivity``, ...              `local.Local`: growth of small disturbances at once and later, and their decay
 ``quantity``                     value of the expression `quantity`
 ``shock_low``, ``shock_high``    interval of the smallest critical shock of the chosen states, at any phase
@@ -99,31 +100,33 @@ MOST_SEEDS = 8
 
 _ENDS = {-1: "-", DIVERGED: "diverges", -3: "elsewhere"}
 
-_PLAIN = (
-    "n_cells",
-    "basin_stability",
-    "basin_stability_low",
-    "basin_stability_high",
-    "weighted_stability",
-    "weighted_stability_low",
-    "weighted_stability_high",
-    "n_effective",
-    "arrived",
-    "arrived_low",
-    "arrived_high",
-    "mean_time",
-    "mean_time_stderr",
-    "longest_time",
-    "n_timed",
-    "weighted_time",
-    *Local._fields,
-    "quantity",
+_STABILITY, _WEIGHTED, _ARRIVED = (
+    [f"{name}{end}" for end in ("", "_low", "_high")] for name in ("basin_stability", "weighted_stability", "arrived")
 )
+
+_NUMBERS = {
+    **dict.fromkeys(_STABILITY, ("share of the cells that end on it", "1")),
+    **dict.fromkeys(_WEIGHTED, ("share of the density that ends on it", "1")),
+    "n_effective": ("independent cells of equal weight with the same error", "1"),
+    **dict.fromkeys(_ARRIVED, ("share of initial states that have arrived in time", "1")),
+    "mean_time": ("mean time until arrival, drive periods or returns", "1"),
+    "mean_time_stderr": ("standard error of the mean time", "1"),
+    "longest_time": ("longest time until arrival, drive periods or returns", "1"),
+    "n_timed": ("timed initial states that end on it", "1"),
+    "weighted_time": ("mean time until arrival, weighed by the density", "1"),
+    "weighted_arrived": ("share of the density that has arrived in time", "1"),
+    "reactivity": ("largest growth rate of a small disturbance, at any phase", "1/{}"),
+    "amplification": ("largest factor by which a small disturbance grows", "1"),
+    "amplification_time": ("time after the disturbance at which it is largest", "{}"),
+    "return_time": ("time in which small disturbances shrink by e at last", "{}"),
+    "quantity": ("quantity of the option", "1"),
+}
+"""Numbers of an attractor: their meanings and units, {} of time."""
+
+_PLAIN = ("n_cells", *_NUMBERS)
 
 _SIZES = ("shock_low", "shock_high", "shock_phase", "distance_low", "distance_high", "orbit_period")
 """Results that `quantity` may use beside those of `_PLAIN`."""
-
-_WEIGHTED = ("weighted_stability", "weighted_stability_low", "weighted_stability_high")
 
 _SHOWN = ("low", "high", "phase", "to", "safe", "n_below", "n_undecided")
 
@@ -158,11 +161,15 @@ def _chosen(run: OpenRun, options: ResilienceOptions) -> list[str]:
     return [name for name in model.state_names if name in wanted]
 
 
+def _places(run: OpenRun, options: ResilienceOptions) -> list[int]:
+    return [run.model.state_names.index(name) for name in _chosen(run, options)]
+
+
 def _asked_quantity(run: OpenRun, options: ResilienceOptions) -> Tree | None:
     """Return the parsed expression of the user's own quantity; None if there is none."""
     if not options.quantity:
         return None
-    results = [name for name in (*_PLAIN, *_SIZES) if name != "quantity"]
+    results = {*_PLAIN, *_SIZES} - {"quantity"}
     return read_expression("quantity", options.quantity, [*results, *run.model.parameter_names, *run.model.state_names])
 
 
@@ -208,8 +215,7 @@ class _Point:
 
     def __init__(self, there: Destinations, options: ResilienceOptions, run: OpenRun) -> None:
         self._there, self._options = there, options
-        names = list(run.model.state_names)
-        self._which = np.array([names.index(name) for name in _chosen(run, options)])
+        self._which = np.array(_places(run, options))
         self._scales = np.asarray(there.geometry.scales)
         o = options
         self._settings = Settings(o.largest, o.directions, o.norm, PRECISION, o.confirmations, o.seed)
@@ -291,14 +297,6 @@ _SEARCHED: dict[str, tuple[str, float, str]] = {
 }
 
 
-_LOCAL: dict[str, tuple[str, str]] = {
-    "reactivity": ("largest growth rate of a small disturbance, at any phase", "1/{}"),
-    "amplification": ("largest factor by which a small disturbance grows", "1"),
-    "amplification_time": ("time after the disturbance at which it is largest", "{}"),
-    "return_time": ("time in which small disturbances shrink by e at last", "{}"),
-}
-
-
 class _Result:
     """Arrays of the result, filled point by point."""
 
@@ -318,22 +316,12 @@ class _Result:
             if name in ("low", "high", "to", "n_undecided"):
                 self._new(f"along_{name}", dtype, fill, f"boundary along a state: {meaning}", ("state",))
         self._new("along", "float64", np.nan, "boundary along a state: jump", ("state",), "see state_units")
-        for name, text in (("mean_time", "mean time until arrival"), ("longest_time", "longest time until arrival")):
-            self._new(name, "float64", np.nan, f"{text}, drive periods or returns")
-        self._new("mean_time_stderr", "float64", np.nan, "standard error of the mean time")
-        self._new("n_timed", "int64", 0, "timed initial states that end on it")
-        self._new("weighted_time", "float64", np.nan, "mean time until arrival, weighed by the density")
-        self._new("n_effective", "float64", np.nan, "independent cells of equal weight with the same error")
-        for name, (text, units) in _LOCAL.items():
-            self._new(name, "float64", np.nan, text, units=units.format(time_unit(run.model)))
-        self._new("quantity", "float64", np.nan, f"quantity {options.quantity}".strip())
-        for end in ("", "_low", "_high"):
-            self._new(f"basin_stability{end}", "float64", np.nan, "share of the cells that end on it")
-            self._new(f"weighted_stability{end}", "float64", np.nan, "share of the density that ends on it")
-            self._new(f"arrived{end}", "float64", np.nan, "share of initial states that have arrived in time")
+        for name, (text, units) in _NUMBERS.items():
+            self._new(name, *(("int64", 0) if name == "n_timed" else ("float64", np.nan)), text, units=units)
 
     def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
         values = np.full((self._attractors.sizes[SET], *(self._n_states for _ in own)), fill, dtype)
+        units = units.format(time_unit(self._run.model))
         self.arrays[name] = ((SET, *own), values, {"units": units, "long_name": text})
 
     def _put(self, name: str, at: Any, value: Any) -> None:
@@ -361,7 +349,7 @@ class _Result:
 
     def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray, weights: np.ndarray) -> None:
         """Fill in the arrival times of initial states, by attractor."""
-        counted = int((label != -1).sum())
+        counted, total = int((label != -1).sum()), weights[label != -1].sum()
         for i in np.unique(label[label >= 0]).tolist():
             chosen, at = (label == i) & np.isfinite(entered), self._rows[index][i]
             own, weight = entered[chosen], weights[chosen]
@@ -370,6 +358,8 @@ class _Result:
             if len(own):
                 self._put("mean_time", at, own.mean())
                 self._put("longest_time", at, own.max())
+            if total > 0.0:
+                self._put("weighted_arrived", at, weight[own <= self._options.within].sum() / total)
             if weight.any():
                 self._put("weighted_time", at, np.average(own, weights=weight))
             if len(own) > 1:
@@ -396,12 +386,12 @@ class _Result:
     def shocks(self, index: tuple[int, ...], found: dict[tuple[int, str], tuple[Found, Bases]]) -> None:
         """Fill in the critical shocks of a parameter point."""
         scales = np.asarray(self._run.model.scales)
-        names = list(self._run.model.state_names)
-        which = [names.index(name) for name in _chosen(self._run, self._options)]
+        which = _places(self._run, self._options)
         for (own, what), (one, bases) in found.items():
             at = self._rows[index][own]
             if what not in ("shock", "any"):
-                self._along(at, int(what), one, scales)
+                self._searched("along", (at, int(what)), one)
+                self._put("along", (at, int(what)), one.shock[0] * scales[int(what)])
                 continue
             name = "shock" if what == "shock" else "distance"
             self._searched(name, at, one)
@@ -413,16 +403,10 @@ class _Result:
             self._put(f"{name}_phase", at, bases.phase[one.base])
             self._put(f"{name}_from", at, bases.states[one.base])
 
-    def _searched(self, name: str, at: int, one: Found) -> None:
-        values = {"low": one.low, "high": one.high, "to": one.leads_to, "safe": one.safe}
-        for key, value in {**values, "n_below": one.n_below, "n_undecided": one.n_undecided}.items():
-            self._put(f"{name}_{key}", at, value)
-
-    def _along(self, at: int, state: int, one: Found, scales: np.ndarray) -> None:
-        values = {"low": one.low, "high": one.high, "to": one.leads_to, "n_undecided": one.n_undecided}
-        for key, value in values.items():
-            self._put(f"along_{key}", (at, state), value)
-        self._put("along", (at, state), one.shock[0] * scales[state])
+    def _searched(self, name: str, at: Any, one: Found) -> None:
+        for key in ("low", "high", "to", "safe", "n_below", "n_undecided"):
+            if f"{name}_{key}" in self.arrays:
+                self._put(f"{name}_{key}", at, getattr(one, key))
 
     def dataset(self) -> xr.Dataset:
         """Return all arrays, with the attractors' features."""
@@ -508,10 +492,9 @@ def size_of(low: float, high: float) -> str:
 
 def _words(attrs: Mapping[str, Any], row: Row) -> Words:
     is_weighed, has_quantity = attrs["resilience_density"] != "1", attrs["resilience_quantity"] != ""
-    share = f"{row['basin_stability']:.4f} ({row['basin_stability_low']:.4f} to {row['basin_stability_high']:.4f})"
     return {
         "letter": row["letter"],
-        "basin stability": share if np.isfinite(row["basin_stability"]) else "-",
+        "basin stability": with_interval(row, _STABILITY, ".4f"),
         "in time": number(row["arrived"], ".3f"),
         "mean time": number(row["mean_time"], ".1f"),
         "longest": number(row["longest_time"], ".0f"),
@@ -521,6 +504,7 @@ def _words(attrs: Mapping[str, Any], row: Row) -> Words:
         "distance": size_of(row["distance_low"], row["distance_high"]),
         "to ": row["distance_leads_to"],
         "weighted stability": with_interval(row, _WEIGHTED, ".4f") if is_weighed else None,
+        "weighted in time": number(row["weighted_arrived"], ".3f") if is_weighed else None,
         "weighted time": number(row["weighted_time"], ".1f") if is_weighed else None,
         "reactivity": number(row["reactivity"], ".4g"),
         "amplification": number(row["amplification"], ".4g"),

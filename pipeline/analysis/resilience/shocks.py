@@ -124,7 +124,7 @@ class Found:
     high: float
     shock: np.ndarray  # (dim,): the shock of size `high`; NaN if none was found
     base: int  # number of its base state, -1 if none was found
-    leads_to: int  # label of the end, `UNDECIDED` if none was found
+    to: int  # label of the end, `UNDECIDED` if none was found
     safe: float  # size of the largest shell below `low` of which all shocks stayed; 0 if there is none
     n_below: int  # number of shocks smaller than `low` that were tried; all of them stayed
     n_undecided: int  # number of shocks smaller than `high` whose end is not known
@@ -179,7 +179,7 @@ class ShockSearch:
         """Search: a generator that yields trials, receives their labels and returns a `Found`."""
         rays = yield from self._outer()
         if not len(rays.base):
-            return self._nothing()
+            return self._found(None)
         yield from self._narrow(rays, COARSE)
         best = self._best(rays)
         if self._dim > 1 or self._n_bases > 1:
@@ -196,7 +196,7 @@ class ShockSearch:
             yield from self._descend(best)
         best = best.take(np.argsort(best.high, kind="stable")[:1])
         yield from self._narrow(best, self._settings.precision)
-        return self._result(best)
+        return self._found(best)
 
     # ---- trials --------------------------------------------------------------------------------
 
@@ -350,28 +350,19 @@ class ShockSearch:
 
     # ---- result --------------------------------------------------------------------------------
 
-    def _tried(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.concatenate([np.zeros(0), *self._sizes]), np.concatenate([np.zeros(0, np.int64), *self._codes])
-
-    def _result(self, best: _Rays) -> Found:
-        size, code = self._tried()
-        high = float(best.high[0])
-        unknown = (code == -1) & (size < high)
-        low = float(size[unknown].min()) if unknown.any() else float(best.low[0])
-        shock = high * best.unit[0]
-        return self._found(low, high, shock, int(best.base[0]), int(best.label[0]))
-
-    def _nothing(self) -> Found:
-        size, code = self._tried()
-        unknown = size[code == -1].tolist()
-        return self._found(min([self._settings.largest, *unknown]), np.inf, np.full(self._dim, np.nan), -1, UNDECIDED)
-
-    def _found(self, low: float, high: float, shock: np.ndarray, base: int, label: int) -> Found:
-        size, code = self._tried()
+    def _found(self, best: _Rays | None) -> Found:
+        """Return the best shock, with what was tried below it; without a ray, that none was found."""
+        size, code = np.concatenate([np.zeros(0), *self._sizes]), np.concatenate([np.zeros(0, int), *self._codes])
+        low, high, shock, base, label = self._settings.largest, np.inf, np.full(self._dim, np.nan), -1, UNDECIDED
+        if best is not None:
+            low, high, base, label = float(best.low[0]), float(best.high[0]), int(best.base[0]), int(best.label[0])
+            shock = high * best.unit[0]
+        unknown = size[(code == -1) & (size < high)]
+        if len(unknown):
+            low = float(unknown.min()) if best is not None else min(low, float(unknown.min()))
         safe = max([0.0, *(shell for shell, stays in self._shells if stays and shell <= low)])
         n_below = int(((size <= low) & (code == 0)).sum())
-        n_unknown = int(((size < high) & (code == -1)).sum())
-        return Found(low, high, shock, base, label, safe, n_below, n_unknown)
+        return Found(low, high, shock, base, label, safe, n_below, len(unknown))
 
 
 @dataclass(frozen=True)

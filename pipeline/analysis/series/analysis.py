@@ -1,23 +1,72 @@
-"""Analyse a recording or a trajectory: a table of what its dynamics are, and the curves behind it."""
+"""Analyse a time series: a table of what it says of its dynamics, and the curves behind it.
+
+A rule that all results share: a series that is not stationary, too short or too noisy gets no exponent, no dimension
+and no name of its motion.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
-from pipeline.analysis.chaos.zero_one import SHORTEST
-from pipeline.analysis.series.embedding import Series
-from pipeline.analysis.series.measure import Measured, measure
+from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
+from pipeline.analysis.intervals import binomial_interval, half_width
+from pipeline.analysis.run import OpenRun
+from pipeline.analysis.series.correlation import Sums, correlation_sums
+from pipeline.analysis.series.divergence import Divergence, divergence
+from pipeline.analysis.series.embedding import (
+    FEW_FALSE,
+    MOST_DIMENSIONS,
+    N_BLOCKS,
+    Embedding,
+    Floats,
+    Series,
+    false_neighbours,
+    first_minimum,
+    mutual_information,
+)
+from pipeline.analysis.series.recurrence import Recurrence, recurrence
+from pipeline.analysis.series.returns import Returns, returns_of
+from pipeline.analysis.series.surrogates import N_SURROGATES, against_noise
+from pipeline.analysis.sets import Geometry
 from pipeline.analysis.spectrum.estimate import pieces_of, spectrum_of
+from pipeline.analysis.spectrum.motions import channels_of, clock_of, motions_of, row_axis, sampled
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
 from pipeline.products.product import Table
+from pipeline.products.spectrum import SeriesOptions
 
 MOST_VECTORS = 4000
 """Most delay vectors that are kept for the figure."""
+
+PER_DELAY = 8
+"""Samples per delay that are kept: more are averaged."""
+
+DRIFT = 0.002
+"""Probability by chance below which a trend over the stretches counts as drift."""
+
+LEAST_DRIFT = 0.1
+"""Least range of level or size over the stretches that counts as drift, relative to the standard deviation."""
+
+ORDERLY, DISORDERLY = 0.15, 0.85
+"""Results of the 0-1 test up to which a motion is regular, and from which on it is not."""
+
+MOTIONS = ("not decided", "periodic", "regular", "chaotic")
+
+
+class Result(NamedTuple):
+    """A quantity with its interval; a value that is not decided is NaN and has a reason."""
+
+    name: str
+    unit: str
+    value: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
+    reason: str = ""
 
 
 def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset:
@@ -63,53 +112,222 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
     series = Series.of(pieces, 1.0 / rate)
     if not np.ptp(series.values) > 0.0:
         raise ValueError(f"channel {channel!r} is constant.")
-    found = measure(series, seed)
     about = {"title": "series", "channel": channel, "unit": shown_unit(ds[channel].attrs, "1"), "seed": seed}
     power = spectrum_of(ds, channel).isel(spectrum=0).reset_coords("frequency_hz")[["power", "frequency_hz"]]
-    return xr.merge([_dataset(found), power.drop_vars("order", errors="ignore")]).assign_attrs(
-        {**told_by(ds.attrs), **about, "motion": found.motion[0], "motion_reason": found.motion[1]}
-    )
+    found = xr.merge([_measured(series, seed), power.drop_vars("order", errors="ignore")])
+    return found.assign_attrs({**told_by(ds.attrs), **about})
 
 
-def _dataset(found: Measured) -> xr.Dataset:
-    """Return a dataset with the results and the curves of a series."""
-    embedding, parted, returns = found.embedding, found.divergence, found.returns
-    over = "quantity"
-    variables: dict[str, Any] = {
-        name: (over, np.array([getattr(r, name) for r in found.results], float)) for name in ("value", "low", "high")
-    }
-    variables |= {name: (over, [getattr(r, name) for r in found.results]) for name in ("unit", "reason")}
+def _measured(series: Series, seed: int) -> xr.Dataset:
+    """Return all results and curves of a series."""
+    rough, information, has_minimum = _delay_of(series)
+    returns = returns_of(series, rough)
+    delay = min(rough, max(1, round(returns.mean / series.step / 4))) if returns.mean > 0.0 else rough
+    coarse = series.averaged(max(1, delay // PER_DELAY))
+    delay = max(1, round(delay * series.step / coarse.step))
+    period = max(4, round((returns.mean / coarse.step) if returns.mean > 0.0 else 4 * delay))
+    false = false_neighbours(coarse, delay, period)
+    enough = np.flatnonzero(false < FEW_FALSE)
+    embedding = Embedding(coarse, delay, int(enough[0]) + 1 if len(enough) else 5, period)
+    parted = divergence(embedding, period, returns.in_cycle > 0)
+    longest = max(coarse.pieces(), key=len)
+    noise = against_noise(longest, delay, embedding.dimension, period, np.random.default_rng(seed))
+    drift = _drift(coarse)
+    sums = correlation_sums(embedding, parted.grows)
+    own = recurrence(embedding)
+    results = [
+        _delay_result(series, rough, has_minimum),
+        _dimension_result(embedding, false),
+        *_period_results(returns),
+        _exponent_result(parted, noise, drift),
+        _unless(drift or sums.reason, Result("correlation_dimension", "1", sums.value, sums.low, sums.high)),
+        _zero_one_result(longest, delay, drift),
+        *_recurrence_results(own),
+        _surrogate_result(noise),
+    ]
+    motion, reason = _motion(returns, {r.name: r for r in results}, parted, drift)
+    variables = {name: ("quantity", [getattr(r, name) for r in results]) for name in Result._fields[1:]}
+    lags = ("lag", np.arange(len(information)) * series.step, {"units": "s"})
+    variables["mutual_information"] = ("lag", information, {"units": "1"})
+    variables["false_neighbours"] = ("dimension", false, {"units": "1"})
+    coords = {"quantity": [r.name for r in results], "lag": lags, "dimension": np.arange(1, len(false) + 1)}
+    curves = _curves(embedding, returns, parted, sums, own)
+    return xr.merge([xr.Dataset(variables, coords), curves]).assign_attrs(motion=motion, motion_reason=reason)
+
+
+def _curves(
+    embedding: Embedding, returns: Returns, parted: Divergence, sums: Sums, own: Recurrence | None
+) -> xr.Dataset:
+    """Return the curves of a series' figure."""
     pure, seconds = {"units": "1"}, {"units": "s"}
-    variables["mutual_information"] = ("lag", found.information, pure)
-    variables["false_neighbours"] = ("dimension", found.false, {"units": "1"})
-    line = np.where((parted.time >= parted.fit[0]) & (parted.time <= parted.fit[1]), 1.0, np.nan)
+    inside = (parted.time >= parted.fit[0]) & (parted.time <= parted.fit[1])
+    line = np.where(inside, parted.offset + parted.value * parted.time, np.nan)
+    firsts, series = returns.pairs(), embedding.series
+    starts = series.starts(embedding.delay)[:MOST_VECTORS]
     about = {**pure, "long_name": "mean log distance of neighbours, of random pairs 0"}
-    variables["divergence"] = ("elapsed", parted.curve, about)
-    variables["fit_line"] = ("elapsed", line * (parted.offset + parted.value * parted.time), pure)
-    firsts = returns.pairs()
-    variables["maximum"] = ("return", returns.height[firsts])
-    variables["next_maximum"] = ("return", returns.height[firsts + 1])
-    starts = embedding.series.starts(embedding.delay)[:MOST_VECTORS]
-    pair = np.stack([embedding.series.values[starts], embedding.series.values[starts + embedding.delay]], axis=1)
-    variables["vector"] = (("delayed", "coordinate"), pair)
-    variables["surrogate_error"] = ("surrogate", found.surrogates[1], {"units": "1"})
-    variables["prediction_error"] = ((), found.surrogates[0], {"units": "1"})
-    if found.recurrence is not None:
-        variables["recurrent"] = (("row", "column"), found.recurrence.matrix)
-    sums = found.sums
-    variables["correlation_sum"] = (("embedding", "radius"), sums.share, {"units": "1"})
-    variables |= {"fit_low": ((), sums.fit[0]), "fit_high": ((), sums.fit[1])}
+    curves = {
+        "divergence": ("elapsed", parted.curve, about),
+        "fit_line": ("elapsed", line, pure),
+        "maximum": ("return", returns.height[firsts]),
+        "next_maximum": ("return", returns.height[firsts + 1]),
+        "vector": (("delayed", "coordinate"), series.values[starts[:, None] + [0, embedding.delay]]),
+        "correlation_sum": (("embedding", "radius"), sums.share, pure),
+        "fit_low": ((), sums.fit[0]),
+        "fit_high": ((), sums.fit[1]),
+    }
     coords: dict[str, Any] = {
-        over: [r.name for r in found.results],
-        "lag": ("lag", np.arange(len(found.information)) * found.step, seconds),
-        "dimension": np.arange(1, len(found.false) + 1),
         "elapsed": ("elapsed", parted.time, seconds),
         "embedding": list(sums.dimensions),
-        "radius": ("radius", sums.radius, {"units": "1"}),
+        "radius": ("radius", sums.radius, pure),
     }
-    if found.recurrence is not None:
-        coords |= {name: (name, found.recurrence.time, seconds) for name in ("row", "column")}
-    return xr.Dataset(variables, coords)
+    if own is not None:
+        curves["recurrent"] = (("row", "column"), own.matrix)
+        coords |= {name: (name, own.time, seconds) for name in ("row", "column")}
+    return xr.Dataset(curves, coords)
+
+
+def _delay_of(series: Series) -> tuple[int, Floats, bool]:
+    """Return the delay [samples], the mutual information, and whether it has a minimum there.
+
+    Without one the delay is the lag at which a fraction 1/e of the information is left.
+    """
+    information = mutual_information(series, min(2000, len(max(series.pieces(), key=len)) // 8))
+    lag = first_minimum(information)
+    if lag is not None:
+        return lag, information, True
+    return max(1, int(np.argmax(information < information[0] / np.e))), information, False
+
+
+def _delay_result(series: Series, delay: int, decided: bool) -> Result:
+    if not decided:
+        return Result("delay", "s", reason="mutual information has no minimum")
+    parts = np.array_split(series.values, 4)
+    lags = [first_minimum(mutual_information(Series.of([part], series.step), 3 * delay)) for part in parts]
+    found = np.array([lag for lag in lags if lag is not None] + [delay]) * series.step
+    return Result("delay", "s", delay * series.step, found.min(), found.max())
+
+
+def _dimension_result(embedding: Embedding, false: Floats) -> Result:
+    name, series = "embedding_dimension", embedding.series
+    if not (false < FEW_FALSE).any():
+        least = float(np.nanmin(false)) if np.isfinite(false).any() else np.nan
+        return Result(name, "1", reason=f"{least:.1%} false neighbours are left: noise, or too few samples")
+    found = [embedding.dimension]
+    for half in np.array_split(series.values, 2):
+        own = false_neighbours(Series.of([half], series.step), embedding.delay, embedding.theiler, 500)
+        enough = np.flatnonzero(own < FEW_FALSE)
+        found.append(int(enough[0]) + 1 if len(enough) else MOST_DIMENSIONS)
+    return Result(name, "1", embedding.dimension, min(found), max(found))
+
+
+def _period_results(returns: Returns) -> list[Result]:
+    if returns.reason:
+        return [Result(name, "s", reason=returns.reason) for name in ("period", "period_scatter")]
+    n = len(returns.time)
+    low, high = (returns.scatter * np.sqrt((n - 1) / stats.chi2.ppf(q, n - 1)) for q in (0.975, 0.025))
+    found = [
+        Result("period", "s", returns.mean, returns.low, returns.high),
+        Result("period_scatter", "s", returns.scatter, low, high),
+    ]
+    cycle = returns.in_cycle
+    return [*found, Result("cycle", "maxima", cycle, cycle, cycle)] if cycle else found
+
+
+def _exponent_result(parted: Divergence, noise: tuple[float, Floats], drift: str) -> Result:
+    reason = drift or parted.reason
+    if not reason and parted.grows and not noise[0] < noise[1].min():
+        reason = "linear noise with the same spectrum is predicted as well"
+    if not reason and parted.low < 0.0 and parted.curve[-1] - parted.curve[0] >= 1.0:
+        reason = "the error is larger than the exponent"
+    return _unless(reason, Result("exponent", "1/s", parted.value, parted.low, parted.high))
+
+
+def _unless(reason: str, result: Result) -> Result:
+    """Return a result, without its values if there is a reason against it."""
+    return Result(result.name, result.unit, reason=reason) if reason else result
+
+
+def _zero_one_result(values: Floats, delay: int, drift: str) -> Result:
+    stride = 2 * delay
+    n = len(values) // stride
+    if drift or n < SHORTEST:
+        return Result("zero_one", "1", reason=drift or f"{n} samples two delays apart, fewer than {SHORTEST}")
+    chosen = values[: n * stride : stride][:4000]
+    ds = xr.Dataset({"section": (("period_index", "state"), chosen[:, None])})
+    one = zero_one_test(ds, geometry=Geometry((False,), (float(values.std()),)))
+    value, error = float(one["zero_one"]), 2.0 * float(one["zero_one_stderr"])
+    ends = [v for v in (value - error, value + error, float(one["zero_one_half"])) if np.isfinite(v)]
+    low, high = min(ends), max(ends)
+    reason = "" if high < ORDERLY or low > DISORDERLY else f"{low:.2f} to {high:.2f}: neither bounded nor diffusive"
+    return _unless(reason, Result("zero_one", "1", value, low, high))
+
+
+def _recurrence_results(found: Recurrence | None) -> list[Result]:
+    units = {"determinism": "1", "laminarity": "1", "mean_line": "s", "line_entropy": "nats"}
+    if found is None:
+        return [Result(name, unit, reason="too few vectors") for name, unit in units.items()]
+    results = []
+    for name, unit in units.items():
+        value, half = found.measures[name], half_width(found.parts[name])
+        most = 1.0 if name in ("determinism", "laminarity") else np.inf
+        results.append(Result(name, unit, value, max(value - half, 0.0), min(value + half, most)))
+    return results
+
+
+def _surrogate_result(noise: tuple[float, Floats]) -> Result:
+    error, others = noise
+    if not np.isfinite(error):
+        return Result("surrogate_rank", "1", reason="too few vectors to predict")
+    n_better = int((others <= error).sum())
+    low, high = binomial_interval(n_better, N_SURROGATES, confidence=0.95, method="clopper-pearson")
+    return Result("surrogate_rank", "1", n_better / N_SURROGATES, float(low), float(high))
+
+
+def _drift(series: Series) -> str:
+    """Return why a series is not stationary: a trend of the level or the size over stretches; else an empty text."""
+    pieces = series.pieces()
+    parts = pieces if len(pieces) >= N_BLOCKS else np.array_split(series.values, N_BLOCKS)
+    for name, values in (("level", [p.mean() for p in parts]), ("size", [p.std() for p in parts])):
+        relative = np.ptp(values) / series.values.std()
+        if relative > LEAST_DRIFT and stats.kendalltau(np.arange(len(parts)), values).pvalue < DRIFT:
+            return f"not stationary: its {name} drifts by {relative:.0%}"
+    return ""
+
+
+def _motion(returns: Returns, results: dict[str, Result], parted: Divergence, drift: str) -> tuple[str, str]:
+    """Return the name of the motion, and what it rests on or why it is not decided."""
+    exponent, diffuses = results["exponent"], results["zero_one"]
+    if drift:
+        return MOTIONS[0], drift
+    if exponent.reason:
+        return MOTIONS[0], exponent.reason
+    if parted.grows:
+        if diffuses.value < ORDERLY:
+            return MOTIONS[0], "the exponent is positive, but the 0-1 test bounded"
+        return MOTIONS[3], "neighbours part exponentially, and linear noise does not explain it"
+    if diffuses.value > DISORDERLY:
+        return MOTIONS[0], "neighbours stay close, but the 0-1 test diffuses"
+    if returns.in_cycle:
+        return MOTIONS[1], f"{returns.in_cycle} maxima repeat"
+    return MOTIONS[2], "neighbours stay close"
+
+
+def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
+    """Sample the motion of an attractor or a cell, and measure what the series says; see `series_of`."""
+    motions = motions_of(run, options)
+    if len(motions) > 1:
+        raise ValueError(f"a series is that of one motion, and {len(motions)} are there: take at, attractor or cell.")
+    (motion,) = motions
+    rate = clock_of(motion)
+    channel = next(v for v in channels_of(run.model) if v.name == options.channel)
+    values = sampled(motion, rate, options.periods, options.samples, channels_of(run.model).index(channel))
+    if values is None:
+        raise ValueError("the trajectory diverges or fails: no series.")
+    time = np.arange(len(values)) / (rate * options.samples)
+    told = told_by(run.cube().attrs)
+    ds = xr.Dataset({channel.name: ("time", values, {"units": channel.unit})}, {"time": time}, told)
+    where = {row_axis(name): value for name, value in motion.where.items()}
+    return series_of(ds, seed=options.seed).assign_coords(where, attractor=motion.attractor)
 
 
 def series_table(ds: xr.Dataset) -> Table:

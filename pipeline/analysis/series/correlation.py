@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
-from pipeline.analysis.series.embedding import Embedding, Floats
+from pipeline.analysis.intervals import half_width
+from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats
 
-PER_OCTAVE = 4
-"""Radii per factor of two."""
-
-N_OCTAVES = 12
-"""Factors of two from the largest radius, the size of the set, to the least."""
+LARGEST, PER_OCTAVE, N_OCTAVES = 4.0, 4, 12
+"""Largest radius [standard deviations], radii per factor of two, and factors of two from it to the least."""
 
 N_REFERENCES, N_POINTS = 2400, 12_000
 """Vectors whose pairs are counted, and vectors that they are paired with."""
-
-N_BLOCKS = 8
-"""Stretches of the series over which the standard error is taken."""
 
 FEWEST_PAIRS, MOST_OF_MIXING = 400, 0.01
 """Pairs at the least radius of a fit of a motion that mixes, and share of all pairs at its largest."""
@@ -72,7 +66,7 @@ def correlation_sums(embedding: Embedding, mixes: bool) -> Sums:
     """
     dimensions = tuple(range(embedding.dimension, embedding.dimension + 3))
     counts, near, n_pairs = _counts(embedding, dimensions)
-    radius = 2.0 ** (-np.arange(N_OCTAVES * PER_OCTAVE + 1)[::-1] / PER_OCTAVE) * _SIZE
+    radius = 2.0 ** (-np.arange(N_OCTAVES * PER_OCTAVE + 1)[::-1] / PER_OCTAVE) * LARGEST
     share = counts.sum(axis=1) / max(n_pairs, 1)
     plain = Sums(dimensions, radius, share)
     pairs = counts.sum(axis=1)
@@ -83,7 +77,7 @@ def correlation_sums(embedding: Embedding, mixes: bool) -> Sums:
         enough = (near >= FEWEST_SAMPLES * near[:, :1]) & (pairs >= FEWEST_PASSES * near) & (share <= MOST_OF_OTHERS)
     places = np.flatnonzero(enough.all(axis=0))
     if len(places) <= LEAST_OCTAVES * PER_OCTAVE:
-        return _undecided(plain, "too few vectors: no two octaves of radii between pairs and edges")
+        return replace(plain, reason="too few vectors: no two octaves of radii between pairs and edges")
     x = np.log(radius)
     with np.errstate(divide="ignore"):
         logs, by_block = np.log(share), np.log(counts[1])
@@ -91,24 +85,16 @@ def correlation_sums(embedding: Embedding, mixes: bool) -> Sums:
     if chosen is None:
         slopes = [_slope(x, one, places) for one in logs]
         told = ", ".join(f"{slope:.2f}" for slope in slopes)
-        return _undecided(plain, f"no plateau: slopes {told} for {dimensions[0]} to {dimensions[-1]} delays")
+        return replace(plain, reason=f"no plateau: slopes {told} for {dimensions[0]} to {dimensions[-1]} delays")
     slopes, bend = _slopes(x, logs, chosen)
     blocks = [_slope(x, one, chosen) for one in by_block if np.isfinite(one[chosen]).all()]
     if len(blocks) < N_BLOCKS:
-        return _undecided(plain, "a stretch of the series has no close pairs")
+        return replace(plain, reason="a stretch of the series has no close pairs")
     value = float(np.mean(slopes))
     if value > 0.75 * dimensions[0] + 0.25:
-        return _undecided(plain, f"slopes near {value:.2f} fill the embedding: noise, or too few delays")
-    half = float(stats.t.ppf(0.975, N_BLOCKS - 1) * np.std(blocks, ddof=1) / np.sqrt(N_BLOCKS)) + bend
-    return Sums(dimensions, radius, share, value, value - half, value + half, (radius[chosen[0]], radius[chosen[-1]]))
-
-
-_SIZE = 4.0
-"""Largest radius [standard deviations]."""
-
-
-def _undecided(plain: Sums, reason: str) -> Sums:
-    return Sums(plain.dimensions, plain.radius, plain.share, reason=reason)
+        return replace(plain, reason=f"slopes near {value:.2f} fill the embedding: noise, or too few delays")
+    half, fit = half_width(blocks) + bend, (float(radius[chosen[0]]), float(radius[chosen[-1]]))
+    return replace(plain, value=value, low=value - half, high=value + half, fit=fit)
 
 
 def _counts(embedding: Embedding, dimensions: tuple[int, ...]) -> tuple[Counts, Counts, int]:
@@ -122,7 +108,7 @@ def _counts(embedding: Embedding, dimensions: tuple[int, ...]) -> tuple[Counts, 
         return counts, near, 0
     starts = starts[:: max(1, -(-len(starts) // N_POINTS))]
     references = starts[np.unique(np.linspace(0, len(starts) - 1, N_REFERENCES).round().astype(int))]
-    scale = float(embedding.series.values.std()) * _SIZE
+    scale = float(embedding.series.values.std()) * LARGEST
     points = widest.vectors(starts) / scale
     n_pairs = 0
     for block, part in enumerate(np.array_split(references, N_BLOCKS)):

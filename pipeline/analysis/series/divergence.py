@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
-from pipeline.analysis.series.embedding import Embedding, Floats, Ints
+from pipeline.analysis.intervals import half_width
+from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, Ints
 
 N_REFERENCES = 1600
 """Vectors whose neighbours are followed."""
-
-N_BLOCKS = 8
-"""Stretches of the series over which the standard error is taken."""
 
 PERIODS = 12
 """Mean periods for which neighbours are followed."""
@@ -119,15 +116,11 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
         return _fitted(plain, smooth, *chosen)
     growth = float(curve[-1] - curve[start])
     if abs(growth) >= NO_GROWTH:
-        return _with(plain, f"no straight range of {LEAST_GROWTH} nats below the size of the set")
+        return replace(plain, reason=f"no straight range of {LEAST_GROWTH} nats below the size of the set")
     is_closer = curve[-1] < min(at_phase, -0.5) - CLOSER
     if not is_closer and at_phase > (REPEATED if is_closed else THIN):
-        return _with(plain, "neighbours are no closer than other passes: noise, or too few vectors")
+        return replace(plain, reason="neighbours are no closer than other passes: noise, or too few vectors")
     return _fitted(plain, smooth, start, len(time) - 1)
-
-
-def _with(plain: Divergence, reason: str) -> Divergence:
-    return Divergence(plain.time, plain.curve, plain.at_phase, reason=reason)
 
 
 def _across(embedding: Embedding, first: Ints, second: Ints, side: int) -> Floats:
@@ -189,9 +182,8 @@ def _fitted(plain: Divergence, blocks: Floats, start: int, end: int) -> Divergen
     slopes = [_slope(time, block, start, end) for block in blocks]
     middle = (start + end) // 2
     bend = abs(_slope(time, curve, start, middle) - _slope(time, curve, middle, end))
-    half = float(stats.t.ppf(0.975, N_BLOCKS - 1) * np.std(slopes, ddof=1) / np.sqrt(N_BLOCKS)) + bend
     value = _slope(time, curve, start, end)
-    half += FINITE * abs(value)
+    half = half_width(slopes) + bend + FINITE * abs(value)
     offset = float(curve[start : end + 1].mean() - value * time[start : end + 1].mean())
     ends = (float(time[start]), float(time[end]))
-    return Divergence(time, curve, plain.at_phase, value, value - half, value + half, ends, offset)
+    return replace(plain, value=value, low=value - half, high=value + half, fit=ends, offset=offset)

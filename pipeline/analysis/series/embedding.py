@@ -22,6 +22,9 @@ FEW_FALSE = 0.01
 FALSE_RATIO, FALSE_SIZE = 15.0, 2.0
 """A neighbour is false if one more coordinate parts it by so many times its distance, or standard deviations."""
 
+N_BLOCKS = 8
+"""Stretches of a series that are compared, and from whose scatter intervals are taken."""
+
 AT_ONCE = 4_000_000
 """Most distances that are held at a time."""
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal, stats
+from scipy import signal
 
-from pipeline.analysis.series.embedding import Floats, Series
+from pipeline.analysis.intervals import half_width
+from pipeline.analysis.series.embedding import N_BLOCKS, Floats, Series
 from pipeline.analysis.series.surrogates import repeats_by_chance
 
 PROMINENCE = 0.1
 """Least height of a maximum over the minima beside it, in standard deviations."""
+
+ABOVE_NOISE = 6.0
+"""The same in standard deviations of the noise that smoothing leaves: lower maxima may be two peaks of one."""
 
 FEWEST = 12
 """Fewest returns from which a period is taken."""
@@ -27,9 +31,6 @@ EXACT, CLOSE = 0.01, 0.12
 
 FEWEST_CYCLES = 20
 """Fewest cycles of a closed orbit with noise: chaos may stay near an unstable orbit for as long as that."""
-
-N_SEGMENTS = 8
-"""Stretches over which intervals are taken."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class Returns:
 def returns_of(series: Series, delay: int) -> Returns:
     """Return the maxima of a series, and its mean period.
 
-    The series is smoothed by parabolas over half a delay, and a maximum is refined by a parabola through three samples.
-    The interval is that of Student from the mean times in `N_SEGMENTS` stretches.
+    The series is smoothed by parabolas over a delay, and a maximum is refined by a parabola through three samples.
+    The interval is that of Student from the mean times in `N_BLOCKS` stretches.
 
     Parameters
     ----------
@@ -75,8 +76,8 @@ def returns_of(series: Series, delay: int) -> Returns:
     cycle = _in_cycle(plain, series)
     of_cycles = plain.pairs(max(cycle, 1))
     spans = (time[of_cycles + max(cycle, 1)] - time[of_cycles]) / max(cycle, 1)
-    means = [part.mean() for part in np.array_split(spans, N_SEGMENTS)]
-    half = float(stats.t.ppf(0.975, N_SEGMENTS - 1) * np.std(means, ddof=1) / np.sqrt(N_SEGMENTS))
+    means = [part.mean() for part in np.array_split(spans, N_BLOCKS)]
+    half = half_width(means)
     irregular = cycle == 0 and scatter > IRREGULAR * mean
     reason = f"times between maxima scatter by {scatter / mean:.0%}" if irregular else ""
     value = float(spans.mean()) if cycle else mean
@@ -86,12 +87,14 @@ def returns_of(series: Series, delay: int) -> Returns:
 def _maxima(series: Series, delay: int) -> tuple[Floats, Floats, np.ndarray]:
     least = PROMINENCE * float(series.values.std())
     window = max(5, delay // 2 * 2 + 1)
+    own = float(signal.savgol_coeffs(window, 2)[window // 2])  # weight of a sample in its smoothed value
     found = []
     for number, piece in enumerate(series.pieces()):
         if len(piece) <= window:
             continue
         smooth = signal.savgol_filter(piece, window, 2)
-        peaks = signal.find_peaks(smooth, prominence=least)[0]
+        noise = float((piece - smooth).std()) * np.sqrt(own / (1.0 - own))
+        peaks = signal.find_peaks(smooth, prominence=max(least, ABOVE_NOISE * noise))[0]
         before, at, after = smooth[peaks - 1], smooth[peaks], smooth[peaks + 1]
         curvature = np.minimum(before - 2.0 * at + after, -1e-300)
         shift = np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)

@@ -7,47 +7,33 @@ enough that almost no power lies in the upper half of the band, where it would f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy import signal
 
-from magpend_core.models.model import Model, Parameters, Quantity, State
-from magpend_core.models.sectioned import of_flow
-from magpend_core.pointwise import evaluate
-from magpend_core.sampling import Drive, sample
-from magpend_core.status import Status
-from pipeline.analysis.attractors.portraits import mean_return
-from pipeline.analysis.ragged import dims_of, places_of_rows, points_of_rows
 from pipeline.analysis.response.orbits import AT_ONCE, Orbit, measures_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.spectrum.estimate import ALL, Averaged, averaged, frequencies_of, power_unit
+from pipeline.analysis.spectrum.motions import (
+    Motion,
+    channels_of,
+    clock_of,
+    motions_of,
+    needs_motion,
+    row_axis,
+    sampled,
+)
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain, words_of
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import RATE, dims_in_own_words
-from pipeline.layout.vocabulary import (
-    BOUNDED_SET,
-    EQUILIBRIUM,
-    FREQUENCY_DIM,
-    KINDS,
-    NOT_SETTLED,
-    PERIODIC_ORBIT,
-    STABILITIES,
-    TORUS,
-    frequency_of,
-    letter,
-    parameters_of,
-    split_dims,
-    told_by,
-)
+from pipeline.layout.vocabulary import EQUILIBRIUM, KINDS, PERIODIC_ORBIT, STABILITIES, TORUS, split_dims, told_by
 from pipeline.products.figures import SpectrumFigureOptions, WaterfallOptions
 from pipeline.products.product import Table
 from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
-from pipeline.specification.problems import unknown_name
 from pipeline.specification.tables import FREQUENCY
 
 FEWEST, MOST = 128, 2048
@@ -66,46 +52,13 @@ SHOWN_LINES = 4
 Array = np.ndarray
 
 
-class Motion(NamedTuple):
-    """A motion whose spectrum is measured: a set at a parameter point, or where a cell goes on."""
-
-    where: dict[str, float]  # values of the swept parameters
-    attractor: int  # id, -1 of a cell on no set
-    kind: int
-    stability: int
-    period: int  # drive periods or returns, 0 if it does not close
-    seconds: float  # of the period
-    share: float  # of the initial conditions
-    state: Array
-    parameters: Parameters
-    clock_hz: float  # frequency of the drive or the strobe; of a flow with a section one over its longest return
-
-
-def _channels(model: Model) -> list[State | Quantity]:
-    both: list[State | Quantity] = [*model.flow.states, *model.flow.quantities]
-    return both
-
-
 def needs_channel(run: OpenRun, options: SpectraOptions) -> None:
     """Raise ValueError unless the options name a channel, a window, and a set or a cell that can be there."""
-    names = [v.name for v in _channels(run.model)]
-    if options.channel and options.channel not in names:
-        raise ValueError(unknown_name("channel", options.channel, names))
+    needs_motion(run, options)
     try:
         signal.get_window(options.window, 8)
     except ValueError as error:
         raise ValueError(f"window {options.window!r}: {error}; scipy.signal.windows lists the names.") from None
-    if options.attractor and not options.attractor.strip().isalnum():
-        raise ValueError(f"attractor {options.attractor!r}: give its letter or its id.")
-    status = run.cube()["status"]
-    select_points(run.cube(), options.at)
-    cell = getattr(options, "cell", None)
-    if cell is None:
-        return
-    if cell >= status.size:
-        raise ValueError(f"cell = {cell} is out of bounds: the run has cells 0 to {status.size - 1}.")
-    if options.at or options.attractor:
-        raise ValueError("cell names a motion already: drop at and attractor.")
 
 
 def needs_axis(run: OpenRun, options: SpectrumFigureOptions | WaterfallOptions) -> None:
@@ -126,13 +79,6 @@ def needs_axis(run: OpenRun, options: SpectrumFigureOptions | WaterfallOptions) 
         select_points(run.cube(), options.at, purpose="spectra are drawn of one parameter point or one cell")
 
 
-def settle_spectrum(run: OpenRun, options: SpectrumOptions) -> SpectrumOptions:
-    """Fill in the channel, and replace the id of an attractor by its letter."""
-    name = options.attractor.strip().upper()
-    chosen = letter(int(name)) if name.isdigit() else name
-    return options.model_copy(update={"channel": options.channel or run.model.state_names[0], "attractor": chosen})
-
-
 def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
     """Measure the spectra of the sets of a run, or of the motion of a cell.
 
@@ -147,9 +93,9 @@ def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
         ``error``; of a torus ``first_hz``, ``second_hz`` (NaN if undecided) and ``explained``, the share of its power
         at their combinations.
     """
-    motions = _motions(run, options)
+    motions = motions_of(run, options)
     run.echo(f"spectrum: {len(motions)} motions")
-    place = [v.name for v in _channels(run.model)].index(options.channel)
+    place = [v.name for v in channels_of(run.model)].index(options.channel)
     rows: list[dict[str, Any]] = [{"estimate": NONE} for _ in motions]
     closed = [i for i, m in enumerate(motions) if m.kind in (PERIODIC_ORBIT, EQUILIBRIUM)]
     for period in sorted({motions[i].period for i in closed}):
@@ -159,56 +105,6 @@ def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
     for i in sorted(set(range(len(motions))) - set(closed)):
         rows[i] = _average(motions[i], place, options)
     return _dataset(run, options, motions, rows)
-
-
-def _motions(run: OpenRun, options: SpectrumOptions) -> list[Motion]:
-    """Return the motions of the chosen sets, or of a cell."""
-    found = run.derive("attractors")
-    dims, _ = split_dims(found["attractor_id"])
-    chosen, where, attractor = run.cube(), dict(options.at), options.attractor
-    if options.cell is not None:
-        status = chosen["status"]
-        place = np.unravel_index(options.cell, status.shape)
-        index = {str(d): int(i) for d, i in zip(status.dims, place, strict=True)}
-        cell = chosen[["status", "section"]].isel(index).load()
-        where = {d: float(found[d][index[d]]) for d in dims}
-        number = int(found["attractor_id"].isel(index))
-        if number < 0:
-            return [_of_cell(found, cell, where)]
-        attractor = letter(number)
-    here = select_points(found, where)
-    axes = dict(zip(dims, places_of_rows(here, dims_of(here)), strict=True))
-    points = points_of_rows(here)
-    motions = []
-    for i, number in enumerate(here["attractor"].values.tolist()):
-        if not attractor or letter(number) == attractor:
-            at = {d: float(values[i]) for d, values in axes.items()}
-            columns = ("kind", "stability", "orbit_period", "period_s", "share")
-            kind, stability, period, seconds, share = (here[name].values[i] for name in columns)
-            base, hertz = _parameters(found, at)
-            told = (int(kind), int(stability), int(period), float(seconds), float(share))
-            motions.append(Motion(at, number, *told, points[i][0], base, hertz))
-    if not motions:
-        there = ", ".join(letter(i) for i in sorted(set(here["attractor"].values.tolist()))) or "none"
-        raise ValueError(f"no set {attractor} is there; it has {there} (magpend analyse attractors).")
-    return motions
-
-
-def _of_cell(found: xr.Dataset, cell: xr.Dataset, where: dict[str, float]) -> Motion:
-    """Return the motion of a cell that is on no known set: where its trajectory goes on."""
-    section = cell["section"].transpose("period_index", "state").values
-    kept = np.flatnonzero(np.isfinite(section).all(axis=1))
-    if not len(kept):
-        raise ValueError(f"the cell has no section from which it could go on: {Status(int(cell['status'])).sentence}.")
-    base, hertz = _parameters(found, where)
-    return Motion(where, -1, BOUNDED_SET, NOT_SETTLED, 0, np.nan, np.nan, section[kept[-1]], base, hertz)
-
-
-def _parameters(found: xr.Dataset, where: Mapping[str, float]) -> tuple[Parameters, float]:
-    """Return the parameters at a point, and the frequency of the drive or the strobe [Hz]."""
-    base = parameters_of(found)
-    values = {**{str(k): float(v) for k, v in found.coords.items() if not v.ndim and v.dtype.kind == "f"}, **where}
-    return base.replace(**{k: v for k, v in values.items() if k in base}), frequency_of(base.model, values)
 
 
 def _lines(motions: Sequence[Motion], place: int, options: SpectrumOptions) -> list[dict[str, Any]]:
@@ -238,15 +134,11 @@ def _lines(motions: Sequence[Motion], place: int, options: SpectrumOptions) -> l
 
 def _average(motion: Motion, place: int, options: SpectrumOptions) -> dict[str, Any]:
     """Average periodograms of a long trajectory; samples are doubled until almost no power folds back."""
-    model = motion.parameters.model
-    rate = motion.clock_hz
-    if model.crossing is not None:
-        returns = 1.0 / mean_return(motion.state[None], motion.parameters, motion.clock_hz)
-        rate = returns if np.isfinite(returns) else rate
+    rate = clock_of(motion)
     n_periods = -(-options.segment * (options.averages + 1) // 2)
     n_samples = max(FEWEST, 1 << (8 * options.orders - 1).bit_length())
     while True:
-        values = _sampled(motion, rate, n_periods, n_samples, place)
+        values = sampled(motion, rate, n_periods, n_samples, place)
         if values is None:
             return {"estimate": NONE}
         found = averaged(
@@ -286,35 +178,6 @@ def _row(
     return row
 
 
-def _sampled(motion: Motion, rate: float, n_periods: int, n_samples: int, place: int) -> Array | None:
-    """Return a channel at even instants of a trajectory, without an angle's mean turning; None if it fails."""
-    flow = of_flow(motion.parameters)
-    times = np.arange(n_periods * n_samples) / (rate * n_samples)
-    # for a flow intervals only bound the steps
-    drive = Drive(np.full(n_periods + 1, 1.0 / rate))
-    found = sample(
-        flow.model.system,
-        flow.pack()[None],
-        motion.state[None],
-        [times],
-        drives=[drive],
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
-        limits_first_step=False,
-    )
-    if found.status[0] != Status.BOUNDED:
-        return None
-    n_states = len(flow.model.states)
-    if place >= n_states:
-        name = flow.model.quantities[place - n_states].name
-        return np.asarray(evaluate([name], times, found.states[0], flow, rate)[:, 0])
-    values = found.states[0, :, place]
-    turns = values[-1] - values[0]
-    if flow.model.system.is_angle[place] and abs(turns) > 2.0 * np.pi:
-        values = values - turns * np.linspace(0.0, 1.0, len(values))
-    return np.asarray(values)
-
-
 _NUMBERS = {
     "n_averages": ("", "number of averaged segments"),
     "resolution_hz": ("Hz", "distance of two bins"),
@@ -331,7 +194,7 @@ def _dataset(
     run: OpenRun, options: SpectrumOptions, motions: Sequence[Motion], rows: Sequence[dict[str, Any]]
 ) -> xr.Dataset:
     model, cube = run.model, run.cube()
-    unit = next(v.unit for v in _channels(model) if v.name == options.channel)
+    unit = next(v.unit for v in channels_of(model) if v.name == options.channel)
     bins = max((len(row["frequency_hz"]) for row in rows if "frequency_hz" in row), default=0)
     table = {name: np.full((len(rows), bins), np.nan) for name in ("frequency_hz", "amplitude", "power")}
     for i, row in enumerate(rows):
@@ -376,11 +239,6 @@ def _column(rows: Sequence[dict[str, Any]], name: str) -> Array:
 def axes_of(ds: xr.Dataset) -> list[str]:
     """Return the names of the coordinates with the swept parameters along the rows."""
     return list(dims_in_own_words(str(ds.attrs.get("axes", "")).split(), str(ds.attrs.get(RATE, FREQUENCY))))
-
-
-def row_axis(name: str) -> str:
-    """Return the name of the coordinate with a swept parameter along the rows, which is none of a variable's."""
-    return name if name == FREQUENCY_DIM else f"at_{name}"
 
 
 _EVIDENCE = ("variance", "kept", "n_averages", "resolution_hz", "bandwidth_hz", "error")

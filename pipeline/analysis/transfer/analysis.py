@@ -25,7 +25,8 @@ variable                       dims              meaning
                                                  same parameter point, with ``_low``, ``_high``, ``_coarse``
 ``place``                      sample, axis      centre of a box
 ``density``                    sample            stationary measure of a box, within its set
-``committor``, ``is_core``     sample            probability to reach the core of its set before the others
+``committor``, ``is_core``     sample            probability to reach the core of its set before the others, with
+                                                 ``_low``, ``_high`` and ``_coarse``
 ============================== ================= ==========================================================
 
 Intervals are percentiles of resamples: of whole cells if there are enough, else of stretches of cells. Sets and cores
@@ -36,7 +37,7 @@ shows the error of the grid.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,9 +58,9 @@ from pipeline.analysis.transfer.ulam import (
     committors,
     conditioned,
     lasting,
+    leading_eigenvalue,
     memberships,
     passage_times,
-    quasi_stationary,
     slow_eigenvalues,
     stationary,
 )
@@ -152,7 +153,7 @@ class Sets:
     density: np.ndarray  # (box,): stationary measure
     n_closed: int
     values: np.ndarray  # (mode,): slow eigenvalues
-    reached: np.ndarray  # (box, set): committors
+    others: np.ndarray  # positions of boxes in further closed sets
 
 
 def sets_of_chain(chain: Chain, options: TransferOptions) -> Sets:
@@ -161,7 +162,7 @@ def sets_of_chain(chain: Chain, options: TransferOptions) -> Sets:
     last = lasting(p)
     density, values = np.zeros(n), np.zeros(0, complex)
     if not len(last):
-        return Sets(np.full(n, -1), [], density, 0, values, np.zeros((n, 0)))
+        return Sets(np.full(n, -1), [], density, 0, values, last)
     stays = conditioned(p[last][:, last])
     classes = sorted(closed_classes(stays), key=len, reverse=True)
     for own in classes:
@@ -177,14 +178,13 @@ def sets_of_chain(chain: Chain, options: TransferOptions) -> Sets:
         parts = [closed[0][belongs == j] for j in range(k)]
         cores = [_core(part, density, options.core) for part in parts if density[part].sum() > 0.0]
     reached = committors(p, cores)
-    if len(cores) > MOST_SETS:
-        kept = np.sort(np.argsort(-reached.mean(axis=0), kind="stable")[:MOST_SETS])
-        cores, reached = [cores[k] for k in kept], reached[:, kept]
-    order = np.argsort([float(chain.boxes[core].mean()) for core in cores], kind="stable")
-    cores, reached = [cores[k] for k in order], reached[:, order]
+    by_share = np.argsort(-reached.mean(axis=0), kind="stable")
+    others = np.concatenate([last[:0], *(cores[k] for k in by_share[MOST_SETS:])])
+    order = sorted(by_share[:MOST_SETS].tolist(), key=lambda k: float(chain.boxes[cores[k]].mean()))
+    reached = reached[:, order]
     of_box = np.where(reached.max(axis=1) > 0.0, reached.argmax(axis=1), -1)
     n_closed = sum(bool(np.allclose(p[own].sum(axis=1), 1.0)) for own in closed)
-    return Sets(of_box, cores, density, n_closed, values, reached)
+    return Sets(of_box, [cores[k] for k in order], density, n_closed, values, others)
 
 
 def _core(part: np.ndarray, density: np.ndarray, share: float) -> np.ndarray:
@@ -195,15 +195,20 @@ def _core(part: np.ndarray, density: np.ndarray, share: float) -> np.ndarray:
 
 
 def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
-    """Return kept measure, rate of escape and mean passage times of the sets of a chain."""
+    """Return committors, kept measure, rate of escape and mean passage times of the sets of a chain."""
     n = len(sets.cores)
-    found = {"kept": np.full(n, np.nan), "escape_rate": np.full(n, np.nan), "passage": np.full((n, MOST_SETS), np.nan)}
+    found: dict[str, np.ndarray] = {
+        "kept": np.full(n, np.nan),
+        "escape_rate": np.full(n, np.nan),
+        "passage": np.full((n, MOST_SETS), np.nan),
+    }
+    found["committor"] = committors(p, [*sets.cores, sets.others])[:, :n]
     for k in range(n):
         own = np.flatnonzero(sets.of_box == k)
         if not len(own):  # of a coarser grid
             continue
         inner = p[own][:, own]
-        rate, _ = quasi_stationary(inner)
+        rate = leading_eigenvalue(inner)
         found["escape_rate"][k] = max(-np.log(rate), 0.0) if rate > 0.0 else np.inf
         weight = sets.density[own]
         if weight.sum() > 0.0:
@@ -219,8 +224,8 @@ def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
     return found
 
 
-def coarsened(chain: Chain, grid: Grid, sets: Sets) -> tuple[Chain, Sets]:
-    """Return the chain on boxes of twice the width; each is in the set and the core that have most of its pairs."""
+def coarsened(chain: Chain, grid: Grid, sets: Sets) -> dict[str, np.ndarray]:
+    """Return the numbers on boxes of twice the width; each is in the set and the core that have most of its pairs."""
     halved = tuple((grid.places_of(chain.boxes) // 2).T)
     boxes, to = np.unique(np.ravel_multi_index(halved, tuple(-(-grid.bins // 2))), return_inverse=True)
     n, entries = len(boxes), chain.counts.tocoo()
@@ -234,21 +239,26 @@ def coarsened(chain: Chain, grid: Grid, sets: Sets) -> tuple[Chain, Sets]:
         return np.asarray(weights.argmax(axis=1) - 1)
 
     in_core = np.full(len(chain.boxes), -1)
-    for k, core in enumerate(sets.cores):
+    for k, core in enumerate([*sets.cores, sets.others]):
         in_core[core] = k
     core_of, density = most(in_core), np.bincount(to, sets.density, n)
-    cores = [np.flatnonzero(core_of == k) for k in range(len(sets.cores))]
-    merged = Sets(most(sets.of_box), cores, density, sets.n_closed, sets.values, sets.reached)
-    return Chain(boxes, counts, np.bincount(to, chain.out, n), chain.unknown), merged
+    *cores, others = (np.flatnonzero(core_of == k) for k in range(len(sets.cores) + 1))
+    merged = replace(sets, of_box=most(sets.of_box), cores=cores, density=density, others=others)
+    found = numbers_of(Chain(boxes, counts, np.bincount(to, chain.out, n), chain.unknown).p, merged)
+    # one step on the fine boxes, later ones on the coarse: the boxes themselves are compared at one place
+    reached = chain.p @ found["committor"][to]
+    for k, core in enumerate(sets.cores):
+        reached[core] = np.arange(len(sets.cores)) == k
+    return found | {"committor": reached}
 
 
 def intervals_of(
     boxes: tuple[np.ndarray, np.ndarray], unit: np.ndarray, chain: Chain, sets: Sets, options: TransferOptions
 ) -> dict[str, np.ndarray]:
-    """Return the ends of the intervals of rates and passage times, from resampled units."""
+    """Return the ends of the intervals of rates, passage times and committors, from resampled units."""
     rng, n_units = np.random.default_rng(options.seed), int(unit.max()) + 1
     there = np.unique(unit)
-    drawn: dict[str, list[np.ndarray]] = {"escape_rate": [], "passage": []}
+    drawn: dict[str, list[np.ndarray]] = {name: [] for name in _WITH_ENDS}
     for _ in range(options.resamples):
         weights = np.bincount(rng.choice(there, len(there)), minlength=n_units)[unit].astype(np.float64)
         found = numbers_of(chain_of(*boxes, weights).p, sets)
@@ -257,8 +267,8 @@ def intervals_of(
     tail = 50.0 * (1.0 - options.confidence)
     ends: dict[str, np.ndarray] = {}
     for name, rows in drawn.items():
-        for end, percent in (("low", tail), ("high", 100.0 - tail)):
-            ends[f"{name}_{end}"] = np.percentile(np.stack(rows), percent, axis=0, method="nearest")
+        both = np.percentile(np.stack(rows), [tail, 100.0 - tail], axis=0, method="nearest")
+        ends |= {f"{name}_low": both[0], f"{name}_high": both[1]}
     for k in range(len(sets.cores)):
         own = sets.cores[k] if sets.n_closed > 1 else np.flatnonzero(sets.of_box == k)
         stayed, left = float(chain.counts[own][:, own].sum()), float((chain.counts.sum(axis=1) + chain.out)[own].sum())
@@ -285,7 +295,7 @@ def transfer(run: OpenRun, options: TransferOptions) -> xr.Dataset:
 def _point(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: TransferOptions) -> dict[str, Any]:
     """Return all variables of one parameter point."""
     if not len(pairs.before):
-        nothing = Sets(np.zeros(0, int), [], np.zeros(0), 0, np.zeros(0, complex), np.zeros((0, 0)))
+        nothing = Sets(np.zeros(0, int), [], np.zeros(0), 0, np.zeros(0, complex), np.zeros(0, int))
         empty = Chain(np.zeros(0, int), csr_array((0, 0)), np.zeros(0), 0.0)
         unsized = np.full(len(names), np.nan)
         return _variables(empty, nothing, {}, np.zeros((0, len(names))), 0) | {"width": unsized}
@@ -294,15 +304,21 @@ def _point(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: 
     chain = chain_of(*boxes)
     sets = sets_of_chain(chain, options)
     found = numbers_of(chain.p, sets) | intervals_of(boxes, pairs.unit, chain, sets, options)
-    coarse = numbers_of((merged := coarsened(chain, grid, sets))[0].p, merged[1])
-    found |= {f"{name}_coarse": coarse[name] for name in ("escape_rate", "passage")}
+    coarse = coarsened(chain, grid, sets)
+    found |= {f"{name}_coarse": coarse[name] for name in _WITH_ENDS}
     n_pairs = int((boxes[0] != OUTSIDE).sum())
     variables = _variables(chain, sets, found, grid.centres_of(chain.boxes), n_pairs)
     return variables | {"width": (grid.high - grid.low) / grid.bins}
 
 
-_REALS = ("escape_rate", "escape_rate_low", "escape_rate_high", "escape_rate_coarse", "kept")
-_PASSAGES = ("passage", "passage_low", "passage_high", "passage_coarse")
+_WITH_ENDS = ("escape_rate", "passage", "committor")
+"""Numbers that have an interval, and a value on coarser boxes."""
+
+_RATES, _PASSAGES, _COMMITTORS = ([f"{name}{end}" for end in ("", "_low", "_high", "_coarse")] for name in _WITH_ENDS)
+_REALS = (*_RATES, "kept")
+_ON_SETS = dict.fromkeys(("is_closed", "measure", "share", *_REALS, N_POINTS), (SET,))
+_ON_SETS |= dict.fromkeys(_PASSAGES, (SET, "target"))
+_ON_BOXES = dict.fromkeys(("density", *_COMMITTORS, "is_core"), (SAMPLE,)) | {"place": (SAMPLE, "axis")}
 
 
 def _variables(
@@ -318,7 +334,7 @@ def _variables(
     measures = np.array([sets.density[own].sum() for own in order])
     of_box = np.concatenate([[0.0], measures])[sets.of_box + 1]
     density = np.divide(sets.density, of_box, out=np.zeros_like(sets.density), where=of_box > 0.0)
-    own = sets.reached[np.arange(len(chain.boxes)), sets.of_box] if n else np.zeros(len(chain.boxes))
+    reached = {name: found.get(name, np.zeros((len(chain.boxes), n))) for name in _COMMITTORS}
     return {
         "n_pairs": n_pairs,
         "n_boxes": len(chain.boxes),
@@ -330,13 +346,13 @@ def _variables(
         ROW_SIZE: n,
         "is_closed": np.array([sets.n_closed > 1] * n, np.int8),
         "measure": np.full(n, np.nan) if sets.n_closed > 1 else measures / max(measures.sum(), 1e-300),
-        "share": sets.reached.mean(axis=0) if n else np.zeros(0),
+        "share": reached["committor"].mean(axis=0) if n else np.zeros(0),
         **{name: found.get(name, np.zeros(0)) for name in _REALS},
         **{name: found.get(name, np.zeros((0, MOST_SETS))) for name in _PASSAGES},
         N_POINTS: np.array([len(part) for part in order], np.int64),
         "place": centres[boxes],
         "density": density[boxes],
-        "committor": own[boxes],
+        **{name: one[boxes, sets.of_box[boxes]] if n else np.zeros(0) for name, one in reached.items()},
         "is_core": is_core[boxes],
     }
 
@@ -353,20 +369,13 @@ def _dataset(
 ) -> xr.Dataset:
     shape = tuple(cube.sizes[d] for d in dims)
     own_dims = {"eigenvalue": ("mode",), "eigenvalue_imaginary": ("mode",), "width": ("axis",)}
-    on_sets = ("is_closed", "measure", "share", *_REALS, N_POINTS)
-    on_boxes = ("density", "committor", "is_core")
+    on_rows = _ON_SETS | _ON_BOXES
     variables: dict[str, Any] = {}
     for name in parts[0]:
         rows = [np.asarray(part[name]) for part in parts]
         units = {"units": next((u for key, u in _UNITS.items() if name.startswith(key)), "1")}
-        if name in on_sets:
-            variables[name] = (SET, np.concatenate(rows), units)
-        elif name in _PASSAGES:
-            variables[name] = ((SET, "target"), np.concatenate(rows), units)
-        elif name in on_boxes:
-            variables[name] = (SAMPLE, np.concatenate(rows), units)
-        elif name == "place":
-            variables[name] = ((SAMPLE, "axis"), np.concatenate(rows), {})
+        if name in on_rows:
+            variables[name] = (on_rows[name], np.concatenate(rows), {} if name == "place" else units)
         else:
             table = np.stack(rows).reshape((*shape, *rows[0].shape))
             variables[name] = ((*dims, *own_dims.get(name, ())), table, units)
@@ -425,7 +434,7 @@ def _words(row: Row) -> Words:
         "boxes": str(row["boxes"]),
         "measure": number(row["measure"], ".4g"),
         "share": number(row["share"], ".4g"),
-        "escape per step": with_interval(row, ("escape_rate", "escape_rate_low", "escape_rate_high"), ".3g"),
+        "escape per step": with_interval(row, _RATES[:3], ".3g"),
         "coarser": number(row["escape_rate_coarse"], ".3g"),
     }
     for name in [name.removeprefix("passage_low_") for name in row if name.startswith("passage_low_")]:

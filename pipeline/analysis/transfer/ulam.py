@@ -147,22 +147,18 @@ def stationary(p: csr_array) -> np.ndarray:
     return np.asarray(pi / pi.sum())
 
 
-def quasi_stationary(p: csr_array) -> tuple[float, np.ndarray]:
-    """Return the leading eigenvalue of a substochastic chain and its left eigenvector, with the sum 1.
+def leading_eigenvalue(p: csr_array) -> float:
+    """Return the leading eigenvalue of a substochastic chain; NaN if it is not found.
 
-    ``-log`` of the eigenvalue is the rate of escape per step (Pianigiani and Yorke, Trans. AMS 252, 351, 1979).
+    ``-log`` of it is the rate of escape per step (Pianigiani and Yorke, Trans. AMS 252, 351, 1979).
     """
     n = p.shape[0]
     if n <= FEW_BOXES:
-        values, vectors = np.linalg.eig(p.toarray().T)
-    else:
-        try:
-            values, vectors = eigs(csc_array(p.T), k=1, which="LR", v0=np.ones(n))
-        except ArpackNoConvergence:
-            return np.nan, np.full(n, np.nan)
-    k = int(np.argmax(values.real))
-    nu = np.abs(vectors[:, k].real)
-    return float(values[k].real), nu / nu.sum()
+        return float(np.linalg.eigvals(p.toarray()).real.max())
+    try:
+        return float(eigs(csc_array(p.T), k=1, which="LR", v0=np.ones(n), return_eigenvectors=False).real[0])
+    except ArpackNoConvergence:
+        return np.nan
 
 
 def slow_eigenvalues(p: csr_array, k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -212,12 +208,11 @@ def committors(p: csr_array, cores: Sequence[np.ndarray]) -> np.ndarray:
 
     Rows add to less than 1 where trajectories leave for outside or unknown boxes, or reach no core.
     """
-    n = p.shape[0]
-    free = np.setdiff1d(np.arange(n), np.concatenate(cores))
-    found = np.zeros((n, len(cores)))
+    found = np.zeros((p.shape[0], len(cores)))
     for k, core in enumerate(cores):
         found[core, k] = 1.0
-    reached = free[_reaches(p, np.concatenate(cores))[free]]
+    any_core = found.any(axis=1)
+    reached = np.flatnonzero(_reaches(p, np.flatnonzero(any_core)) & ~any_core)
     if len(reached):
         a = csc_array(eye_array(len(reached)) - p[reached][:, reached])
         found[reached] = np.clip(_solve(a, np.asarray(p[reached] @ found)), 0.0, 1.0)

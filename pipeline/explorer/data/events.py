@@ -41,9 +41,8 @@ def events(run: RunDirectory, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     found = _kept(explored, x, explored.place(at, but=x))
     if found is None:
         return {"events": [], "note": "not computed along this axis: magpend analyse events DIR"}
-    rows = list(shown_table("events", found).rows)
-    own = [k for k, row in enumerate(rows) if row["what"] != RANGE_END]
-    return {"events": [_event(explored, found, k, rows[k], x, at) for k in own], "note": None}
+    own = [row for row in shown_table("events", found).rows if row["what"] != RANGE_END]
+    return {"events": [_event(explored, found, row, x, at) for row in own], "note": None}
 
 
 def _kept(run: ExploredRun, x: str, place: Mapping[str, int]) -> xr.Dataset | None:
@@ -60,14 +59,14 @@ def _kept(run: ExploredRun, x: str, place: Mapping[str, int]) -> xr.Dataset | No
 
 
 def _event(
-    run: ExploredRun, found: xr.Dataset, k: int, row: Mapping[str, Any], x: str, at: Mapping[str, int]
+    run: ExploredRun, found: xr.Dataset, row: Mapping[str, Any], x: str, at: Mapping[str, int]
 ) -> dict[str, Any]:
-    one = found.isel(event=k)
+    one = found.isel(event=row["event"])
     seen, beyond = float(one["seen"]), float(one["beyond"])
     before, after = _cells(run, one, x, run.place(at, but=x))
     low, high = sorted((seen, beyond)) if math.isfinite(beyond) else (seen, seen)
     return {
-        "event": k,
+        "event": row["event"],
         "label": row["label"] or plain(row["what"]),
         "sentence": row["sentence"],
         "x": finite(one["value"]),

@@ -90,6 +90,7 @@ hysteresis = Run.hysteresis
 settling = Run.settling
 chaos = Run.chaos
 dimension = Run.dimension
+series = Run.series
 spectrum = Run.spectrum
 branches = Run.branches
 bands = Run.bands

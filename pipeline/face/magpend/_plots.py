@@ -34,6 +34,7 @@ class Plots:
     convergence = SeveralPanels(options.ConvergenceOptions)
     dimension = SeveralPanels(options.DimensionFigureOptions)
     spectrum = SeveralPanels(options.SpectrumFigureOptions)
+    series = SeveralPanels(options.SeriesFigureOptions)
     waterfall = OnePanel(options.WaterfallOptions)
     branches = OnePanel(options.BranchFigureOptions)
     multipliers = OnePanel(options.MultiplierOptions)

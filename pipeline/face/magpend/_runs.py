@@ -26,7 +26,7 @@ from pipeline.products.product import Options, Table
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.response import ResponseOptions
-from pipeline.products.spectrum import SpectrumOptions
+from pipeline.products.spectrum import SeriesOptions, SpectrumOptions
 from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
 from pipeline.products.transfer import TransferOptions
 from pipeline.runs.arguments import names_arguments
@@ -80,6 +80,7 @@ class Run(RunDirectory):
     chaos = AnalysisMethod(ChaosOptions)
     dimension = AnalysisMethod(DimensionOptions)
     spectrum = AnalysisMethod(SpectrumOptions)
+    series = AnalysisMethod(SeriesOptions)
     branches = AnalysisMethod(BranchOptions)
     bands = AnalysisMethod(BandOptions)
     sensitivities = AnalysisMethod(SensitivityOptions)

@@ -16,7 +16,7 @@ from pipeline.report.report import part_of
 from pipeline.runs import extend as extending
 from pipeline.store.errors import RefusedError
 
-CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
+CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mirror={"signs": {"x": -1}}, mu=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +65,15 @@ def test_graph__edges_are_the_rows_of_the_table(cubic, tmp_path):
     assert graph == ds.magpend.graph()
     names = {node["id"] for node in graph["nodes"]}
     assert all({edge["source"], edge["target"]} <= names for edge in graph["edges"])
-    for k, row in table.iterrows():
-        edges = [edge for edge in graph["edges"] if edge["event"] == k]
+    nodes = graph["nodes"]
+    for _, row in table.iterrows():
+        edges = [edge for edge in graph["edges"] if edge["event"] == row["event"]]
         assert {edge["sentence"] for edge in edges} == ({row["sentence"]} if row["what"] != "range_end" else set())
         if not edges:
             continue
+        assert np.ptp([edge["value"] for edge in edges]) <= 2.0 * row["value_error"]
+        edges = [edge for edge in edges if edge["attractor"] == row["attractor"]]
         assert sum(edge["cells"] for edge in edges) == row["n_cells"]
-        nodes = graph["nodes"]
         source = nodes[edges[0]["source"]]
         assert (source["attractor"], source["period"]) == (row["attractor"], row["period"])
         end = "high" if row["rises"] else "low"
@@ -84,6 +86,23 @@ def test_graph__edges_are_the_rows_of_the_table(cubic, tmp_path):
     name = {node["id"]: node["name"] for node in graph["nodes"]}
     ends = [(name[e["source"]], name[e["target"]], e["label"]) for e in graph["edges"]]
     assert set(ends) >= {("A", "B", "BP"), ("A", "C", "BP"), ("B", "A", "BP"), ("B", "B", "PD"), ("C", "C", "PD")}
+    # the pitchfork is one event of three attractors, and the doublings of both arms are another one
+    told = table[table["what"].isin(["pitchfork", "period_doubling"]) & (table["value"] > 0.0)]
+    assert told["value"].tolist() == pytest.approx([1.0, 2.0], abs=1e-6)
+    assert [len({e["source"] for e in graph["edges"] if e["event"] == k}) for k in told["event"]] == [3, 2]
+
+
+@pytest.mark.slow
+def test_events__chaos_that_moves_far_is_one_set(tmp_path):
+    """x - s is the logistic map at every s, so that the set moves and is the same; its ids rest on distance."""
+    model = magpend.model("x' = s + 1 - 1.9*(x - s)**2", name="moving", kind="map", s=0.0)
+    spec = magpend.Spec("sweep", model).with_axis("s", values=[0.0, 0.8, 1.6])
+    spec = spec.with_start_random(n=6, seed=0, x=(0.75, 0.85)).with_integration(n_transient=500, n_keep=100)
+    run = magpend.run(spec, tmp_path / "run", workers=0)
+    assert len(set(run.attractors()["attractor"].values.tolist())) > 1
+    (node,) = run.events().magpend.graph()["nodes"]
+    assert (node["set"], node["low"], node["high"]) == ("chaotic_set", 0.0, 1.6)
+    assert set(run.table("events")["what"]) == {"range_end"}
 
 
 # ---- further values -----------------------------------------------------------------------------

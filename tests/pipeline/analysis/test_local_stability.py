@@ -162,19 +162,63 @@ def test_resilience__weighed_by_a_normal_density(double_well):
 @pytest.mark.slow
 def test_resilience__weighs_arrivals_and_combines_results(double_well):
     """With all starts timed, a density of 1 on one half gives the mean time of that half; 1 changes nothing."""
-    half = double_well.derive("resilience", density="where(x > 1.5, 2, 0)", **{**FEW, "timed": 400})
+    half = double_well.derive("resilience", density="where(x > 1.05, 2, 0)", within=1, **{**FEW, "timed": 400})
     plain = double_well.derive("resilience", quantity="shock_high*basin_stability + f", **{**FEW, "timed": 400})
     right = int(np.argmax(plain["shock_from"].values[:, 0]))
     # from x > 1 a trajectory is within .01 of 1 at exp(-2 t) (1 - 1/x^2) = 1 - 1/1.01^2
     x = np.linspace(-3.0, 3.0, 400)
-    x = x[x > 1.5]
+    x = x[x > 1.05]
     entered = np.ceil(0.5 * np.log((1.0 - x**-2.0) / (1.0 - 1.01**-2.0)))
     assert float(half["weighted_time"][right]) == pytest.approx(entered.mean())
     assert float(half["weighted_stability"][right]) == 1.0
     assert np.isnan(half["weighted_time"][1 - right])
+    assert half["weighted_arrived"].values[right] == pytest.approx(np.mean(entered <= 1))
+    assert 0.0 < np.mean(entered <= 1) < 1.0
     assert plain["weighted_time"].values == pytest.approx(plain["mean_time"].values)
     assert plain["weighted_stability_low"].values == pytest.approx(plain["basin_stability_low"].values)
     assert float(plain["quantity"][right]) == pytest.approx(1.5, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_resilience__numbers_of_attractors_jl(computed):
+    """The "dumb map" of Attractors.jl: to (r, r) from x >= 0, to (-r, -r) from x < 0, and to 0 for r < 1/2.
+
+    Expected values: test/nonlocal/stability_quantifiers_accumulator.jl of JuliaDynamics/Attractors.jl (commit 2973f2c),
+    with finite time 0.5 on nine starts. Its mean time counts starts of other basins as 0.
+    """
+    to = "where(r < 0.5, 0, where(x >= 0, r, -r))"
+    model = {**table("dumb_map", {"x": to, "y": to}, {"r": 1.0}), "kind": "map"}
+    starts = {"kind": "grid", "x": line(-1.0, 1.0, 3), "y": line(-1.0, 1.0, 3)}
+    spec = sweep(model, starts, axes={"r": {"values": [-1.0, 1.0]}})
+    spec["integration"] = {"n_transient": 20, "n_keep": 4}
+    run = AnalysedRun.of(computed(spec))
+    options = {**FEW, "within": 0, "timed": 9, "largest": 4.0}
+    found = run.derive("resilience", quantity="mean_time*basin_stability", **options)
+    assert found["n_sets"].values.tolist() == [1, 2]
+    order = [0, *(1 + np.argsort(found["shock_from"].values[1:, 0])).tolist()]  # 0, (-1, -1), (1, 1)
+    expected = {
+        "basin_stability": [1.0, 0.33333, 0.66667],
+        "weighted_arrived": [0.11111, 0.11111, 0.11111],
+        "arrived": [0.11111, 0.11111, 0.11111],
+        "quantity": [0.88889, 0.22222, 0.55555],
+        "longest_time": [1.0, 1.0, 1.0],
+        "amplification": [1.0, 1.0, 1.0],
+        "amplification_time": [0.0, 0.0, 0.0],
+        "return_time": [0.0, 0.0, 0.0],
+        # the boundary itself; the nearest starts beyond it, of which theirs are, are at 1 and 2
+        "distance_high": [np.inf, 1.0, 1.0],
+    }
+    for name, values in expected.items():
+        assert found[name].values[order] == pytest.approx(values, abs=1e-5), name
+    # their mean non-critical shock, and their own quantity that counts starts with x > 1/2
+    for text, values in (
+        ("basin_stability*sqrt((x - r)**2 + (y - r)**2)", {2: 0.85003}),
+        ("basin_stability*sqrt((x + r)**2 + (y + r)**2)", {1: 0.33333}),
+        ("n_cells*where(x > 0.5, 1, 0)", {1: 0.0, 2: 3.0}),
+    ):
+        own = run.derive("resilience", quantity=text, **options)["quantity"].values[order]
+        for k, value in values.items():
+            assert own[k] == pytest.approx(value, abs=1e-5), text
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
 import magpend
@@ -23,6 +24,7 @@ STUART = magpend.model(
     "x' = x*(1 - R) - w*y + F*cos(omega*t)\ny' = y*(1 - R) + w*x + F*sin(omega*t)\nR = x**2 + y**2",
     name="stuart", w=1.0, F=0.2,
 )  # fmt: skip
+FORCED = magpend.model("x'' = mu*(1 - x**2)*x' - x + A*cos(omega*t)", name="forced", mu=0.1, A=0.04)
 # polar coordinates: th' = th + O - K sin th, r' = sqrt(r)
 RING = magpend.model(
     "x' = G*(x*cos(a) - y*sin(a))\ny' = G*(x*sin(a) + y*cos(a))\na = O - K*y/sqrt(R)\nG = R**(-0.25)\nR = x**2 + y**2",
@@ -89,6 +91,50 @@ def test_events__tongue_of_stuart_landau(tmp_path):
     # and the orbit ends at both edges in the same folds
     assert sorted(table[table["what"] == "fold"]["value"]) == pytest.approx([1.0 - d, 1.0 + d], abs=1e-9)
     assert not (table["what"] == "not_decided").any()
+
+
+def fold_of_forced(mu, force, period, x, v, omega):
+    """Frequency near one at which an orbit of some drive periods has the multiplier 1, by shooting with DOP853."""
+
+    def rates(t, u, omega):
+        x, v = u[:2]
+        slopes = np.array([[0.0, 1.0], [-2.0 * mu * x * v - 1.0, mu * (1.0 - x * x)]]) @ u[2:].reshape(2, 2)
+        return [v, mu * (1.0 - x * x) * v - x + force * np.cos(omega * t), *slopes.ravel()]
+
+    def singular(y):
+        time, start = 2.0 * np.pi * period / y[2], [*y[:2], 1.0, 0.0, 0.0, 1.0]
+        end = solve_ivp(rates, (0.0, time), start, "DOP853", args=(y[2],), rtol=1e-11, atol=1e-12).y[:, -1]
+        return [*(end[:2] - y[:2]), np.linalg.det(end[2:].reshape(2, 2) - np.eye(2))]
+
+    return fsolve(singular, [x, v, omega], xtol=1e-12)[2]
+
+
+WEAK, STRONG = (0.1, 0.04, 1), (1.0, 1.5, 3)
+TONGUES = {
+    "0/1": (WEAK, [0.97, 0.98, 1.0, 1.015, 1.03], [(1.971, -0.224, 0.9893), (-1.966, -0.184, 1.0094)]),
+    "1/3": (STRONG, [2.62, 2.65, 2.8, 2.99, 3.02], [(1.319, -0.575, 2.6798), (1.843, 0.653, 2.9616)]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tongue", TONGUES)
+def test_events__tongues_of_van_der_pol(tongue, tmp_path):
+    (mu, force, period), values, folds = TONGUES[tongue]
+    axes = {"mu": [mu], "A": [force], "omega": values}
+    run = sweep(FORCED, tmp_path, {"x": (-2, 2), "x_dot": (-2, 2)}, {"n_transient": 300, "n_keep": 200}, n=2, **axes)
+    table = run.table("events", parameter="omega", stable=True)
+    known = [fold_of_forced(mu, force, period, *one) for one in folds]
+    edges, ends = of(table, "locking"), of(table, "fold")
+    assert [x[4] for x in edges] == [tongue] * 2
+    for found in (edges, ends):
+        assert [x[0] for x in sorted(found)] == pytest.approx(known, abs=1e-8)
+    assert not (table["what"] == "not_decided").any()
+    if tongue == "0/1":
+        # averaged over a period: x = 2 Re(u exp(i omega t)), u' = (1 - |u|**2) u + i s u - i F in the time mu t/2, with
+        # s = (1 - omega**2)/(mu omega) and F = A/(2 mu omega), about the frequency 1 - mu**2/16
+        d = locked(force / (2.0 * mu))
+        averaged = np.array([-d, d]) * mu / 2.0 + np.hypot(1.0, d * mu / 2.0) - mu**2 / 16.0
+        assert known == pytest.approx(averaged, abs=0.2 * mu**3)
 
 
 @pytest.mark.slow
@@ -170,7 +216,7 @@ def test_scaling__refuses_the_other_law(kind, exponent):
     for other in (-0.5, -1.0):
         length = 20.0 * (d / d[0]) ** other - 2.0 * (kind == FOLD)
         found = Phases(d, length, np.full(6, 0.02), np.full(6, 500), np.full(6, 0.5))
-        slope, error, chosen = scaling(found, kind, 1)
+        slope, error, chosen = scaling(found, kind, 1, passages.MEASURED[kind])
         assert slope == pytest.approx(other, abs=2e-3)
         assert len(chosen) >= passages.LEAST_VALUES
         told = passages._judged(found, (slope, error, chosen), kind, "", 0.0, False)
@@ -194,6 +240,14 @@ def test_peak__is_smooth_and_below_zero():
     assert grazing._peak(h, rate, 0.01) == pytest.approx(-0.1, abs=1e-12)
     assert np.isnan(grazing._peak(np.sin(t), np.cos(t), 0.01))
     assert np.isnan(grazing._peak(np.where(t > 3.5, 0.0, h), rate, 0.01))
+
+
+def test_stay__is_one_between_others():
+    """A fall onto a surface and a leave along it, staying for 31 of 200 intervals; not at an end, twice, or never."""
+    h = np.concatenate([(1e-2 * np.arange(80, 0, -1)) ** 2, np.zeros(31), (1e-2 * np.arange(1, 91)) ** 2])
+    assert grazing._stay(h) == pytest.approx(31 / 200)
+    for other in (h[80:], h[:111], np.concatenate([h, h]), h + 1e-9):
+        assert np.isnan(grazing._stay(other))
 
 
 def test_touch__extrapolates_and_refuses():

@@ -224,7 +224,7 @@ def test_shocks__magnetic_pendulum_as_published(magnets):
         search = ShockSearch(own, 1, 2, settings)
         one = search_together({"it": Asked(search.run(), bases, which)}, Shocked(there), np.ones(4), "")["it"]
         assert one.high == pytest.approx(least, abs=1e-4)
-        assert one.leads_to in {0, 1, 2} - {own}
+        assert one.to in {0, 1, 2} - {own}
     # Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above
     found = magnets.derive("resilience", states="x,y", timed=0)
     assert found["shock_high"].values == pytest.approx(np.full(3, 0.40204), abs=1e-4)

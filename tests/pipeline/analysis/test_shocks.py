@@ -40,7 +40,7 @@ def test_shock_search__finds_the_nearest_point_of_a_plane(dim):
     assert one.high == pytest.approx(0.37, rel=5e-6)
     assert one.high - one.low <= 1.1e-6 * one.high
     assert one.shock == pytest.approx(0.37 * normal, abs=3e-3)
-    assert one.leads_to == OTHER
+    assert one.to == OTHER
     assert one.n_undecided == 0
 
 
@@ -65,7 +65,7 @@ def test_shock_search__takes_the_smaller_of_two_ways_out():
         return np.where(inside, 7, beyond(0.6)(base, shock))
 
     one, tried = found(label_of, 3, confirmations=4000)
-    assert one.leads_to == 7
+    assert one.to == 7
     assert one.high == pytest.approx(0.2, rel=5e-6)
     sizes = np.linalg.norm(np.concatenate([t.shock for t in tried]), axis=1)
     assert one.n_below == (sizes <= one.low).sum()
@@ -99,7 +99,7 @@ def test_shock_search__undecided_shocks_make_an_interval():
 
 def test_shock_search__nothing_leads_away():
     one, tried = found(lambda base, shock: np.full(len(base), OWN), 2, n_bases=3)
-    assert (one.low, one.high, one.base, one.leads_to) == (2.0, np.inf, -1, UNDECIDED)
+    assert (one.low, one.high, one.base, one.to) == (2.0, np.inf, -1, UNDECIDED)
     assert one.safe == pytest.approx(2.0)
     assert np.isnan(one.shock).all()
     assert one.n_below == sum(len(t.base) for t in tried)

@@ -9,6 +9,7 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 
 import magpend
+from pipeline.analysis.series.analysis import series_table
 from pipeline.analysis.spectrum.analysis import LINES, spectrum_table
 from pipeline.analysis.spectrum.estimate import ALL, frequencies_of
 from pipeline.specification.problems import SpecError
@@ -100,6 +101,7 @@ def duffing(tmp_path_factory):
         .with_axis("F", values=[0.2, 0.28, 0.5, 0.65])
         .with_start_list(points=[(1.0, 0.0), (0.1, 0.0)])
         .with_integration(n_transient=400, n_keep=64)
+        .with_lyapunov(n_transient=50, n_periods=400)
     )
     return magpend.run(spec, tmp_path_factory.mktemp("runs") / "twowell", workers=0)
 
@@ -198,6 +200,24 @@ def test_spectrum__of_a_torus_has_the_frequencies_of_its_uncoupled_oscillators(t
     assert f"{f2:.6g} Hz" in ax.get_title(loc="left")
     names = {text.get_text() for text in ax.texts}
     assert {"$f$", "$f_2$", "$f+f_2$"} <= names <= {"$f$", "$f_2$", "$f+f_2$", "$f-f_2$"}
+
+
+@pytest.mark.slow
+def test_series__of_a_chaotic_cell_has_the_exponent_of_its_tangents(duffing):
+    """From the samples of the cell's motion alone, and from the variational equations (``[products] lyapunov``)."""
+    cell = {"cell": 4, "periods": 150, "samples": 30}
+    found = duffing.series(**cell)
+    exponent = found.sel(quantity="exponent")
+    known = float(duffing.cube()["lyapunov"].isel(exponent=0).values.ravel()[4])
+    assert found.attrs["motion"] == "chaotic"
+    assert 0.0 < float(exponent["low"]) <= known <= float(exponent["high"])
+    assert float(found["at_F"]) == 0.5
+    assert "chaotic" in series_table(found).lines[0]
+    assert len(duffing.plot.series(**cell)) == 6
+    with pytest.raises(SpecError, match="of one motion, and"):
+        duffing.series()
+    with pytest.raises(SpecError, match="unknown channel 'w'"):
+        duffing.series(channel="w")
 
 
 @pytest.mark.slow

@@ -39,9 +39,11 @@ def well() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return z, kernel, pi / pi.sum()
 
 
+@pytest.mark.slow
 def test_transfer__noisy_well_by_quadrature(well) -> None:
     z, kernel, pi = well
-    found = _point(noisy_pairs(3000, 200), ["x"], [False], TransferOptions(bins=120, resamples=20))
+    pairs = noisy_pairs(3000, 200)
+    found = _point(pairs, ["x"], [False], TransferOptions(bins=120, resamples=10))
     exact = np.sort(np.linalg.eigvals(kernel).real)[::-1]
     assert found["n_closed"] == 1
     assert found["eigenvalue"][1] == pytest.approx(exact[1], abs=3e-4)
@@ -66,10 +68,67 @@ def test_transfer__noisy_well_by_quadrature(well) -> None:
     assert found["passage"][0, 1] == pytest.approx(mean, rel=0.08)
     between = ~here & ~there
     q = there.astype(float)
-    inner = np.eye(between.sum()) - kernel[np.ix_(between, between)]
-    q[between] = np.linalg.solve(inner, kernel[np.ix_(between, there)].sum(axis=1))
-    seen = (own == 1) & (np.abs(x) < 0.8)
-    assert found["committor"][seen] == pytest.approx(np.interp(x[seen], z, q), abs=0.05)
+    visits = np.linalg.inv(np.eye(between.sum()) - kernel[np.ix_(between, between)])
+    q[between] = visits @ kernel[np.ix_(between, there)].sum(axis=1)
+    # a box of n pairs knows the mean of q one step on with the variance of q there over n; the error of a committor is
+    # the sum over boxes, times the visits to them
+    edges = np.concatenate([x[own == k] for k in (0, 1)])
+    edges = np.append(np.sort(edges) - half, edges.max() + half)
+    box = np.digitize(z[between], edges) - 1
+    scatter = (kernel @ q**2 - (kernel @ q) ** 2)[between]
+    by_box = np.stack([visits[:, box == k] @ np.sqrt(scatter[box == k]) for k in range(len(edges) - 1)], axis=1)
+    error = np.sqrt(by_box**2 @ (1.0 / np.histogram(pairs.before, edges)[0]))
+    seen = (own == 1) & (np.abs(x) < 0.8) & (found["is_core"] == 0)
+    misfit = (found["committor"][seen] - np.interp(x[seen], z, q)) / np.interp(x[seen], z[between], error)
+    assert np.sqrt(np.mean(misfit**2)) < 1.5
+    assert np.abs(misfit).max() < 4.0
+    width = found["committor_high"][seen] - found["committor_low"][seen]  # least and largest of 10 resamples
+    assert np.median(width / np.interp(x[seen], z[between], error)) == pytest.approx(3.1, rel=0.3)
+
+
+def whirl(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A map of the plane with two attracting points and no detailed balance."""
+    return x + 0.3 * (x - x**3) + 0.25 * y, 0.6 * y - 0.1 * x
+
+
+def noisy_whirl(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    u, v = whirl(x, y)
+    return u + 0.15 * rng.standard_normal(len(x)), v + 0.15 * rng.standard_normal(len(x))
+
+
+@pytest.mark.slow
+def test_transfer__committors_in_the_plane_by_simulation() -> None:
+    rng = np.random.default_rng(5)
+    paths = [(rng.uniform(-1.8, 1.8, 12_000), rng.uniform(-1.0, 1.0, 12_000))]
+    for _ in range(25):
+        paths.append(noisy_whirl(rng, *paths[-1]))
+    states = np.moveaxis(np.array(paths), 2, 0)  # cell, step, state
+    pairs = Pairs(states[:, :-1].reshape(-1, 2), states[:, 1:].reshape(-1, 2), np.repeat(np.arange(12_000), 25))
+    found = _point(pairs, ["x", "y"], [False, False], TransferOptions(bins=30, resamples=10))
+    own = np.repeat([0, 1], found["n_points"])
+    place, width = found["place"], found["width"]
+    q = np.where(own == 1, found["committor"], 1.0 - found["committor"])
+    corner = place.min(axis=0)
+    core_at = np.full((48, 48), -1)
+    core_at[tuple(np.rint((place - corner) / width).astype(int).T)] = np.where(found["is_core"] > 0, own, -1)
+    boxes = np.random.default_rng(6).choice(np.flatnonzero((q > 0.1) & (q < 0.9) & (found["density"] > 1e-3)), 12)
+    n = 4000
+    x, y = (place[np.repeat(boxes, n)] + rng.uniform(-0.5, 0.5, (12 * n, 2)) * width).T
+    end = np.full(12 * n, -1)
+    for _ in range(3000):
+        going = np.flatnonzero(end < 0)
+        if not len(going):
+            break
+        x[going], y[going] = noisy_whirl(rng, x[going], y[going])
+        at = np.floor((np.column_stack([x, y])[going] - corner) / width + 0.5).astype(int)
+        end[going] = np.where(((at >= 0) & (at < 48)).all(axis=1), core_at[tuple(np.clip(at, 0, 47).T)], -1)
+    assert (end >= 0).all()
+    counted = end.reshape(12, n).mean(axis=1)
+    counting = (found["committor_high"] - found["committor_low"])[boxes] / 3.1  # least and largest of 10
+    cell = np.abs(found["committor"] - found["committor_coarse"])[boxes]
+    allowed = 3.0 * np.hypot(np.sqrt(counted * (1.0 - counted) / n), counting) + cell
+    assert (np.abs(counted - q[boxes]) < allowed).all()
+    assert allowed.max() < 0.1
 
 
 def test_transfer__two_wells_without_noise_are_closed() -> None:

@@ -35,7 +35,7 @@ def folds_of(line: Path) -> list[dict[str, Any]]:
 
 def test_events__lead_to_cells_on_the_orbits(line: Path) -> None:
     run = RunDirectory.open(line)
-    rows = shown_table("events", derive(line, "events", {"max_period": 1})).rows
+    rows = {row["event"]: row for row in shown_table("events", derive(line, "events", {"max_period": 1})).rows}
     cube = run.cube().load()
     folds = folds_of(line)
     assert len(folds) == 2
