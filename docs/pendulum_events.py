@@ -28,8 +28,11 @@ SMALL = 1e-8
 
 Row = dict[str, Any]
 
-LONGEST = {"events_2_3hz": 24, "events_0p1_2hz": 12}
-"""Longest period of the branches that are followed in each run."""
+OPTIONS: dict[str, dict[str, Any]] = {
+    "events_2_3hz": {"stable": True, "max_period": 24},
+    "events_0p1_2hz": {"stable": True, "max_period": 12, "orbits": True},
+}
+"""Options of the analysis by run."""
 
 SIDES = {
     "on one side": ("left", "right"),
@@ -40,12 +43,7 @@ SIDES = {
 """Groups of the tables: classes of motion."""
 
 
-def options_of(name: str) -> dict[str, object]:
-    """Return the options of the analysis of a run."""
-    return {"stable": True, "max_period": LONGEST[name]}
-
-
-def rows_of(run: magpend.Run, options: dict[str, object]) -> pd.DataFrame:
+def rows_of(run: magpend.Run, options: dict[str, Any]) -> pd.DataFrame:
     """Return the events of a run by rising frequency, each with the side of its attractor."""
     rows = run.table("events", **options)
     sides = run.table("attractors").groupby("attractor_id")["side"].agg(lambda own: ", ".join(sorted(set(own))))
@@ -94,7 +92,7 @@ def tables_of(rows: pd.DataFrame, longest: int, twins: set[frozenset[int]]) -> l
     lines += ["", "**Not decided**", "", "| motions | end, between these values in Hz | tried |", "|---|---|---|"]
     groups: dict[tuple[str, str], list[str]] = {}
     for row in rows[is_open].to_dict("records"):
-        own = f"orbits of period over {longest}" if row["period"] > longest else f"{_own(row)}s"
+        own = f"orbits of period over {longest}" if row["period"] > longest else _own(row)
         low, high = sorted((row["seen"], row["beyond"]))
         ends = groups.setdefault((f"{own}, {row['side']}", _tried(row, longest)), [])
         ends.append(f"{letter(row['attractor'])} {low:.5g}-{high:.5g}")
@@ -143,12 +141,16 @@ def _tried(row: Row, longest: int) -> str:
         return "no branch was followed"
     if "such ids rest on distance" in why:
         why = "the set beyond is chaotic too and may be the same"
-    why = {"no orbit to follow": "neither closed, nor shown to be chaotic or a torus"}.get(why, why)
+    if "no bifurcation is located" in why:
+        return "its branch turns or loses stability where no bifurcation is located"
+    if why == "no orbit to follow":
+        is_known = row["set"] in ("chaotic_set", "torus")
+        why = "not looked for (`--orbits`)" if is_known else "neither closed, nor shown to be chaotic or a torus"
     return why + ("; no unstable orbit that was tried is met" if crisis else "")
 
 
 def _own(row: Row) -> str:
-    return f"orbit of period {row['period']}" if row["period"] else plain(row["set"])
+    return f"orbits of period {row['period']}" if row["period"] else plain(row["set"]) + "s"
 
 
 def written(page: str, name: str, lines: list[str]) -> str:
@@ -168,11 +170,13 @@ def main() -> None:
     words.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the runs")
     given = words.parse_args()
     for name in given.names:
-        run, options = magpend.run(name, given.runs / name), options_of(name)
+        run, options = magpend.run(name, given.runs / name), OPTIONS[name]
         rows = rows_of(run, options)
         rows.to_csv(PAGE.parent / f"{name}.csv", index=False)
         run.plot.genealogy(**options).figure.savefig(PAGE.parent / f"{name}.png", dpi=120)
-        PAGE.write_text(written(PAGE.read_text("utf-8"), name, tables_of(rows, LONGEST[name], twins_of(run))), "utf-8")
+        PAGE.write_text(
+            written(PAGE.read_text("utf-8"), name, tables_of(rows, options["max_period"], twins_of(run))), "utf-8"
+        )
 
 
 if __name__ == "__main__":

@@ -55,6 +55,7 @@ NOT_MADE = {
     "report.png": "a browser's picture of a part of a report",
     "response-pendulum.png": "the response of the pendulum, half a minute, by the commands beside it",
     "rig-calibrated.png": "a diagram of the calibrated model of docs/rig.md beside the rig's",
+    "tutorials/events_0p1_2hz.png": "the same between 0.1 and 2 Hz, half an hour",
     "tutorials/events_2_3hz.png": "bars of the pendulum's attractors, ten minutes, by docs/pendulum_events.py",
 }
 """Pictures in the docs that this program does not make, with what they show."""

@@ -18,6 +18,11 @@ class EventOptions(BranchOptions):
         "in DIR-refined until all are as short; 0 runs none.",
         ge=0.0,
     )
+    orbits: bool = option(
+        False,
+        "Name the ends of orbits alone. What chaotic sets and tori end in takes many long trajectories: a minute for "
+        "each end at low frequencies.",
+    )
 
 
 EVENTS = Analysis(

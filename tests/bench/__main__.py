@@ -23,6 +23,7 @@ TINY = {
     "peers": [*SMALL, "--models", "lorenz", "pendulum", "--points"],
     "same_set": ["--cells", "6", "--cases", "Ueda"],
     "scaling": ["--seconds", "0", "--workers", "4", "--task-seconds", "0.05", "--rounds", "3"],
+    "series": ["--seeds", "1", "--cases", "ar1"],
     "virtual_rig": ["--seeds", "0"],
 }
 """Options of the smallest size of each benchmark."""

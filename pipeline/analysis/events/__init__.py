@@ -5,7 +5,8 @@ at which cells end on it, its branch is followed until it loses stability (`line
 located bifurcation on the branch of that very orbit, wherever it lies on the grid of parameter values; where the
 branch gives no reason, the event is not decided. `analysis` joins attractors and branches; `cascades`, `passages` and
 `crises` decide ends of chaotic sets and tori, `crises` by what `contact` and `transients` measure; `grazing` decides
-those of orbits that touch a surface; `sentences` has the table.
+those of orbits that touch a surface; `one_event` finds the ends that are one event; `dataset` has the Dataset,
+`sentences` the table.
 
 Ids that lie on one stable piece of a branch are one attractor and have the least of their ids, since ids of
 equilibria rest on distance alone. Nothing is looked for between neighbouring values at which cells end on the same
@@ -25,7 +26,7 @@ variable                       dims              meaning
 ``period``
 ``period_after``               event             period of the same attractor beyond a change; -1: it ends
 ``rises``                      event             1 if the attractor ends as the parameter rises
-``what``                       event             name of the event, see `analysis.NAMES`
+``what``                       event             name of the event, see `names.NAMES`
 ``criticality``                event             unknown, supercritical, subcritical, contradictory
 ``value``, ``value_error``     event             parameter value of the event, its error; NaN if unknown
 ``seen``, ``beyond``           event             last value at which cells end there, next value of the run

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,25 +11,22 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
-from pipeline.analysis.branches.bifurcations import SAME_PLACE
-from pipeline.analysis.branches.dataset import CRITICALITIES
-from pipeline.analysis.branches.kinds import BRANCHING, KINDS
+from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
-from pipeline.analysis.events.crises import Crises, Crisis
-from pipeline.analysis.events.graph import at_ends
+from pipeline.analysis.events.crises import Crises
+from pipeline.analysis.events.dataset import dataset_of
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
-from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
-from pipeline.analysis.outcomes import DIVERGED, outcomes
+from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import isel, points_of_rows, rows_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.tabular import plain
-from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     EQUILIBRIUM,
@@ -94,16 +91,17 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
     stretches, ids = _continued(scene, _stretches(scene))
     crises = Crises(replace(scene, names=ids))
-    stretches = crises.split(stretches)
+    stretches = stretches if options.orbits else crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(stretches, _fates(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    breakups = Breakups(scene)
-    named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
-    return _dataset(scene, stretches, _merged(named))
+    if not options.orbits:
+        breakups = Breakups(scene)
+        named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
+    return dataset_of(scene, stretches, _merged(named))
 
 
 def _scalars(part: xr.Dataset) -> list[tuple[str, float]]:
@@ -367,178 +365,3 @@ def _merged(named: Sequence[Event]) -> list[Event]:
         else:
             merged.append(one)
     return merged
-
-
-def _same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
-    """Return for each end of an attractor the number of the end that leads: ends at one bifurcation are one event.
-
-    The leading end is that of the orbit on which the bifurcation lies, or of the set that meets the orbit of a crisis.
-    """
-    groups: list[list[int]] = []
-    for k, one in enumerate(named):
-        own = next((group for group in groups if any(_is_same(scene, named[i], one) for i in group)), None)
-        if own is None:
-            groups.append([k])
-        else:
-            own.append(k)
-    found = [0] * len(named)
-    for group in groups:
-        lead = min(group, key=lambda k: (_is_seen_from_elsewhere(scene.located, named[k]), k))
-        for k in group:
-            found[k] = lead
-    return found
-
-
-def _is_seen_from_elsewhere(ds: xr.Dataset, one: Event) -> bool:
-    if isinstance(one.born, Crisis):
-        return one.born.lives_beyond
-    return not _is_own(ds, one.fate)
-
-
-def _is_same(scene: Scene, a: Event, b: Event) -> bool:
-    """Tell whether two ends are one event: of one kind, at one value, and of one orbit or of mirror images."""
-    if a.what != b.what or not abs(_value(a) - _value(b)) <= a.error + b.error:
-        return False
-    ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
-    if a.what in CRISES and (a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)):
-        return True  # one crisis told from both sides, or by both sets that merge
-    if min(j, k) >= 0:
-        points = ds["bifurcation_section"].values[[j, k]]
-        away = geometry_of(scene.attractors).distance(points[0], points[1, 0])
-        if j == k or np.nanmin(away) <= SAME_PLACE:
-            return True
-    return a.rises == b.rises and _are_mirrored(scene, a, b)
-
-
-def _are_mirrored(scene: Scene, a: Event, b: Event) -> bool:
-    """Tell whether two attractors are mirror images of each other at the ends of their stretches."""
-    ds, (i, j) = scene.attractors, (one.stretch.rows[one.rises] for one in (a, b))
-    if a.stretch.places[a.rises] != b.stretch.places[b.rises] or "mirror_partner" not in ds:
-        return False
-    return int(ds["mirror_partner"].values[i]) == int(ds["attractor"].values[j])
-
-
-# ---- dataset -----------------------------------------------------------------------------------
-
-
-Columns = dict[str, tuple[Sequence[object], str, Mapping[str, object]]]
-"""Values, meaning and attributes of the columns of events, by name."""
-
-
-def _dataset(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> xr.Dataset:
-    named = sorted(named, key=lambda one: (one.stretch.attractor, one.stretch.places[one.rises]))
-    located, along, n = scene.located, scene.along, len(scene.along)
-    beyond = [one.stretch.places[one.rises] + (1 if one.rises else -1) for one in named]
-    bifurcations = np.array([one.fate.bifurcation for one in named], int)
-    own = [_is_own(located, one.fate) for one in named]
-    degrees = [
-        int(located["criticality"].values[one.fate.bifurcation])
-        if one.fate.bifurcation >= 0 and one.what != BRANCHING
-        else 0
-        for one in named
-    ]
-    unit = {"units": str(located.attrs["parameter_units"])}
-    columns: Columns = {
-        "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),
-        "set": ([one.stretch.kind for one in named], "kind of the attractor", code_flags(SETS)),
-        "period": ([one.stretch.period for one in named], "period of the attractor, 0 none", {}),
-        "period_after": ([one.after.period if one.after else -1 for one in named], "period beyond a change", {}),
-        "rises": ([int(one.rises) for one in named], "1 if it ends as the parameter rises", {}),
-        "what": ([NAMES.index(one.what) for one in named], "name of the event", code_flags(NAMES)),
-        "criticality": (degrees, "criticality", code_flags(["unknown", *CRITICALITIES[1:]])),
-        "value": ([_value(one) for one in named], "parameter value of the event", unit),
-        "value_error": ([one.error for one in named], "error of the value", unit),
-        "seen": ([along[one.stretch.places[one.rises]] for one in named], "last value with cells", unit),
-        "beyond": ([along[b] if 0 <= b < n else np.nan for b in beyond], "next value of the run", unit),
-        "bifurcation": (bifurcations.tolist(), "number of the bifurcation, -1 none", {}),
-        "branch": ([one.fate.branch for one in named], "branch of the attractor, -1 none", {}),
-        "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
-        "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
-        "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
-        "same_as": (_same_as(scene, named), "number of the event that this end belongs to", {}),
-        "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
-    }
-    variables: dict[str, object] = {
-        name: ("event", np.array(found), {"units": "1", "long_name": text, **attrs})
-        for name, (found, text, attrs) in (columns | _columns_of_sets(named)).items()
-    }
-    to = [list(one.to) for one in named], [list(one.to.values()) for one in named]
-    doublings = [one.born.doublings if one.born else () for one in named]
-    variables["to_attractor"] = (("event", "outcome"), _padded(to[0], -1).astype(int), {"long_name": "ids beyond"})
-    variables["to_cells"] = (("event", "outcome"), _padded(to[1], 0).astype(int), {"long_name": "their cells"})
-    ends = [_stretches_beyond(stretches, one, b) for one, b in zip(named, beyond, strict=True)]
-    variables["to_stretch"] = (("event", "outcome"), _padded(ends, -1).astype(int), {"long_name": "their stretches"})
-    after = [stretches.index(one.after) if one.after else -1 for one in named]
-    variables["stretch_of"] = ("event", np.array([stretches.index(one.stretch) for one in named], int))
-    variables["stretch_after"] = ("event", np.array(after, int))
-    variables["doublings"] = (("event", "doubling"), _padded(doublings, np.nan), unit)
-    kept = {name: located.attrs[name] for name in ("parameter", "parameter_units", "model") if name in located.attrs}
-    return xr.Dataset(variables | _bars(scene, stretches, named), attrs=kept)
-
-
-def _stretches_beyond(stretches: Sequence[Stretch], event: Event, beyond: int) -> list[int]:
-    """Return the stretches on which the cells of an event go on; -1 none, -2 they diverge."""
-    there = {one.attractor: k for k, one in enumerate(stretches) if one.places[0] <= beyond <= one.places[1]}
-    return [DIVERGED if i == DIVERGED else there.get(i, -1) for i in event.to]
-
-
-def _columns_of_sets(named: Sequence[Event]) -> Columns:
-    """Return the columns of ends of chaotic sets and tori."""
-    born = [one.born or Born("", "") for one in named]
-    crises = [one if isinstance(one, Crisis) else Crisis("", "") for one in born]
-    return {
-        "ratio": ([one.ratio for one in born], "ratio of the last two intervals", {}),
-        "exponent": ([one.exponent for one in born], "minus the power of the distance with which times grow", {}),
-        "exponent_error": ([one.exponent_error for one in born], "its error", {}),
-        "rotation": ([one.rotation for one in born], "p/q of a locked orbit", {}),
-        "met_period": ([one.period for one in crises], "period of the unstable orbit that is met, 0 none", {}),
-        "twin": ([one.twin for one in crises], "id of the set with which it merges, -1 none", {}),
-        "lives_beyond": ([int(one.lives_beyond) for one in crises], "1 if the set beyond meets the orbit", {}),
-    }
-
-
-def _padded(rows: Sequence[Sequence[float]], fill: float) -> np.ndarray:
-    """Stack rows of different lengths to an array."""
-    found = np.full((len(rows), max([1, *map(len, rows)])), fill)
-    for one, row in zip(found, rows, strict=True):
-        one[: len(row)] = row
-    return found
-
-
-def _value(one: Event) -> float:
-    return np.nan if one.what in (UNDECIDED, LIVES_ON) else one.fate.value
-
-
-def _bars(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> dict[str, object]:
-    """Return the range of each stretch, up to its events where they are decided."""
-    ends = {(one.stretch, one.rises): _value(one) for one in named}
-    ends |= {(one.after, not one.rises): _value(one) for one in named if one.after}
-
-    def end(one: Stretch, rises: bool) -> float:
-        found = ends[one, rises]
-        return float(scene.along[one.places[rises]]) if np.isnan(found) else found
-
-    unit = {"units": str(scene.located.attrs["parameter_units"])}
-    columns: dict[str, tuple[Sequence[float], Mapping[str, object]]] = {
-        "attractor": ([one.attractor for one in stretches], {}),
-        "set": ([one.kind for one in stretches], code_flags(SETS)),
-        "period": ([one.period for one in stretches], {}),
-        "low": ([end(one, False) for one in stretches], unit),
-        "high": ([end(one, True) for one in stretches], unit),
-    }
-    bars: dict[str, object] = {
-        f"stretch_{name}": ("stretch", np.array(found), attrs) for name, (found, attrs) in columns.items()
-    }
-    places = [[(place, scene.ids_of(one.attractor, place)) for place in one.places] for one in stretches]
-    return bars | at_ends(scene.attractors, scene.axis, scene.order, [one.rows for one in stretches], places)
-
-
-def _is_own(ds: xr.Dataset, fate: Fate) -> int:
-    return int(fate.bifurcation >= 0 and int(ds["of_branch"].values[fate.bifurcation]) == fate.branch)
-
-
-def _other_branch(ds: xr.Dataset, fate: Fate) -> int:
-    if fate.bifurcation < 0:
-        return -1
-    both = (int(ds[name].values[fate.bifurcation]) for name in ("of_branch", "to_branch"))
-    return next((one for one in both if one != fate.branch), -1)

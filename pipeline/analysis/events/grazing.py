@@ -42,9 +42,6 @@ stay before an orbit comes to stick, in units of its range and of the square of 
 it the orbit comes in across the surface, and not along it.
 """
 
-RESOLVED = 4.0 / SAMPLES**2
-"""Error of a short stay, as a share of the period: its beginning and its end are seen between two instants."""
-
 NODES, APART = 30, 2.0
 """Last points of a branch that are looked at, and the least ratio of the heights of those that are used."""
 
@@ -81,9 +78,6 @@ def grazing_of(line: Line, node: int, family: Family) -> tuple[str, float, float
     for name, measured in ((GRAZING, peaks), (SLIDING, stays)):
         for of in range(len(measured[0]) if measured else 0):
             touch = _touch(values, [one[of] for one in measured])
-            if name == SLIDING and touch is not None:
-                other = _touch(values, [one[of] - RESOLVED for one in measured])
-                touch = None if other is None else (touch[0], touch[1] + abs(other[0] - touch[0]), touch[2])
             if touch is not None and max(abs(touch[0] - values[0]), touch[1]) <= REACH * family.scales[0]:
                 return name, touch[0], touch[1], _evidence(name, of, touch[2], system.n_switches)
     return None
@@ -171,12 +165,17 @@ def _stays(family: Family, point: Point, values: np.ndarray) -> list[float]:
 
 
 def _stay(h: np.ndarray) -> float:
-    """Return the share of some instants at which a function is 0; NaN if that is not one stay between others."""
+    """Return the share of some instants for which a function is 0; NaN if that is not one stay between others.
+
+    The function comes to 0 along a straight line, and leaves it along a parabola.
+    """
     on = np.flatnonzero(np.abs(h) <= STUCK)
-    n = len(on)
-    if not 0 < n == on[-1] - on[0] + 1 or on[0] == 0 or on[-1] == len(h) - 1:
+    if not len(on) or len(on) != on[-1] - on[0] + 1 or on[0] < 2 or on[-1] > len(h) - 3:
         return np.nan
-    return n / (len(h) - 1)
+    before, after = np.abs(h[on[0] - 2 : on[0]]), np.sqrt(np.abs(h[on[-1] + 1 : on[-1] + 3]))
+    begin = on[0] - 1 + before[1] / (before[0] - before[1])
+    end = on[-1] + 1 - after[0] / (after[1] - after[0])
+    return float(end - begin) / (len(h) - 1)
 
 
 def _peak(h: np.ndarray, rate: np.ndarray, step: float) -> float:

@@ -327,7 +327,7 @@ def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
     told = told_by(run.cube().attrs)
     ds = xr.Dataset({channel.name: ("time", values, {"units": channel.unit})}, {"time": time}, told)
     where = {row_axis(name): value for name, value in motion.where.items()}
-    return series_of(ds, seed=options.seed).assign_coords(where, attractor=motion.attractor)
+    return series_of(ds, seed=options.seed).assign_coords({**where, "attractor": motion.attractor})
 
 
 def series_table(ds: xr.Dataset) -> Table:

@@ -115,7 +115,7 @@ WIDTH = 0.004
 def undecided():
     """Leave the ends of chaotic sets open, so that their intervals alone tell where they are."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analysis, "_aperiodic", lambda scene, crises, one, named: one)
+        patch.setattr(analysis, "_aperiodic", lambda scene, crises, breakups, one, named: one)
         yield
 
 
@@ -139,6 +139,20 @@ def assert_crisis(run, found):
     assert set(run.cube()["r"].values) < set(values)
     assert found.attrs["n_further"] == len(values) - 3
     return beside
+
+
+@pytest.mark.slow
+def test_events__of_orbits_alone(tmp_path):
+    """With `orbits` no end of a chaotic set is looked at; the doubling at 3 is named all the same."""
+    spec = magpend.Spec("sweep", LOGISTIC).with_axis("r", values=[2.9, 3.1, 3.9, 3.95])
+    spec = spec.with_start_random(n=4, seed=1, x=(0.1, 0.9)).with_integration(n_transient=1000, n_keep=60)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(analysis, "_aperiodic", None)
+        patch.setattr(analysis.Crises, "split", None)
+        table = magpend.run(spec, tmp_path / "run", workers=0).table("events", orbits=True)
+    (doubling,) = table[table["what"] == "period_doubling"]["value"][:1]
+    assert abs(doubling - 3.0) < 1e-8
+    assert table[(table["set"] == "chaotic_set") & (table["what"] != "range_end")]["what"].tolist() == ["not_decided"]
 
 
 @pytest.mark.slow

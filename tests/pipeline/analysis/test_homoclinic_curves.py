@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
-import magpend
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import curves_table
@@ -16,7 +14,6 @@ from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.homoclinic import Loop
 from pipeline.analysis.branches.homoclinic_curves import homoclinic_curves, loop_near
 from pipeline.analysis.branches.problems import Family, Value
-from pipeline.analysis.tabular import words_of
 from pipeline.plots.regimes import plot_curves
 from tests.core.flows import LORENZ, flow, table
 from tests.pipeline.analysis.test_branches_flows import followed
@@ -74,9 +71,10 @@ def test_homoclinic_curves__closed_form():
 TAKENS = table("takens", {"x": "y", "y": "b1 + b2*x + x**2 + x*y"}, {"b1": 0.0, "b2": 0.0})
 
 
-def split_at(rate, saddle, jacobian):
-    """Distance of the saddle's manifolds on y = 0, left of the saddle, for x' = y, y' = rate(x, y), by DOP853."""
-    values, vectors = np.linalg.eig(jacobian)
+def takens_split(b1, b2):
+    """Distance of the saddle's manifolds on y = 0, left of the saddle, by DOP853."""
+    saddle = 0.5 * (-b2 + np.sqrt(b2 * b2 - 4.0 * b1))
+    values, vectors = np.linalg.eig([[0.0, 1.0], [b2 + 2.0 * saddle, saddle]])
     ends = []
     for sign in (1.0, -1.0):
 
@@ -88,22 +86,11 @@ def split_at(rate, saddle, jacobian):
         start = np.array([saddle, 0.0]) - 1e-7 * own * np.sign(own[0])
 
         def rates(_, u, sign=sign):
-            return [sign * u[1], sign * rate(*u)]
+            return [sign * u[1], sign * (b1 + b2 * u[0] + u[0] ** 2 + u[0] * u[1])]
 
         found = solve_ivp(rates, (0.0, 400.0), start, "DOP853", events=level, rtol=1e-12, atol=1e-14)
         ends.append(found.y_events[0][0, 0])
     return ends[0] - ends[1]
-
-
-def takens_split(b1, b2):
-    saddle = 0.5 * (-b2 + np.sqrt(b2 * b2 - 4.0 * b1))
-    jacobian = [[0.0, 1.0], [b2 + 2.0 * saddle, saddle]]
-    return split_at(lambda x, y: b1 + b2 * x + x**2 + x * y, saddle, jacobian)
-
-
-def damped_split(b1, b2):
-    saddle = np.sqrt(-b1)
-    return split_at(lambda x, y: b1 + b2 * y + x**2 + x * y, saddle, [[0.0, 1.0], [2.0 * saddle, b2 + saddle]])
 
 
 def test_homoclinic_curves__bogdanov_takens():
@@ -126,35 +113,6 @@ def test_homoclinic_curves__bogdanov_takens():
     points = np.array([family.values(p.u) for p in curve.points[:-1]])
     ratio = points[:, 0] / points[:, 1] ** 2
     assert ratio[np.argmin(np.abs(points[:, 1]))] == pytest.approx(-6.0 / 25.0, abs=5e-4)
-
-
-def test_curves__of_a_run_from_a_bogdanov_takens_point(tmp_path, main):
-    """x' = y, y' = b1 + b2 y + x**2 + x y: equilibria meet at b1 = 0, lose stability at b1 = -b2**2, and the cycles end
-    at b1 = -(49/25) b2**2 + ... (Guckenheimer and Holmes, Nonlinear Oscillations, 1983, section 7.3).
-    """
-    damped = magpend.model("x' = y\ny' = b1 + b2*y + x**2 + x*y", name="damped", b1=-0.2, b2=0.2)
-    spec = magpend.Spec("sweep", damped).with_section(of="y", value=0.0, longest=60.0)
-    spec = spec.with_axis("b1", values=[-0.3, -0.1]).with_start_random(n=1, x=(-0.6, -0.4), y=(0.0, 0.05), seed=0)
-    run = magpend.run(spec.with_integration(n_transient=100, n_keep=4), tmp_path / "run", workers=0)
-    second = {"low": -0.4, "high": 0.1, "second": "b2", "second_low": -0.05, "second_high": 0.3}
-    flags = ["--from", -0.4, "--to", 0.1, "--second", "b2", "--second-from", -0.05, "--second-to", 0.3]
-    code, out, _ = main("analyse", "curves", "run", *flags)
-    assert code == 0
-    assert "HOM homoclinic" in out
-    ds = run.curves(**second)
-    kinds = np.array(words_of(ds["kind"]))[ds["kind"].values]
-    (point,) = np.flatnonzero(np.array(words_of(ds["special_kind"]))[ds["special_kind"].values] == "bogdanov_takens")
-    assert [float(ds[f"special_{one}"][point]) for one in ("first", "second")] == pytest.approx([0.0, 0.0], abs=1e-7)
-    (curve,) = np.flatnonzero(kinds == "homoclinic")
-    n = int(ds["n_points"][curve])
-    b1, b2 = (ds[name].values[curve, :n] for name in ("first", "second"))
-    for value in (0.05, 0.2):
-        near = CubicSpline(b2[np.argsort(b2)], b1[np.argsort(b2)])(value)
-        known = brentq(damped_split, 1.001 * near, 0.999 * near, args=(value,), xtol=1e-12)
-        assert near == pytest.approx(known, abs=1e-6 * abs(value))
-    small = b2 > 1e-9
-    ratio = b1[small] / b2[small] ** 2
-    assert ratio[np.argmin(b2[small])] == pytest.approx(-49.0 / 25.0, abs=0.02)
 
 
 NEURON = table(

@@ -132,7 +132,7 @@ def test_logistic__grid_values_on_bifurcations(tmp_path):
         ([1.0, 2.0, 3.0], (0.5, 3.2), {"transcritical": 1.0, "period_doubling": 3.0}, [1, 1, 2]),
         ([3.0], (2.9, 3.1), {"period_doubling": 3.0}, [1, 2]),
     ):
-        ds = logistic(tmp_path / str(len(values)), values).branches(low=ends[0], high=ends[1])
+        ds = logistic(tmp_path / str(len(values)), values).branches(parameter="r", low=ends[0], high=ends[1])
         rows = branches_table(ds).rows
         assert sorted(ds["orbit_period"].values) == periods
         assert [(row["type"], row["period"]) for row in rows] == [(kind, 1) for kind in known]
