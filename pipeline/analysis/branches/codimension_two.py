@@ -268,13 +268,16 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
     """Collect the points of codimension two of several curves without duplicates; `points` has those of each curve
     number.
 
-    A Chenciner point at a strong resonance is dropped: the coefficient that vanishes there has no meaning at it.
+    A Chenciner point at a strong resonance is dropped, and a cusp at a degenerate pitchfork, where a curve of folds goes
+    on to its mirror image: the coefficient that vanishes there has no meaning at it.
     """
     found: list[SpecialPoint] = []
     strong = [one for ones in points.values() for one in ones if one.kind in (R1, R2, R3, R4)]
+    pitchforks = [one for ones in points.values() for one in ones if one.kind == DEGENERATE]
     for number, ones in points.items():
         for one in ones:
-            is_resonance = one.kind == CHENCINER and any(_is_same_orbit(one, other) for other in strong)
+            beside = {CHENCINER: strong, CUSP: pitchforks}.get(one.kind, [])
+            is_resonance = any(_is_same_orbit(one, other) for other in beside)
             if not is_resonance and not any(one.kind == other.kind and _is_same_orbit(one, other) for other in found):
                 found.append(replace(one, curve=number))
     return found

@@ -74,6 +74,9 @@ SINGULAR = 1e-6
 """Largest singular value of the dimensionless equations of a fold at a branch point, and its quadratic term at a
 pitchfork."""
 
+NO_PRODUCT = 1e-5
+"""Product <p, q> below which a pitchfork is a double zero, where its cubic coefficient has a pole."""
+
 PERSISTS = 1e-7
 """Largest imperfection beta of a branch point that counts as none."""
 
@@ -257,6 +260,9 @@ class EquilibriumDetector(Detector):
         if one.kind == CUSP:
             found = partial(cusp, rest)
         elif one.kind == DEGENERATE:
+            right, left = null_vectors(rest.matrix)
+            if abs(left @ right) < NO_PRODUCT:
+                return None
             found = partial(degenerate_pitchfork, rest)
         elif one.kind == BT:
             found = partial(bogdanov_takens, rest)
