@@ -268,8 +268,8 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
     """Collect the points of codimension two of several curves without duplicates; `points` has those of each curve
     number.
 
-    A Chenciner point at a strong resonance is dropped, and a cusp at a degenerate pitchfork, where a curve of folds goes
-    on to its mirror image: the coefficient that vanishes there has no meaning at it.
+    A Chenciner point at a strong resonance is dropped, and a cusp at a degenerate pitchfork, where folds go on to their
+    mirror image: the coefficient that vanishes there has no meaning at it.
     """
     found: list[SpecialPoint] = []
     strong = [one for ones in points.values() for one in ones if one.kind in (R1, R2, R3, R4)]
