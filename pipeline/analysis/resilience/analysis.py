@@ -317,7 +317,8 @@ class _Result:
                 self._new(f"along_{name}", dtype, fill, f"boundary along a state: {meaning}", ("state",))
         self._new("along", "float64", np.nan, "boundary along a state: jump", ("state",), "see state_units")
         for name, (text, units) in _NUMBERS.items():
-            self._new(name, *(("int64", 0) if name == "n_timed" else ("float64", np.nan)), text, units=units)
+            dtype, fill = ("int64", 0) if name == "n_timed" else ("float64", np.nan)
+            self._new(name, dtype, fill, text, units=units)
 
     def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
         values = np.full((self._attractors.sizes[SET], *(self._n_states for _ in own)), fill, dtype)

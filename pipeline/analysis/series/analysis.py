@@ -146,7 +146,7 @@ def _measured(series: Series, seed: int) -> xr.Dataset:
         _surrogate_result(noise),
     ]
     motion, reason = _motion(returns, {r.name: r for r in results}, parted, drift)
-    variables = {name: ("quantity", [getattr(r, name) for r in results]) for name in Result._fields[1:]}
+    variables: dict[str, Any] = {name: ("quantity", [getattr(r, name) for r in results]) for name in Result._fields[1:]}
     lags = ("lag", np.arange(len(information)) * series.step, {"units": "s"})
     variables["mutual_information"] = ("lag", information, {"units": "1"})
     variables["false_neighbours"] = ("dimension", false, {"units": "1"})

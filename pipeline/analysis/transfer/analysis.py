@@ -316,7 +316,7 @@ _WITH_ENDS = ("escape_rate", "passage", "committor")
 
 _RATES, _PASSAGES, _COMMITTORS = ([f"{name}{end}" for end in ("", "_low", "_high", "_coarse")] for name in _WITH_ENDS)
 _REALS = (*_RATES, "kept")
-_ON_SETS = dict.fromkeys(("is_closed", "measure", "share", *_REALS, N_POINTS), (SET,))
+_ON_SETS: dict[str, tuple[str, ...]] = dict.fromkeys(("is_closed", "measure", "share", *_REALS, N_POINTS), (SET,))
 _ON_SETS |= dict.fromkeys(_PASSAGES, (SET, "target"))
 _ON_BOXES = dict.fromkeys(("density", *_COMMITTORS, "is_core"), (SAMPLE,)) | {"place": (SAMPLE, "axis")}
 
