@@ -547,9 +547,11 @@ def _relocate(one: Bifurcation, branch: Branch, place: int) -> None:
     """Locate a branch point again between the points of the branch that passes straight through it: on the branch that
     turns there it is known to the root of its residual alone.
     """
-    beside, test = branch.points[max(place - 1, 0) : place + 1], TESTS[BRANCHING]
-    if len(beside) == 2 and test(beside[0]) * test(beside[1]) < 0.0:
-        found = run_alone(locate(problem_of(branch.family), *beside, BRANCHING, Settings(), SHIFTS))
+    if not 0 < place < len(branch.points):
+        return
+    before, after = branch.points[place - 1 : place + 1]
+    if TESTS[BRANCHING](before) * TESTS[BRANCHING](after) < 0.0:
+        found = run_alone(locate(problem_of(branch.family), before, after, BRANCHING, Settings(), SHIFTS))
         if found is not None:
             one.point, one.bracket = found.point, found.bracket
 
