@@ -109,7 +109,8 @@ def filled(
         values = np.full((*shape, *(sizes[dim] for dim in further)), np.nan)
         for index, item in items:
             own = np.asarray(values_of(*item))
-            values[(*index, *(slice(n) for n in own.shape))] = own
+            place: tuple[Any, ...] = (*index, *(slice(n) for n in own.shape))
+            values[place] = own
         found[name] = ((*dims, *further), values, {"units": unit, "long_name": about})
     return found
 
