@@ -83,7 +83,7 @@ ANALYSES = {
     "chaos": "sweep",
     "dimension": f"sweep {POINT} --n-max 2000",
     "spectrum": f"sweep {POINT} --averages 3",
-    "series": f"sweep {POINT} --attractor A --periods 60 --samples 16",
+    "series": f"sweep {POINT} --attractor E --periods 60 --samples 16",
     "branches": "walk --period 1",
     "manifolds": f"{SWEPT} --length 0.5 --chord 0.1",
     "tangency": f"{SWEPT} --parameter amplitude --from 0.3 --to 0.31 --length 0.5",
@@ -327,6 +327,7 @@ def test_plot__refuses_runs_that_lack_what_the_guide_says(runs, day, name):
             magpend.figure(magpend.Run.open(day / directory), name, {**required, "at": chosen})
 
 
+@pytest.mark.slow
 def test_figures__have_names_of_their_own(drawn):
     """No two commands above write one file, whichever of them have been run before."""
     figures = [drawn(words)[0] for words in PICTURES]

@@ -76,6 +76,7 @@ def hardening(t, y, f):
     return v, force - 0.1 * v - x - 0.5 * x**3, c, d, -k * a - 0.1 * c, -k * b - 0.1 * d
 
 
+@pytest.mark.slow
 def test_branches__have_the_orbits_and_folds_of_another_integrator(tmp_path):
     found = magpend.branches(finished(tmp_path, RESONANCE), max_period=1)
     folds = found.isel(bifurcation=found.of_branch == 0)

@@ -286,7 +286,7 @@ SPECTRUM = Figure(
 
 SERIES = Figure(
     "series",
-    "Draw a motion's delay portrait, return map, divergence of neighbours, correlation sums, recurrences and spectrum.",
+    "Draw a motion's delay portrait, return map, divergence, correlation sums, recurrences and spectrum.",
     SeriesFigureOptions,
     "pipeline.plots.series:draw_series",
     panels="several",

@@ -285,6 +285,7 @@ def least_sum(polynomial):
     return np.abs(values[i] + values[j]).min() / np.abs(values).max()
 
 
+@pytest.mark.slow
 def test_follower_force():
     """Flutter by Routh and Hurwitz, divergence where det K = 0; both meet at the double zero."""
     flutter = brentq(lambda load: routh(follower_polynomial(load, 1.0)), 1.0, 2.0, xtol=1e-12)

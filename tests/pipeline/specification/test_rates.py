@@ -44,6 +44,7 @@ def test_cells__have_frequencies(runs):
     np.testing.assert_array_equal(*same)
 
 
+@pytest.mark.slow
 def test_tables__have_the_word_of_the_specification(runs):
     """Located folds and jumps: values converted, directions of a period turned round."""
     hertz, omega, period = (runs[word].branches().magpend.table() for word in ("frequency_hz", "omega", "period"))

@@ -275,6 +275,7 @@ def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the
         run_posterior(path, directory, 3, tmp_path / "other", workers=0)
 
 
+@pytest.mark.slow
 def test_posterior__parameter_that_is_not_determined(fitted):
     directory, result = fitted
     result["covariance"]["matrix"][0][0] = None
