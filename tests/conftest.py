@@ -23,6 +23,10 @@ settings.register_profile("fresh", deadline=None, max_examples=300, print_blob=T
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 
+# two processes whose small matrices are each shared among threads wait for each other; workers of pytest inherit it
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
 def _is_writable(folder: Path) -> bool:
     """Whether a file can be put into a folder, which is made if need be."""
     try:

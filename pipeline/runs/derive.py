@@ -320,12 +320,15 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 def _compute(run: AnalysedRun, analysis: Analysis, options: Options, *, can_keep: bool) -> xr.Dataset:
     """Compute a result, in blocks if they can be kept, otherwise on threads of the engine."""
+    from threadpoolctl import threadpool_limits
+
     from magpend_core.engine.threads import using_threads
     from pipeline.runs.blocks import in_blocks
 
     started = time.perf_counter()
     threads = contextlib.nullcontext() if run.workers is None else using_threads(max(run.workers, 1))
-    with refused(run.name), threads:
+    # matrices are so small that threads of linear algebra would wait for each other
+    with refused(run.name), threads, threadpool_limits(1):
         if analysis.by_point and can_keep and not getattr(options, "at", None):
             result = in_blocks(run, analysis, options)
         else:

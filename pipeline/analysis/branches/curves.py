@@ -120,7 +120,7 @@ NO_FREQUENCY = 1e-6
 SAME_PERIOD = 0.1
 """Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
 
-BESIDE = (0.02, 0.005)
+BESIDE = (0.2, 0.02)
 """Scaled distances from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins."""
 
 AMPLITUDES = (0.02, 0.05, 0.1)

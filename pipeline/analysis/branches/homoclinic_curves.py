@@ -67,8 +67,10 @@ MEETS = 1e-3
 SAMPLES = 8000
 """Instants of a long cycle that is the first guess."""
 
-ANGLES, LOOP = 36, 6.0
-"""Directions about a Bogdanov-Takens point that are tried, and half the length of a loop in units of its time 1/k."""
+ANGLES, NARROWEST, LOOP = 36, 1e-6, 6.0
+"""Directions about a Bogdanov-Takens point that are tried, the width to which they are narrowed [rad], and half the
+length of a loop in units of its time 1/k.
+"""
 
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 """Intervals of both parameters."""
@@ -435,21 +437,21 @@ def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
     Loop or None
         None if no direction in the plane of the parameters fulfils the condition.
     """
-    angles = np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)
-    pairs = [_pair_at(takens, away, angle) for angle in angles]
-    for i in range(ANGLES):
-        low, high = angles[i], angles[i + 1]
-        first, last = pairs[i], pairs[i + 1]
-        if first is None or last is None or first.work * last.work >= 0.0:
+    known = [(angle, _pair_at(takens, away, angle)) for angle in np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)]
+    for one, other in pairwise(known):
+        (inner, pair), (outer, beyond) = (one, other) if one[1] is not None else (other, one)
+        if pair is None or (beyond is not None and pair.work * beyond.work > 0.0):
             continue
-        while high - low > 1e-6 and first is not None:
-            middle = 0.5 * (low + high)
-            pair = _pair_at(takens, away, middle)
-            if pair is None or pair.work * first.work > 0.0:
-                low, first = middle, pair
+        # where the equilibria meet there is no pair; the work may change its sign just before
+        while abs(outer - inner) > NARROWEST:
+            middle = 0.5 * (inner + outer)
+            found = _pair_at(takens, away, middle)
+            if found is None or found.work * pair.work < 0.0:
+                outer, beyond = middle, found
             else:
-                high = middle
-        return None if first is None else first.loop(takens.family)
+                inner, pair = middle, found
+        if beyond is not None:
+            return pair.loop(takens.family)
     return None
 
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
+import magpend
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import curves_table
@@ -14,6 +15,7 @@ from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.homoclinic import Loop
 from pipeline.analysis.branches.homoclinic_curves import homoclinic_curves, loop_near
 from pipeline.analysis.branches.problems import Family, Value
+from pipeline.analysis.tabular import words_of
 from pipeline.plots.regimes import plot_curves
 from tests.core.flows import LORENZ, flow, table
 from tests.pipeline.analysis.test_branches_flows import followed
@@ -71,10 +73,9 @@ def test_homoclinic_curves__closed_form():
 TAKENS = table("takens", {"x": "y", "y": "b1 + b2*x + x**2 + x*y"}, {"b1": 0.0, "b2": 0.0})
 
 
-def takens_split(b1, b2):
+def split(rates, saddle, jacobian):
     """Distance of the saddle's manifolds on y = 0, left of the saddle, by DOP853."""
-    saddle = 0.5 * (-b2 + np.sqrt(b2 * b2 - 4.0 * b1))
-    values, vectors = np.linalg.eig([[0.0, 1.0], [b2 + 2.0 * saddle, saddle]])
+    values, vectors = np.linalg.eig(jacobian)
     ends = []
     for sign in (1.0, -1.0):
 
@@ -85,12 +86,22 @@ def takens_split(b1, b2):
         own = vectors[:, np.argmax(sign * values)]
         start = np.array([saddle, 0.0]) - 1e-7 * own * np.sign(own[0])
 
-        def rates(_, u, sign=sign):
-            return [sign * u[1], sign * (b1 + b2 * u[0] + u[0] ** 2 + u[0] * u[1])]
+        def flow_of(_, u, sign=sign):
+            return [sign * rate for rate in rates(*u)]
 
-        found = solve_ivp(rates, (0.0, 400.0), start, "DOP853", events=level, rtol=1e-12, atol=1e-14)
+        found = solve_ivp(flow_of, (0.0, 400.0), start, "DOP853", events=level, rtol=1e-12, atol=1e-14)
         ends.append(found.y_events[0][0, 0])
     return ends[0] - ends[1]
+
+
+def takens_split(b1, b2):
+    saddle = 0.5 * (-b2 + np.sqrt(b2 * b2 - 4.0 * b1))
+    return split(lambda x, y: (y, b1 + b2 * x + x * x + x * y), saddle, [[0.0, 1.0], [b2 + 2.0 * saddle, saddle]])
+
+
+def damped_split(b1, b2):
+    saddle = np.sqrt(-b1)
+    return split(lambda x, y: (y, b1 + b2 * y + x * x + x * y), saddle, [[0.0, 1.0], [2.0 * saddle, b2 + saddle]])
 
 
 def test_homoclinic_curves__bogdanov_takens():
@@ -113,6 +124,26 @@ def test_homoclinic_curves__bogdanov_takens():
     points = np.array([family.values(p.u) for p in curve.points[:-1]])
     ratio = points[:, 0] / points[:, 1] ** 2
     assert ratio[np.argmin(np.abs(points[:, 1]))] == pytest.approx(-6.0 / 25.0, abs=5e-4)
+
+
+def test_curves__spring_from_a_bogdanov_takens_point(tmp_path):
+    """The whole command on x' = y, y' = b1 + b2 y + x**2 + x y: its Hopf curve b1 = -b2**2 ends at (0, 0), from where
+    the homoclinic curve b1 = -(49/25) b2**2 + ... is followed.
+    """
+    model = magpend.model("x' = y\ny' = b1 + b2*y + x**2 + x*y", name="damped", b1=-0.1, b2=0.2)
+    spec = magpend.Spec("sweep", model).with_section(of="y", value=0.0, longest=60.0)
+    spec = spec.with_axis("b1", values=[-0.12, -0.1]).with_start_random(n=1, x=(-0.4, -0.3), y=(0.0, 0.05), seed=0)
+    run = magpend.run(spec.with_integration(n_transient=100, n_keep=4), tmp_path / "run", workers=0)
+    found = run.curves(low=-0.12, high=0.02, stable=True, second="b2", second_low=-0.02, second_high=0.22)
+    kinds = [words_of(found["kind"])[code] for code in found["kind"].values]
+    rows = {kind: np.array([found[name].values[k] for name in ("first", "second")]) for k, kind in enumerate(kinds)}
+    hopf, homoclinic = (row[:, np.isfinite(row[0])] for row in (rows["hopf"], rows["homoclinic"]))
+    np.testing.assert_allclose(hopf[0], -(hopf[1] ** 2), atol=1e-9)
+    assert np.abs(homoclinic[:, 0]).max() < 1e-9
+    ratio = homoclinic[0, 1:] / homoclinic[1, 1:] ** 2
+    assert ratio[np.argmin(homoclinic[1, 1:])] == pytest.approx(-49.0 / 25.0, abs=2e-4)
+    b1, b2 = homoclinic[:, np.argmin(np.abs(homoclinic[1] - 0.1))]
+    assert b1 == pytest.approx(brentq(damped_split, 1.001 * b1, 0.999 * b1, args=(b2,), xtol=1e-13), abs=1e-9)
 
 
 NEURON = table(
