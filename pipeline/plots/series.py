@@ -38,7 +38,9 @@ def plot_series(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     for ax, panel in zip(axes, panels, strict=True):
         style.style_axes(ax)
         panel(ax, ds)
-    fig.suptitle(f"{ds.attrs['channel']}: {ds.attrs['motion']}", x=0.01, ha="left", fontsize=fig.look.title)
+    of_a_cell = "model" in ds.attrs
+    title = style.join([*([labels.caption(ds)] if of_a_cell else []), f"{ds.attrs['channel']}: {ds.attrs['motion']}"])
+    fig.suptitle(style.folded(title, frame.width_in - 0.6, fig.look.title), x=0.01, ha="left", fontsize=fig.look.title)
     style.finish(fig)
     return fig
 

@@ -207,7 +207,7 @@ def tangency_of_ueda():
 
 @pytest.mark.slow
 def test_contact_of__boundary_crisis_of_ueda():
-    """Ueda (Ann. N. Y. Acad. Sci. 357, 1980, 422) gives 13.388; `analyse events` finds the same orbit by itself."""
+    """The saddle of period 1 that is met is given here; `analyse events` searches it."""
     along = section_map(UEDA, "B", 13.375, 0.5 / np.pi)
     effort = Effort(64, 192, 3, 12, 1, is_flow=True)
     sample = sample_of(along, 13.375, np.array([3.1, -0.78]), effort)
