@@ -36,7 +36,7 @@ class Case:
     motion: str  # "chaotic", "periodic", "regular" or "noise"
     exponent: float = np.nan
     dimension: tuple[float, float] = (np.nan, np.nan)
-    period: float = np.nan  # mean time between maxima
+    period: float = np.nan  # mean time between maxima, of a closed orbit the time of its cycle
     cycle: int = 0
 
 
@@ -127,9 +127,9 @@ CASES = {
         torus, 0.17, ((1500, 0.0), (4000, 0.0), (12_000, 0.0), (4000, 0.05)), "regular", 0.0, (2.0, 2.0), TURN
     ),
     "orbit": Case(orbit(1.0, 0.3), 0.1, ((1500, 0.05), (3000, 0.2), (4000, 0.0)), "periodic", 0.0, (1.0, 1.0), TURN, 1),
-    "orbit-2": Case(orbit(0.5, 1.0), 0.1, ((4000, 0.1),), "periodic", 0.0, (1.0, 1.0), TURN / 2.0, 2),
+    "orbit-2": Case(orbit(0.5, 1.0), 0.1, ((4000, 0.1),), "periodic", 0.0, (1.0, 1.0), TURN, 2),
     "doubled": Case(
-        flow(roessler(3.5), 0.2, 800.0), 0.2, ((4000, 0.0), (4000, 0.02)), "periodic", 0.0, (1.0, 1.0), 5.7726, 2
+        flow(roessler(3.5), 0.2, 800.0), 0.2, ((4000, 0.0), (4000, 0.02)), "periodic", 0.0, (1.0, 1.0), 2 * 5.7726, 2
     ),
     "ar1": Case(autoregressive(1.0, -0.95), 1.0, ((1500, 0.0), (4000, 0.0)), "noise"),
     "narrow": Case(autoregressive(*NARROW), 1.0, ((1500, 0.0), (4000, 0.0)), "noise"),

@@ -33,7 +33,7 @@ from pipeline.analysis.series.returns import Returns, returns_of
 from pipeline.analysis.series.surrogates import N_SURROGATES, against_noise
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.spectrum.estimate import pieces_of, spectrum_of
-from pipeline.analysis.spectrum.motions import channels_of, clock_of, motions_of, row_axis, sampled
+from pipeline.analysis.spectrum.motions import channels_of, clock_of, motions_of, sampled
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
@@ -223,13 +223,10 @@ def _dimension_result(embedding: Embedding, false: Floats) -> Result:
 def _period_results(returns: Returns) -> list[Result]:
     if returns.reason:
         return [Result(name, "s", reason=returns.reason) for name in ("period", "period_scatter")]
-    n = len(returns.time)
-    low, high = (returns.scatter * np.sqrt((n - 1) / stats.chi2.ppf(q, n - 1)) for q in (0.975, 0.025))
-    found = [
-        Result("period", "s", returns.mean, returns.low, returns.high),
-        Result("period_scatter", "s", returns.scatter, low, high),
-    ]
-    cycle = returns.in_cycle
+    n, cycle = len(returns.time), returns.in_cycle
+    mean, low, high, scatter = (max(cycle, 1) * x for x in (returns.mean, returns.low, returns.high, returns.scatter))
+    ends = (scatter * np.sqrt((n - 1) / stats.chi2.ppf(q, n - 1)) for q in (0.975, 0.025))
+    found = [Result("period", "s", mean, low, high), Result("period_scatter", "s", scatter, *ends)]
     return [*found, Result("cycle", "maxima", cycle, cycle, cycle)] if cycle else found
 
 
@@ -326,8 +323,7 @@ def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
     time = np.arange(len(values)) / (rate * options.samples)
     told = told_by(run.cube().attrs)
     ds = xr.Dataset({channel.name: ("time", values, {"units": channel.unit})}, {"time": time}, told)
-    where = {row_axis(name): value for name, value in motion.where.items()}
-    return series_of(ds, seed=options.seed).assign_coords({**where, "attractor": motion.attractor})
+    return series_of(ds, seed=options.seed).assign_coords({**motion.where, "attractor": motion.attractor})
 
 
 def series_table(ds: xr.Dataset) -> Table:

@@ -159,6 +159,15 @@ def test_series_of__a_decaying_swing_is_not_stationary():
     assert low - 1e-4 <= np.pi <= high + 1e-4
 
 
+@pytest.mark.slow
+def test_series_of__a_cycle_of_three_maxima_has_the_period_of_the_whole():
+    t = np.arange(4000) * 0.05
+    found = magpend.series_of(series(np.sin(t) + 0.8 * np.sin(3.0 * t + 0.5), 0.05))
+    assert one(found, "cycle")[1] == 3
+    low, _, high = one(found, "period")
+    assert low - 1e-4 <= 2.0 * np.pi <= high + 1e-4
+
+
 def test_series_of__refuses_what_it_cannot_measure():
     with pytest.raises(ValueError, match="no 200 samples"):
         magpend.series_of(series(np.arange(100.0), 1.0))
