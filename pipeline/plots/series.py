@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tabular import counted
 from pipeline.plots import labels, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import SeriesFigureOptions
@@ -106,7 +107,9 @@ def _slopes(ax: Axes, ds: xr.Dataset) -> None:
         there = share[:-4] > 1e-6
         slope = np.log2(share[4:][there] / share[:-4][there])
         middle = np.sqrt(radius[4:] * radius[:-4])[there]
-        ax.plot(middle, slope, color=colour, linewidth=0.9, label=f"{int(one['embedding'])} delays", gid=f"slope-{k}")
+        ax.plot(
+            middle, slope, color=colour, linewidth=0.9, label=counted(int(one["embedding"]), "delay"), gid=f"slope-{k}"
+        )
     if np.isfinite(float(ds["fit_low"])):
         ax.axvspan(float(ds["fit_low"]), float(ds["fit_high"]), color="0.9", linewidth=0.0, zorder=0)
     ax.set_xscale("log")
