@@ -212,7 +212,7 @@ def test_series__of_a_chaotic_cell_has_the_exponent_of_its_tangents(duffing):
     known = float(duffing.cube()["lyapunov"].isel(exponent=0).values.ravel()[4])
     assert found.attrs["motion"] == "chaotic"
     assert 0.0 < float(exponent["low"]) <= known <= float(exponent["high"])
-    assert float(found["at_F"]) == 0.5
+    assert float(found["F"]) == 0.5
     assert "chaotic" in series_table(found).lines[0]
     assert len(duffing.plot.series(**cell)) == 6
     with pytest.raises(SpecError, match="of one motion, and"):
