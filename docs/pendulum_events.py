@@ -100,7 +100,7 @@ def tables_of(rows: pd.DataFrame, longest: int, twins: set[frozenset[int]]) -> l
 
 
 def _line(told: Sequence[Row]) -> str:
-    """Return the line of an event, or of those of two twins."""
+    """Return the table's line of one event, or of the two events of mirror twins."""
     values, whats, cells = zip(*(_parts(row) for row in told), strict=True)
     names = [letter(row["attractor"]) for row in told]
     own = [f"{name}: {to}" for name, to in zip(names, cells, strict=True) if to] if len(told) > 1 else cells

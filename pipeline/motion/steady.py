@@ -241,7 +241,7 @@ class Steady:
     def _more(
         self, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_more: int, quantities: Sequence[str] | None
     ) -> Values:
-        """Integrate cells further from their stored last states; return the variables of these periods."""
+        """Integrate cells on from their stored last states; return what the further periods give."""
         from magpend_core.extension import more_sections
 
         cells = more_sections(

@@ -335,7 +335,7 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
 
 
 def _turns(ds: xr.Dataset, k: int) -> bool:
-    """Return whether the branch turns at a bifurcation: a fold, or a pitchfork whose other branch is not known."""
+    """Return whether the branch turns back at a bifurcation, so that both its sides lie on one side of the value."""
     one = ds.isel(bifurcation=k)
     kind, branch, after = values(one, "kind")["kind"], int(one["of_branch"]), max(int(one["after"]), 0)
     before, beyond = ds["parameter"].values[branch, after : after + 2] - float(one["value"])
@@ -407,7 +407,7 @@ def _windows(ds: xr.Dataset) -> list[str]:
 
 
 def period_words(period: int) -> str:
-    """Name orbits of a period, or equilibria, which have the period 0."""
+    """Return "period N", or "equilibrium" for the period 0."""
     return f"period {period}" if period else "equilibrium"
 
 

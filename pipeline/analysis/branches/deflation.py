@@ -66,7 +66,7 @@ class FoundOrbit:
         return found[np.argsort(-np.abs(found), kind="stable")]
 
     def index(self, times: int = 1) -> int:
-        """Return the fixed-point index of the orbit, traversed `times` times: the sign of det(1 - M^times)."""
+        """Return the fixed-point index of the orbit run through `times` times: the sign of det(1 - M^times)."""
         power = np.linalg.matrix_power(self.monodromy, times)
         return int(np.sign(np.linalg.det(np.eye(len(power)) - power)))
 
@@ -263,7 +263,7 @@ def coverage(found: Sequence[FoundOrbit]) -> float:
 
 
 def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
-    """Add up the fixed-point indices of all fixed points of the p-fold section map, for each p from 1 to `longest`."""
+    """For each p up to `longest`, add up the indices of the fixed points of the section map taken p times."""
     return {
         p: sum(one.period * one.index(p // one.period) for one in found if p % one.period == 0)
         for p in range(1, longest + 1)

@@ -206,6 +206,7 @@ class _Vectors:
 
     @classmethod
     def of(cls, matrix: np.ndarray, before: _Vectors | None) -> _Vectors:
+        """Compute the null vectors of a matrix, with the signs of those before."""
         right, left = null_vectors(matrix)
         if before is not None:
             right, left = (v * np.copysign(1.0, v @ w) for v, w in ((right, before.right), (left, before.left)))

@@ -147,8 +147,8 @@ def _judge_sign(one: Bifurcation) -> None:
 
 
 def _tell_branch_point(one: Bifurcation, square: tuple[float, float], cubic: tuple[float, float], size: float) -> None:
-    """Tell a pitchfork from a transcritical point by the quadratic coefficient, in units of its bound `size`; both
-    coefficients come with their errors.
+    """Call a branch point transcritical if its quadratic coefficient is not 0, a pitchfork if it is certainly small
+    beside its bound `size`, and leave it open otherwise. Both coefficients come with their errors.
     """
     by_arms, one.criticality = one.criticality, ""
     if not np.isfinite(square[0] + size):

@@ -39,11 +39,11 @@ from pipeline.specification.problems import SpecError
 
 
 def needs_point(run: OpenRun, options: OrbitOptions) -> None:
-    """Raise ValueError unless the options choose exactly one parameter point, and --start names all states."""
+    """Refuse options that choose no parameter point or several, and a --start without all states or a period."""
     point_of(run.cube(), options)
     problems = start_problems(run.model, options)
     if options.start and not options.start_period:
-        problems = ["--start-period 0: this analysis takes orbits; give their period, 1 or more."]
+        problems.append("--start-period 0: this analysis takes orbits; give their period, 1 or more.")
     if problems:
         raise SpecError(problems)
 

@@ -380,7 +380,7 @@ class EquilibriumProblem(FamilyProblem):
     _unit: float = field(default=0.0, init=False, repr=False)
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return no trajectories to integrate: the equations for equilibria need none."""
+        """Return an empty set of trajectories: equilibria need no integration."""
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:

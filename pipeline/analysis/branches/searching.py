@@ -173,7 +173,7 @@ def _hindrance(cells: xr.Dataset, parameters: Parameters) -> str:
 
 
 def where_variables(dim: str, places: Sequence[Any], model: Model) -> dict[str, Any]:
-    """Return variables of the parameter's value (``..._value``) at some places, and of those of other axes."""
+    """Return the values of the parameter (``DIM_value``) and of other axes at the places of a search."""
     columns = {"value": [p.value for p in places], **{d: [p.where[d] for p in places] for d in places[0].where}}
     units = {name: parameter_units(places[0].family.free[0] if name == "value" else name, model) for name in columns}
     return {

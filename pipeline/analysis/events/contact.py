@@ -441,7 +441,7 @@ class Approach:
         return a, lane, at, k
 
     def lifetimes(self, value: float, length: int) -> tuple[float, int]:
-        """Return the mean time before trajectories leave at a parameter value, and the number that left."""
+        """Return the mean time after which trajectories leave at a parameter value [sections], and how many left."""
         paths = self.paths(value, length)
         until = _until(*self._sided(value, paths)[:3], paths)
         if self.effort.is_flow:  # of a lost set, most trajectories leave far from the orbit, and none comes back

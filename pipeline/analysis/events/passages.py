@@ -42,7 +42,7 @@ EXPONENTS = {FOLD: -0.5, TORUS: -1.0, DOUBLING: -1.0}
 
 
 class Effort(NamedTuple):
-    """Trajectories near a bifurcation, and the laminar phases of which lengths are fitted."""
+    """How many trajectories are followed near a bifurcation, how long, and how many laminar phases the fit needs."""
 
     n_values: int  # distances, each half of the one before
     many: int  # trajectories at each

@@ -132,7 +132,7 @@ class Place:
         return paths, last_stays(paths, self.points, AROUND * self.size, self.along.geometry)
 
     def lifetime(self, value: float) -> tuple[float, int]:
-        """Return the mean lifetime of trajectories at a value, and the number of those that left.
+        """Return the mean lifetime of trajectories at a parameter value [sections], and how many of them left.
 
         The set is followed: if none left, its points at this value replace those before.
         """

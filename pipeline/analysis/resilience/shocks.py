@@ -327,7 +327,7 @@ class ShockSearch:
         return np.tile(numbers, len(sizes)), shock.reshape(-1, self._dim)
 
     def _contradictions(self, best: _Rays) -> Generator[Trials, np.ndarray, _Rays]:
-        """Try random smaller shocks; return the rays of those that lead away.
+        """Try random shocks below the smallest one found; return those that lead out of the basin, if any.
 
         Half of them have any direction and base state. The others are near the best ray at all distances below its
         shock: where the boundary is fractal, thin parts of other basins lie there, which dividing a ray misses.

@@ -64,7 +64,7 @@ class Divergence:
 
     @property
     def grows(self) -> bool:
-        """Whether neighbours part exponentially, beyond the error."""
+        """Whether neighbours move apart exponentially: the interval of the rate lies above 0."""
         return self.low > 0.0 and not self.reason
 
 

@@ -237,7 +237,7 @@ def _column(rows: Sequence[dict[str, Any]], name: str) -> Array:
 
 
 def axes_of(ds: xr.Dataset) -> list[str]:
-    """Return the names of the coordinates with the swept parameters along the rows."""
+    """Return the names of the coordinates that hold the swept parameters of each row."""
     return list(dims_in_own_words(str(ds.attrs.get("axes", "")).split(), str(ds.attrs.get(RATE, FREQUENCY))))
 
 

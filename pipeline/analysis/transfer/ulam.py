@@ -192,7 +192,9 @@ def memberships(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _corners(x: np.ndarray) -> list[int]:
-    """Return the numbers of the corner rows; each further one is the farthest from the plane of those before."""
+    """Choose as many rows as there are columns, as corners of the simplex that holds all: each further one lies
+    farthest from the plane through those before.
+    """
     found = [int(np.argmax(np.linalg.norm(x - x.mean(axis=0), axis=1)))]
     rest = x - x[found[0]]
     for _ in range(x.shape[1] - 1):
