@@ -31,7 +31,7 @@ class StartOptions(Options):
     )
     start_period: int = option(
         1,
-        "Period of the orbit near --start; branches take 0, and of a flow without a section any, as an equilibrium.",
+        "Period of the orbit near --start. For branches 0 means an equilibrium; a flow without a section has only these.",
         unit="drive periods or returns",
         ge=0,
     )

@@ -20,8 +20,8 @@ class EventOptions(BranchOptions):
     )
     orbits: bool = option(
         False,
-        "Name the ends of orbits alone. What chaotic sets and tori end in takes many long trajectories: a minute for "
-        "each end at low frequencies.",
+        "Name only the ends of periodic orbits and equilibria. Each end of a chaotic set or a torus takes many long "
+        "trajectories: a minute at low frequencies.",
     )
 
 
@@ -31,8 +31,8 @@ EVENTS = Analysis(
 
     Follows the branch of each orbit from the last value at which cells end on it. Ends of chaotic sets and tori are
     named where doublings, a Neimark-Sacker point, slow passages near an orbit beyond (intermittency, locking), the
-    touch of an unstable orbit (crises) or exponents in between (break-up of a torus) prove them; all others are not
-    decided.""",
+    touch of an unstable orbit (crises), lifetimes beyond (transients) or exponents in between (break-up of a torus)
+    prove them; all others are not decided.""",
     EventOptions,
     compute=f"{_ROOM}:events",
     table="pipeline.analysis.events.sentences:events_table",
