@@ -31,7 +31,7 @@ class StartOptions(Options):
     )
     start_period: int = option(
         1,
-        "Period of the orbit near --start. For branches 0 means an equilibrium; a flow without a section has only these.",
+        "Period of the orbit near --start. Of branches 0 is an equilibrium; flows without a section have only these.",
         unit="drive periods or returns",
         ge=0,
     )
