@@ -300,10 +300,10 @@ def _motion(returns: Returns, results: dict[str, Result], parted: Divergence, dr
         return MOTIONS[0], exponent.reason
     if parted.grows:
         if diffuses.value < ORDERLY:
-            return MOTIONS[0], "the exponent is positive, but the 0-1 test bounded"
+            return MOTIONS[0], "the exponent is positive, but the 0-1 test finds bounded motion"
         return MOTIONS[3], "neighbours part exponentially, and linear noise does not explain it"
     if diffuses.value > DISORDERLY:
-        return MOTIONS[0], "neighbours stay close, but the 0-1 test diffuses"
+        return MOTIONS[0], "neighbours stay close, but the 0-1 test finds diffusion"
     if returns.in_cycle:
         return MOTIONS[1], f"{returns.in_cycle} maxima repeat"
     return MOTIONS[2], "neighbours stay close"
@@ -313,7 +313,7 @@ def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
     """Sample the motion of an attractor or a cell, and measure what the series says; see `series_of`."""
     motions = motions_of(run, options)
     if len(motions) > 1:
-        raise ValueError(f"a series is that of one motion, and {len(motions)} are there: take at, attractor or cell.")
+        raise ValueError(f"a series is taken of one motion, and {len(motions)} are there: choose one by at, attractor or cell.")
     (motion,) = motions
     rate = clock_of(motion)
     channel = next(v for v in channels_of(run.model) if v.name == options.channel)
