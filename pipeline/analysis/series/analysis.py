@@ -313,7 +313,9 @@ def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
     """Sample the motion of an attractor or a cell, and measure what the series says; see `series_of`."""
     motions = motions_of(run, options)
     if len(motions) > 1:
-        raise ValueError(f"a series is taken of one motion, and {len(motions)} are there: choose one by at, attractor or cell.")
+        raise ValueError(
+            f"a series is taken of one motion, and {len(motions)} are there: choose by at, attractor or cell."
+        )
     (motion,) = motions
     rate = clock_of(motion)
     channel = next(v for v in channels_of(run.model) if v.name == options.channel)
