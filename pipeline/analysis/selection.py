@@ -27,6 +27,11 @@ def start_dims(attractors: xr.Dataset) -> list[str]:
     return list(split_dims(attractors["attractor_id"])[1])
 
 
+def listed(text: str) -> list[str]:
+    """Return the names in a text, which are separated by commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...], purpose: str) -> xr.Dataset:
     """Select one value on each axis of a dataset, except on the axes in `keep`.
 

@@ -55,8 +55,6 @@ LEAST_DRIFT = 0.1
 ORDERLY, DISORDERLY = 0.15, 0.85
 """Results of the 0-1 test up to which a motion is regular, and from which on it is not."""
 
-MOTIONS = ("not decided", "periodic", "regular", "chaotic")
-
 
 class Result(NamedTuple):
     """A quantity with its interval; a value that is not decided is NaN and has a reason."""
@@ -90,22 +88,18 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
         (false nearest neighbours), ``period`` and ``period_scatter`` (between maxima), ``cycle`` (maxima in a closed
         orbit), ``exponent`` (largest Lyapunov exponent), ``correlation_dimension``, ``zero_one`` (0-1 test),
         ``determinism``, ``laminarity``, ``mean_line``, ``line_entropy`` (recurrences) and ``surrogate_rank`` (share
-        of surrogates that are predicted no worse). Attributes: ``motion`` (a word of `MOTIONS`) and ``motion_reason``.
-        Curves: ``mutual_information`` over ``lag``, ``false_neighbours`` over ``dimension``, ``divergence`` over
-        ``elapsed`` with ``fit_line``, ``correlation_sum`` over ``embedding`` and ``radius``, ``recurrent`` over
-        ``row`` and ``column``, ``maximum`` and ``next_maximum`` over ``return``, ``vector`` over ``delayed`` and
-        ``coordinate``, and ``power`` over ``bin``.
+        of surrogates that are predicted no worse). Attributes: ``motion`` (not decided, periodic, regular or chaotic)
+        and ``motion_reason``. Curves: ``mutual_information`` over ``lag``, ``false_neighbours`` over ``dimension``,
+        ``divergence`` over ``elapsed`` with ``fit_line``, ``correlation_sum`` over ``embedding`` and ``radius``,
+        ``recurrent`` over ``row`` and ``column``, ``maximum`` and ``next_maximum`` over ``return``, ``vector`` over
+        ``delayed`` and ``coordinate``, and ``power`` over ``bin``.
 
     Raises
     ------
     ValueError
         If there is no such channel, samples are not even, or no piece has 200 samples.
     """
-    names = [str(name) for name, v in ds.data_vars.items() if v.ndim == 1 and v.dims == ds["time"].dims]
-    channel = channel or names[0]
-    if channel not in names:
-        raise ValueError(f"channel {channel!r} is not there; it has {', '.join(names)}.")
-    pieces, rate = pieces_of(ds, channel)
+    channel, pieces, rate = pieces_of(ds, channel)
     pieces = [piece for piece in pieces if len(piece) >= SHORTEST]
     if not pieces:
         raise ValueError(f"channel {channel!r} has no {SHORTEST} samples in a row.")
@@ -113,9 +107,8 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
     if not np.ptp(series.values) > 0.0:
         raise ValueError(f"channel {channel!r} is constant.")
     about = {"title": "series", "channel": channel, "unit": shown_unit(ds[channel].attrs, "1"), "seed": seed}
-    power = spectrum_of(ds, channel).isel(spectrum=0).reset_coords("frequency_hz")[["power", "frequency_hz"]]
-    found = xr.merge([_measured(series, seed), power.drop_vars("order", errors="ignore")])
-    return found.assign_attrs({**told_by(ds.attrs), **about})
+    power = spectrum_of(ds, channel).isel(spectrum=0).reset_coords()[["power", "frequency_hz"]]
+    return xr.merge([_measured(series, seed), power]).assign_attrs({**told_by(ds.attrs), **about})
 
 
 def _measured(series: Series, seed: int) -> xr.Dataset:
@@ -294,19 +287,17 @@ def _drift(series: Series) -> str:
 def _motion(returns: Returns, results: dict[str, Result], parted: Divergence, drift: str) -> tuple[str, str]:
     """Return the name of the motion, and what it rests on or why it is not decided."""
     exponent, diffuses = results["exponent"], results["zero_one"]
-    if drift:
-        return MOTIONS[0], drift
-    if exponent.reason:
-        return MOTIONS[0], exponent.reason
+    if reason := drift or exponent.reason:
+        return "not decided", reason
     if parted.grows:
         if diffuses.value < ORDERLY:
-            return MOTIONS[0], "the exponent is positive, but the 0-1 test finds bounded motion"
-        return MOTIONS[3], "neighbours part exponentially, and linear noise does not explain it"
+            return "not decided", "the exponent is positive, but the 0-1 test finds bounded motion"
+        return "chaotic", "neighbours part exponentially, and linear noise does not explain it"
     if diffuses.value > DISORDERLY:
-        return MOTIONS[0], "neighbours stay close, but the 0-1 test finds diffusion"
+        return "not decided", "neighbours stay close, but the 0-1 test finds diffusion"
     if returns.in_cycle:
-        return MOTIONS[1], f"{returns.in_cycle} maxima repeat"
-    return MOTIONS[2], "neighbours stay close"
+        return "periodic", f"{returns.in_cycle} maxima repeat"
+    return "regular", "neighbours stay close"
 
 
 def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
@@ -335,17 +326,18 @@ def series_table(ds: xr.Dataset) -> Table:
     """
     rows: list[Row] = []
     lines: list[Words] = []
-    for i, name in enumerate(ds["quantity"].values.tolist()):
-        one = ds.isel(quantity=i)
-        value, low, high = (float(one[key]) for key in ("value", "low", "high"))
-        unit, reason = str(one["unit"].item()), str(one["reason"].item())
-        row = {"quantity": name, "value": value, "low": low, "high": high, "unit": unit}
-        rows.append({**row, "decided": not reason, "reason": reason})
-        shown = f"{number(low, '.4g')} to {number(high, '.4g')}" if not reason else ""
-        words = {"quantity": plain(name), "value": number(value, ".5g"), "95 % interval": shown}
-        lines.append({**words, "unit": "" if unit == "1" else unit, "not decided because": reason})
-    motion = {"quantity": "motion", "value": np.nan, "low": np.nan, "high": np.nan, "unit": str(ds.attrs["motion"])}
-    decided = ds.attrs["motion"] != "not decided"
-    rows.append({**motion, "decided": decided, "reason": str(ds.attrs["motion_reason"])})
+    for name, *columns in zip(*(ds[key].values.tolist() for key in ("quantity", *Result._fields[1:])), strict=True):
+        one = Result(name, *columns)
+        rows.append(_row(one, not one.reason))
+        shown = f"{number(one.low, '.4g')} to {number(one.high, '.4g')}" if not one.reason else ""
+        words = {"quantity": plain(name), "value": number(one.value, ".5g"), "95 % interval": shown}
+        lines.append({**words, "unit": "" if one.unit == "1" else one.unit, "not decided because": one.reason})
+    motion = Result("motion", str(ds.attrs["motion"]), reason=str(ds.attrs["motion_reason"]))
+    rows.append(_row(motion, motion.unit != "not decided"))
     heading = f"{ds.attrs['channel']}: {ds.attrs['motion']} ({ds.attrs['motion_reason']})"
     return Table(rows, [heading, *aligned(lines)])
+
+
+def _row(one: Result, decided: bool) -> Row:
+    numbers = {name: getattr(one, name) for name in ("value", "low", "high", "unit")}
+    return {"quantity": one.name, **numbers, "decided": decided, "reason": one.reason}

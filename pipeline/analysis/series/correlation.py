@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.analysis.intervals import half_width
-from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats
+from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, slope, spread
 
 LARGEST, PER_OCTAVE, N_OCTAVES = 4.0, 4, 12
 """Largest radius [standard deviations], radii per factor of two, and factors of two from it to the least."""
@@ -55,21 +55,15 @@ def correlation_sums(embedding: Embedding, mixes: bool) -> Sums:
     without pairs close in time (Theiler, Phys. Rev. A 34, 2427, 1986). The range of the fit is the longest in which the
     slopes of both halves, and those for the embedding and two delays more, agree within `FLAT`. It lies between the
     radius below which pairs are too few and the one beyond which the edges of the set bend the curve. The interval is
-    that of Student from slopes of `N_BLOCKS` stretches, widened by these differences.
-
-    Parameters
-    ----------
-    embedding
-        Delay vectors of the series.
-    mixes
-        Whether neighbours part, so that the distances of passes are random.
+    that of Student from slopes of `N_BLOCKS` stretches, widened by these differences. In a motion that mixes neighbours
+    part, so that the distances of passes are random.
     """
     dimensions = tuple(range(embedding.dimension, embedding.dimension + 3))
     counts, near, n_pairs = _counts(embedding, dimensions)
     radius = 2.0 ** (-np.arange(N_OCTAVES * PER_OCTAVE + 1)[::-1] / PER_OCTAVE) * LARGEST
-    share = counts.sum(axis=1) / max(n_pairs, 1)
-    plain = Sums(dimensions, radius, share)
     pairs = counts.sum(axis=1)
+    share = pairs / max(n_pairs, 1)
+    plain = Sums(dimensions, radius, share)
     if mixes:
         enough = (pairs >= FEWEST_PAIRS) & (share <= MOST_OF_MIXING)
     else:
@@ -83,11 +77,10 @@ def correlation_sums(embedding: Embedding, mixes: bool) -> Sums:
         logs, by_block = np.log(share), np.log(counts[1])
     chosen = _plateau(x, logs, places)
     if chosen is None:
-        slopes = [_slope(x, one, places) for one in logs]
-        told = ", ".join(f"{slope:.2f}" for slope in slopes)
+        told = ", ".join(f"{slope(x[places], one[places]):.2f}" for one in logs)
         return replace(plain, reason=f"no plateau: slopes {told} for {dimensions[0]} to {dimensions[-1]} delays")
     slopes, bend = _slopes(x, logs, chosen)
-    blocks = [_slope(x, one, chosen) for one in by_block if np.isfinite(one[chosen]).all()]
+    blocks = [slope(x[chosen], one[chosen]) for one in by_block if np.isfinite(one[chosen]).all()]
     if len(blocks) < N_BLOCKS:
         return replace(plain, reason="a stretch of the series has no close pairs")
     value = float(np.mean(slopes))
@@ -107,7 +100,7 @@ def _counts(embedding: Embedding, dimensions: tuple[int, ...]) -> tuple[Counts, 
     if len(starts) < 100:
         return counts, near, 0
     starts = starts[:: max(1, -(-len(starts) // N_POINTS))]
-    references = starts[np.unique(np.linspace(0, len(starts) - 1, N_REFERENCES).round().astype(int))]
+    references = spread(starts, N_REFERENCES)
     scale = float(embedding.series.values.std()) * LARGEST
     points = widest.vectors(starts) / scale
     n_pairs = 0
@@ -133,16 +126,12 @@ def _below(apart: Floats, n_radii: int) -> Counts:
     return np.asarray(np.cumsum(np.bincount(bins, minlength=n_radii + 1)[:n_radii]))
 
 
-def _slope(x: Floats, y: Floats, places: np.ndarray) -> float:
-    return float(np.polyfit(x[places], y[places], 1)[0])
-
-
 def _slopes(x: Floats, logs: Floats, places: np.ndarray) -> tuple[list[float], float]:
     """Return the slope for each embedding, and the largest difference of slopes with it and along the radii."""
     half = len(places) // 2
-    slopes = [_slope(x, one, places) for one in logs]
-    ends = [(_slope(x, one, places[: half + 1]), _slope(x, one, places[half:])) for one in logs]
-    return slopes, max(float(np.ptp(slopes)), *(abs(a - b) for a, b in ends))
+    parts = places, places[: half + 1], places[half:]
+    slopes, early, late = ([slope(x[part], one[part]) for one in logs] for part in parts)
+    return slopes, max(float(np.ptp(slopes)), *(abs(a - b) for a, b in zip(early, late, strict=True)))
 
 
 def _plateau(x: Floats, logs: Floats, places: np.ndarray) -> np.ndarray | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.analysis.intervals import half_width
-from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, Ints
+from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, Ints, slope
 
 N_REFERENCES = 1600
 """Vectors whose neighbours are followed."""
@@ -54,7 +54,7 @@ class Divergence:
 
     time: Floats  # [s]
     curve: Floats  # mean log distance, of random pairs 0
-    at_phase: float  # the same of passes at the same phase, whatever their distance
+
     value: float = np.nan  # exponent [1/s], nan if not decided
     low: float = np.nan
     high: float = np.nan
@@ -79,16 +79,8 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
     The range of the fit is the longest one that is straight (slopes of its halves differ by less than `STRAIGHT`) after
     the first embedding window and before the distances come within `SATURATED` of those of passes at the same phase.
     The interval is that of Student from `N_BLOCKS` stretches of the series, widened by the difference of the halves and
-    by `FINITE`.
-
-    Parameters
-    ----------
-    embedding
-        Delay vectors of the series.
-    period
-        Mean period [samples].
-    is_closed
-        Whether the maxima repeat but for noise. Then neighbours may be as far apart as other passes.
+    by `FINITE`. The period [samples] is the mean one. In a closed orbit, whose maxima repeat but for noise, neighbours
+    may be as far apart as other passes.
     """
     horizon = min(PERIODS * period, len(embedding.series.values) // 6)
     side = max(1, embedding.delay // 3)
@@ -97,21 +89,19 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
     first, second = references[there], nearest[there, 0]
     n_steps = horizon - period
     if len(first) < 20 * N_BLOCKS or n_steps < 2.0 * period:
-        return Divergence(np.empty(0), np.empty(0), np.nan, reason="too few vectors that can be followed")
+        return Divergence(np.empty(0), np.empty(0), reason="too few vectors that can be followed")
     stride = max(1, period // 32)
     lags = np.arange(0, horizon + 1, stride)
     size, at_phase = _sizes(embedding, side, period)
     logs = np.stack([_log(_across(embedding, first + lag, second + lag, side), size) for lag in lags])
     blocks = np.stack([part.mean(axis=1) for part in np.array_split(logs, N_BLOCKS, axis=1)])
     width = period // stride
-    kernel = np.full(width, 1.0 / width)
-    smooth = np.stack([np.convolve(block, kernel, "valid") for block in blocks])
+    smooth = np.stack([np.convolve(block, np.full(width, 1.0 / width), "valid") for block in blocks])
     time: Floats = (lags[: smooth.shape[1]] + 0.5 * stride * (width - 1)).astype(np.float64) * embedding.series.step
-    seconds = period * embedding.series.step
     curve: Floats = np.asarray(smooth.mean(axis=0), np.float64)
-    plain = Divergence(time, curve, at_phase)
+    plain = Divergence(time, curve)
     start = min(int(np.ceil(max(embedding.span - 0.5 * period, 0) / stride)), len(time) // 4)
-    chosen = _range(time, curve, start, seconds, min(at_phase, 0.0) - SATURATED)
+    chosen = _range(time, curve, start, period * embedding.series.step, min(at_phase, 0.0) - SATURATED)
     if chosen is not None:
         return _fitted(plain, smooth, *chosen)
     growth = float(curve[-1] - curve[start])
@@ -152,8 +142,12 @@ def _sizes(embedding: Embedding, side: int, period: int) -> tuple[float, float]:
     return size, float(_log(_across(embedding, first, nearest, side), size).mean())
 
 
-def _slope(time: Floats, curve: Floats, start: int, end: int) -> float:
-    return float(np.polyfit(time[start : end + 1], curve[start : end + 1], 1)[0])
+def _slopes(time: Floats, curve: Floats, start: int, end: int) -> tuple[float, float]:
+    """Return the slope of a range, and the difference between those of its halves."""
+    middle = (start + end) // 2
+    parts = slice(start, end + 1), slice(start, middle + 1), slice(middle, end + 1)
+    whole, early, late = (slope(time[part], curve[part]) for part in parts)
+    return whole, abs(early - late)
 
 
 def _range(time: Floats, curve: Floats, start: int, period: float, end: float) -> tuple[int, int] | None:
@@ -168,9 +162,8 @@ def _range(time: Floats, curve: Floats, start: int, period: float, end: float) -
                 break
             if curve[b] - curve[a] < LEAST_GROWTH or time[b] - time[a] < LEAST_PERIODS * period:
                 break
-            middle = (a + b) // 2
-            early, late, whole = (_slope(time, curve, *ends) for ends in ((a, middle), (middle, b), (a, b)))
-            if abs(early - late) <= STRAIGHT * whole:
+            whole, bend = _slopes(time, curve, a, b)
+            if bend <= STRAIGHT * whole:
                 best = (a, b)
                 break
     return best
@@ -178,12 +171,9 @@ def _range(time: Floats, curve: Floats, start: int, period: float, end: float) -
 
 def _fitted(plain: Divergence, blocks: Floats, start: int, end: int) -> Divergence:
     """Return a curve with the slope of a range, and its interval."""
-    time, curve = plain.time, plain.curve
-    slopes = [_slope(time, block, start, end) for block in blocks]
-    middle = (start + end) // 2
-    bend = abs(_slope(time, curve, start, middle) - _slope(time, curve, middle, end))
-    value = _slope(time, curve, start, end)
-    half = half_width(slopes) + bend + FINITE * abs(value)
-    offset = float(curve[start : end + 1].mean() - value * time[start : end + 1].mean())
+    time, curve, inside = plain.time, plain.curve, slice(start, end + 1)
+    value, bend = _slopes(time, curve, start, end)
+    half = half_width([slope(time[inside], block[inside]) for block in blocks]) + bend + FINITE * abs(value)
+    offset = float(curve[inside].mean() - value * time[inside].mean())
     ends = (float(time[start]), float(time[end]))
     return replace(plain, value=value, low=value - half, high=value + half, fit=ends, offset=offset)

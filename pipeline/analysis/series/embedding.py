@@ -76,20 +76,15 @@ class Embedding:
         return np.asarray(self.series.values[starts[:, None] + self.delay * np.arange(self.dimension)])
 
     def neighbours(self, n_references: int, ahead: int, n_nearest: int = 1) -> tuple[Ints, Ints, Floats]:
-        """Return vectors, evenly spread over the series, with their nearest neighbours.
+        """Return vectors, evenly spread over the series, with their nearest neighbours and the Euclidean distances.
 
-        Both can be followed for `ahead` more samples in their pieces.
-
-        Returns
-        -------
-        references, nearest, distance
-            First samples, shape (vector,) and (vector, n_nearest), and Euclidean distances. Empty if there are too
-            few vectors.
+        Vectors are given by their first samples, shapes (vector,) and (vector, n_nearest), and can be followed for
+        `ahead` more samples in their pieces. Empty if there are too few.
         """
         starts = self.series.starts(self.span + ahead)
         if len(starts) < 2 * self.theiler + 4 * n_nearest + 2:
             return np.empty(0, np.int64), np.empty((0, n_nearest), np.int64), np.empty((0, n_nearest))
-        references = starts[np.unique(np.linspace(0, len(starts) - 1, n_references).round().astype(int))]
+        references = spread(starts, n_references)
         points = self.vectors(starts)
         size = (points**2).sum(axis=1)
         nearest, distance = [], []
@@ -102,6 +97,16 @@ class Embedding:
             # the expanded square is not exact for close points
             distance.append(np.linalg.norm(points[chosen] - own[:, None], axis=-1))
         return references, np.concatenate(nearest), np.concatenate(distance)
+
+
+def spread(starts: Ints, n: int) -> Ints:
+    """Return at most `n` samples, evenly spread over some."""
+    return np.asarray(starts[np.unique(np.linspace(0, len(starts) - 1, n).round().astype(int))])
+
+
+def slope(x: Floats, y: Floats) -> float:
+    """Return the slope of the straight line through points."""
+    return float(np.polyfit(x, y, 1)[0])
 
 
 def mutual_information(series: Series, n_lags: int) -> Floats:

@@ -29,7 +29,6 @@ class Recurrence:
 
     matrix: npt.NDArray[np.bool_]
     time: Floats  # of the rows [s]
-    radius: float
     measures: dict[str, float]
     parts: dict[str, list[float]]
 
@@ -56,19 +55,11 @@ def recurrence(embedding: Embedding) -> Recurrence | None:
     radius = float(np.quantile(apart[np.triu_indices(len(starts), window + 1)], RATE))
     matrix = apart <= radius
     step = stride * embedding.series.step
-    parts = [_measures(part, window, step) for part in _along(matrix)]
-    return Recurrence(
-        matrix,
-        (starts - starts[0]) * embedding.series.step,
-        radius,
-        _measures(matrix, window, step),
-        {name: [part[name] for part in parts] for name in parts[0]},
-    )
-
-
-def _along(matrix: npt.NDArray[np.bool_]) -> list[npt.NDArray[np.bool_]]:
     ends = np.linspace(0, len(matrix), N_PARTS + 1).astype(int)
-    return [matrix[a:b, a:b] for a, b in pairwise(ends)]
+    parts = [_measures(matrix[a:b, a:b], window, step) for a, b in pairwise(ends)]
+    time = (starts - starts[0]) * embedding.series.step
+    by_name = {name: [part[name] for part in parts] for name in parts[0]}
+    return Recurrence(matrix, time, _measures(matrix, window, step), by_name)
 
 
 def _measures(matrix: npt.NDArray[np.bool_], window: int, step: float) -> dict[str, float]:
@@ -89,6 +80,6 @@ def _measures(matrix: npt.NDArray[np.bool_], window: int, step: float) -> dict[s
 
 def _lengths(lines: list[npt.NDArray[np.bool_]]) -> npt.NDArray[np.int64]:
     """Return the lengths of the runs of True in some lines."""
-    joined = np.concatenate([np.append(line, False) for line in lines]) if lines else np.zeros(1, bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], joined, [False]])))
+    joined = np.concatenate([[False], *(np.append(line, False) for line in lines)])
+    edges = np.flatnonzero(np.diff(joined))
     return np.asarray(edges[1::2] - edges[::2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import signal
@@ -55,29 +55,22 @@ class Returns:
 def returns_of(series: Series, delay: int) -> Returns:
     """Return the maxima of a series, and its mean period.
 
-    The series is smoothed by parabolas over a delay, and a maximum is refined by a parabola through three samples.
-    The interval is that of Student from the mean times in `N_BLOCKS` stretches.
-
-    Parameters
-    ----------
-    series
-        All samples.
-    delay
-        Delay of the embedding [samples], about a quarter of a period.
+    The series is smoothed by parabolas over a delay [samples], about a quarter of a period, and a maximum is refined by
+    a parabola through three samples. The interval is that of Student from the mean times in `N_BLOCKS` stretches.
     """
     time, height, piece = _maxima(series, delay)
     plain = Returns(time, height, piece)
     firsts = plain.pairs()
     if len(firsts) < FEWEST:
-        return Returns(time, height, piece, reason=f"{len(firsts)} returns, fewer than {FEWEST}")
+        return replace(plain, reason=f"{len(firsts)} returns, fewer than {FEWEST}")
     times = time[firsts + 1] - time[firsts]
     mean, scatter = float(times.mean()), float(times.std(ddof=1))
     # a cycle with several maxima has as many times between them: whole cycles are compared
-    cycle = _in_cycle(plain, series)
-    of_cycles = plain.pairs(max(cycle, 1))
-    spans = (time[of_cycles + max(cycle, 1)] - time[of_cycles]) / max(cycle, 1)
-    means = [part.mean() for part in np.array_split(spans, N_BLOCKS)]
-    half = half_width(means)
+    cycle = _in_cycle(plain, float(series.values.std()))
+    apart = max(cycle, 1)
+    of_cycles = plain.pairs(apart)
+    spans = (time[of_cycles + apart] - time[of_cycles]) / apart
+    half = half_width([part.mean() for part in np.array_split(spans, N_BLOCKS)])
     irregular = cycle == 0 and scatter > IRREGULAR * mean
     reason = f"times between maxima scatter by {scatter / mean:.0%}" if irregular else ""
     value = float(spans.mean()) if cycle else mean
@@ -105,9 +98,8 @@ def _maxima(series: Series, delay: int) -> tuple[Floats, Floats, np.ndarray]:
     return place * series.step, height, piece
 
 
-def _in_cycle(returns: Returns, series: Series) -> int:
+def _in_cycle(returns: Returns, size: float) -> int:
     """Return the number of maxima after which heights repeat but for noise without memory; 0 if they do not."""
-    size = float(series.values.std())
     scatter = np.full(MOST_IN_CYCLE + 1, np.inf)
     for k in range(1, min(MOST_IN_CYCLE, len(returns.height) // 4) + 1):
         firsts = returns.pairs(k)
@@ -122,4 +114,4 @@ def _in_cycle(returns: Returns, series: Series) -> int:
     rest = returns.height.copy()
     for phase in range(k):
         rest[phase::k] -= rest[phase::k].mean()
-    return k if repeats_by_chance(rest, np.random.default_rng(0)) else 0
+    return k if repeats_by_chance(rest) else 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import fft
 
 from pipeline.analysis.series.embedding import Embedding, Floats, Series
@@ -43,50 +42,42 @@ def closed_stretch(values: Floats) -> Floats:
     Up to a tenth is cut off on each side.
     """
     values = values[:MOST_SAMPLES]
-    tenth = max(1, len(values) // 10)
     slope = np.gradient(values)
-    scale, steep = values.std(), slope.std()
-    start, end = np.arange(tenth), len(values) - 1 - np.arange(tenth)
-    misfit = ((values[start][:, None] - values[end]) / scale) ** 2
-    misfit += ((slope[start][:, None] - slope[end]) / max(float(steep), 1e-300)) ** 2
-    a, b = np.unravel_index(int(misfit.argmin()), misfit.shape)
-    begin, stop = int(start[a]), int(end[b])
+    start = np.arange(max(1, len(values) // 10))
+    end = len(values) - 1 - start
+    misfit = ((values[start][:, None] - values[end]) / values.std()) ** 2
+    misfit += ((slope[start][:, None] - slope[end]) / max(float(slope.std()), 1e-300)) ** 2
+    begin, cut = map(int, np.unravel_index(int(misfit.argmin()), misfit.shape))
+    stop = len(values) - 1 - cut
     # a transform of a length with large prime factors is slow
     return values[begin : begin + int(fft.prev_fast_len(stop - begin, real=True))]
 
 
-def prediction_error(series: Series, delay: int, dimension: int, theiler: int, ahead: int) -> float:
+def prediction_error(values: Floats, delay: int, dimension: int, theiler: int, ahead: int) -> float:
     """Return the error of predicting values from the futures of near vectors, as a share of the standard deviation.
 
     The prediction is the mean over the nearest vectors `ahead` samples after their last coordinate.
     """
-    embedding = Embedding(series, delay, dimension, theiler)
-    n_nearest = dimension + 2
-    first, nearest, _ = embedding.neighbours(400, ahead, n_nearest)
+    embedding = Embedding(Series.of([values], 1.0), delay, dimension, theiler)
+    first, nearest, _ = embedding.neighbours(400, ahead, dimension + 2)
     if not len(first):
         return np.nan
     later = embedding.span + ahead
-    predicted = series.values[nearest + later].mean(axis=1)
-    return float(np.sqrt(np.mean((predicted - series.values[first + later]) ** 2)) / series.values.std())
+    predicted = values[nearest + later].mean(axis=1)
+    return float(np.sqrt(np.mean((predicted - values[first + later]) ** 2)) / values.std())
 
 
 def against_noise(
     values: Floats, delay: int, dimension: int, theiler: int, generator: np.random.Generator
-) -> tuple[float, npt.NDArray[np.float64]]:
+) -> tuple[float, Floats]:
     """Return the prediction error of a series, and those of its surrogates."""
-    stretch = closed_stretch(values)
-
-    def error(one: Floats) -> float:
-        return prediction_error(Series.of([one], 1.0), delay, dimension, theiler, 2 * delay)
-
-    return error(stretch), np.array([error(surrogate(stretch, generator)) for _ in range(N_SURROGATES)])
+    stretch, settings = closed_stretch(values), (delay, dimension, theiler, 2 * delay)
+    others = [prediction_error(surrogate(stretch, generator), *settings) for _ in range(N_SURROGATES)]
+    return prediction_error(stretch, *settings), np.array(others)
 
 
-def repeats_by_chance(values: Floats, generator: np.random.Generator) -> bool:
+def repeats_by_chance(values: Floats) -> bool:
     """Return whether a sequence is predicted no better than its shuffled copies: it has no memory that is seen."""
-
-    def error(one: Floats) -> float:
-        return prediction_error(Series.of([one], 1.0), 1, 2, 0, 1)
-
-    own = error(values)
-    return bool(own >= min(error(generator.permutation(values)) for _ in range(99)))
+    generator, settings = np.random.default_rng(0), (1, 2, 0, 1)
+    least = min(prediction_error(generator.permutation(values), *settings) for _ in range(99))
+    return prediction_error(values, *settings) >= least

@@ -51,14 +51,7 @@ class Averaged:
 def averaged(pieces: Sequence[Array], rate_hz: float, *, window: str, nperseg: int, scaling: str) -> Averaged:
     """Average the periodograms of segments that overlap by half, as `scipy.signal.welch`, over pieces of a series.
 
-    Parameters
-    ----------
-    pieces
-        Evenly sampled values; each has at least `nperseg`. Segments of all pieces have equal weight.
-    rate_hz
-        Samples per second.
-    window, nperseg, scaling
-        As in `scipy.signal.welch`.
+    Each piece has at least `nperseg` even samples. Segments of all pieces have equal weight.
     """
     counts = [1 + (len(piece) - nperseg) // (nperseg - nperseg // 2) for piece in pieces]
     settings = {"fs": rate_hz, "window": window, "nperseg": nperseg, "scaling": scaling}
@@ -88,16 +81,7 @@ def frequencies_of(values: Array, rate_hz: float, drive_hz: float | None = None)
 
     The first is the drive's; without a drive, that of the strongest line. The second is that of the strongest line
     that is no multiple of the first. It is known up to its sign and multiples of the first. Both maximise the
-    transform of the whole series with a Blackman-Harris window.
-
-    Parameters
-    ----------
-    values
-        Evenly sampled, over many periods of both.
-    rate_hz
-        Samples per second.
-    drive_hz
-        Frequency of the drive [Hz]; None without one.
+    transform of the whole series with a Blackman-Harris window. Samples are even, over many periods of both.
     """
     n = len(values)
     weighted = (values - values.mean()) * signal.get_window("blackmanharris", n)
@@ -125,14 +109,12 @@ def _near(n_bins: int, lines: Array) -> Array:
 def _peak(weighted: Array, rate_hz: float, power: Array) -> float:
     """Return the frequency near the largest bin at which the transform is largest [Hz]."""
     turns = np.arange(len(weighted)) / len(weighted)
-    middle = int(power.argmax())
+    ends = (power.argmax() - 1.0, power.argmax() + 1.0)
 
     def size(place: float) -> float:
         return -float(np.abs(weighted @ np.exp(-2j * np.pi * place * turns)))
 
-    found = optimize.minimize_scalar(
-        size, bounds=(middle - 1.0, middle + 1.0), method="bounded", options={"xatol": 1e-7}
-    )
+    found = optimize.minimize_scalar(size, bounds=ends, method="bounded", options={"xatol": 1e-7})
     return float(found.x) * rate_hz / len(weighted)
 
 
@@ -179,40 +161,38 @@ def spectrum_of(
     ValueError
         If there is no such channel, samples are not even, or no piece is as long as a segment.
     """
-    names = [str(name) for name, v in ds.data_vars.items() if v.ndim == 1 and v.dims == ds["time"].dims]
-    channel = channel or names[0]
-    if channel not in names:
-        raise ValueError(f"channel {channel!r} is not there; it has {', '.join(names)}.")
-    pieces, rate = pieces_of(ds, channel)
-    nperseg = nperseg or max(len(piece) for piece in pieces) // SEGMENTS
+    channel, pieces, rate = pieces_of(ds, channel)
+    longest = max(len(piece) for piece in pieces)
+    nperseg = nperseg or longest // SEGMENTS
     long = [piece for piece in pieces if len(piece) >= nperseg >= 4]
     if not long:
         raise ValueError(
-            f"nperseg = {nperseg}: no piece of {channel} is as long; the longest without a gap has "
-            f"{max(len(piece) for piece in pieces)} samples. A segment has at least 4."
+            f"nperseg = {nperseg}: no piece of {channel} is as long; the longest without a gap has {longest} samples. "
+            "A segment has at least 4."
         )
     found = averaged(long, rate, window=window, nperseg=nperseg, scaling=scaling)
     drive_hz = drive_hz or ds.attrs.get("frequency_hz")
     unit = shown_unit(ds[channel].attrs, "1")
+    both, frequency = ("spectrum", "bin"), found.frequency_hz[None]
     about = {"units": power_unit(unit, scaling), "long_name": f"{scaling} of {channel}"}
-    numbers: dict[str, Any] = {
-        name: ("spectrum", [getattr(found, name)]) for name in ("n_averages", "resolution_hz", "bandwidth_hz")
-    }
-    numbers |= {"variance": ("spectrum", [found.variance], {"units": power_unit(unit, "spectrum")})}
-    numbers |= {"kept": ("spectrum", [found.power_below(len(found.power), scaling) / found.variance])}
-    result = xr.Dataset({"power": (("spectrum", "bin"), found.power[None], about), **numbers})
-    own: dict[str, Any] = {
-        "frequency_hz": (("spectrum", "bin"), found.frequency_hz[None], {"units": "Hz", "long_name": "frequency"})
-    }
+    variables: dict[str, Any] = {"power": (both, found.power[None], about)}
+    for name in ("n_averages", "resolution_hz", "bandwidth_hz"):
+        variables[name] = ("spectrum", [getattr(found, name)])
+    variables["variance"] = ("spectrum", [found.variance], {"units": power_unit(unit, "spectrum")})
+    variables["kept"] = ("spectrum", [found.power_below(len(found.power), scaling) / found.variance])
+    coords: dict[str, Any] = {"frequency_hz": (both, frequency, {"units": "Hz", "long_name": "frequency"})}
     if drive_hz:
-        order = found.frequency_hz[None] / float(drive_hz)
-        own["order"] = (("spectrum", "bin"), order, {"units": "1", "long_name": "order"})
+        coords["order"] = (both, frequency / float(drive_hz), {"units": "1", "long_name": "order"})
     attrs = {"title": "spectrum", "channel": channel, "unit": unit, "scaling": scaling, "window": window}
-    return result.assign_coords(own).assign_attrs({**told_by(ds.attrs), **attrs})
+    return xr.Dataset(variables, coords, {**told_by(ds.attrs), **attrs})
 
 
-def pieces_of(ds: xr.Dataset, channel: str) -> tuple[list[Array], float]:
-    """Return the stretches of a series without gaps, and its samples per second."""
+def pieces_of(ds: xr.Dataset, channel: str) -> tuple[str, list[Array], float]:
+    """Return the channel (by default the first), its stretches without gaps, and its samples per second."""
+    names = [str(name) for name, v in ds.data_vars.items() if v.ndim == 1 and v.dims == ds["time"].dims]
+    channel = channel or names[0]
+    if channel not in names:
+        raise ValueError(f"channel {channel!r} is not there; it has {', '.join(names)}.")
     time, values = (np.asarray(ds[name].values, np.float64) for name in ("time", channel))
     piece = ds["piece"].values if "piece" in ds else np.zeros(len(time), int)
     good = np.isfinite(values)
@@ -229,4 +209,5 @@ def pieces_of(ds: xr.Dataset, channel: str) -> tuple[list[Array], float]:
         )
     # the mean interval of the longest stretch is more exact than the median of rounded times
     longest = max(stretches, key=len)
-    return [values[part] for part in stretches], (len(longest) - 1) / float(time[longest[-1]] - time[longest[0]])
+    rate = (len(longest) - 1) / float(time[longest[-1]] - time[longest[0]])
+    return channel, [values[part] for part in stretches], rate

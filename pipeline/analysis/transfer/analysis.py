@@ -48,6 +48,7 @@ from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, inputs_at, point_dims
 from pipeline.analysis.ragged import N_POINTS, ROW_SIZE, SAMPLE, SET, rows_at
 from pipeline.analysis.run import OpenRun
+from pipeline.analysis.selection import listed
 from pipeline.analysis.tabular import Row, Words, aligned, number, points_of, with_interval
 from pipeline.analysis.transfer.ulam import (
     OUTSIDE,
@@ -86,8 +87,7 @@ MANY_UNKNOWN = 0.01
 def needs_pairs(run: OpenRun, options: TransferOptions) -> None:
     """Raise ValueError unless the run is a sweep with pairs of sections, and the options name its states."""
     names = run.model.state_names
-    asked = [s.strip() for s in options.states.split(",") if s.strip()]
-    for name in (*asked, *options.low, *options.high):
+    for name in (*listed(options.states), *options.low, *options.high):
         if name not in names:
             raise ValueError(unknown_name("state", name, names))
     if run.spec.continuation is not None:
@@ -113,8 +113,8 @@ class Pairs:
     unit: np.ndarray  # (pair,): number of the resampled unit
 
 
-def pairs_of(run: OpenRun, cells: PointCells) -> Pairs:
-    """Return the pairs of successive sections of the cells of a parameter point.
+def pairs_of(run: OpenRun, cells: PointCells, columns: Sequence[int]) -> Pairs:
+    """Return the pairs of successive sections of the cells of a parameter point, of some states.
 
     A cell that diverged has no sections, and counts only if it did so in its first step.
     """
@@ -127,7 +127,7 @@ def pairs_of(run: OpenRun, cells: PointCells) -> Pairs:
     unit = np.arange(n_cells)[:, None] * parts + np.arange(n) * parts // n
     known = np.isfinite(before).all(axis=2)
     known &= np.isfinite(after).all(axis=2) | (cells.n_periods == 1)[:, None]
-    return Pairs(before[known], after[known], unit[known])
+    return Pairs(before[known][:, columns], after[known][:, columns], unit[known])
 
 
 def grid_of(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: TransferOptions) -> Grid:
@@ -197,31 +197,25 @@ def _core(part: np.ndarray, density: np.ndarray, share: float) -> np.ndarray:
 def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
     """Return committors, kept measure, rate of escape and mean passage times of the sets of a chain."""
     n = len(sets.cores)
-    found: dict[str, np.ndarray] = {
-        "kept": np.full(n, np.nan),
-        "escape_rate": np.full(n, np.nan),
-        "passage": np.full((n, MOST_SETS), np.nan),
-    }
-    found["committor"] = committors(p, [*sets.cores, sets.others])[:, :n]
-    for k in range(n):
+    kept, escape_rate = np.full((2, n), np.nan)
+    passage = np.full((n, MOST_SETS), np.nan)
+    for k, core in enumerate(sets.cores):
         own = np.flatnonzero(sets.of_box == k)
-        if not len(own):  # of a coarser grid
-            continue
-        inner = p[own][:, own]
-        rate = leading_eigenvalue(inner)
-        found["escape_rate"][k] = max(-np.log(rate), 0.0) if rate > 0.0 else np.inf
-        weight = sets.density[own]
-        if weight.sum() > 0.0:
-            found["kept"][k] = float(weight @ np.asarray(inner.sum(axis=1))) / float(weight.sum())
-    for k in range(n):
-        if not len(sets.cores[k]):
-            continue
-        steps = passage_times(p, sets.cores[k])
-        for j in range(n):
-            weight = sets.density[sets.cores[j]]
-            if j != k and weight.sum() > 0.0:
-                found["passage"][j, k] = float(weight @ steps[sets.cores[j]]) / float(weight.sum())
-    return found
+        if len(own):  # not always on a coarser grid
+            inner = p[own][:, own]
+            rate = leading_eigenvalue(inner)
+            escape_rate[k] = max(-np.log(rate), 0.0) if rate > 0.0 else np.inf
+            kept[k] = _mean(inner.sum(axis=1), sets.density[own])
+        steps = passage_times(p, core) if len(core) else np.full(len(sets.density), np.nan)
+        for j, other in enumerate(sets.cores):
+            if j != k:
+                passage[j, k] = _mean(steps[other], sets.density[other])
+    committor = committors(p, [*sets.cores, sets.others])[:, :n]
+    return {"kept": kept, "escape_rate": escape_rate, "passage": passage, "committor": committor}
+
+
+def _mean(values: np.ndarray, weight: np.ndarray) -> float:
+    return float(weight @ values) / float(weight.sum()) if weight.sum() > 0.0 else np.nan
 
 
 def coarsened(chain: Chain, grid: Grid, sets: Sets) -> dict[str, np.ndarray]:
@@ -280,16 +274,11 @@ def intervals_of(
 def transfer(run: OpenRun, options: TransferOptions) -> xr.Dataset:
     """Estimate the transfer operator at each parameter point, see the module's schema."""
     cube, model = run.cube(), model_of(run.cube())
-    asked = [s.strip() for s in options.states.split(",") if s.strip()] or list(model.state_names)
-    columns = [model.state_names.index(name) for name in asked]
+    names = listed(options.states) or list(model.state_names)
+    columns = [model.state_names.index(name) for name in names]
     angles = [model.is_angle[i] for i in columns]
-    dims = point_dims(cube)
-    parts = []
-    for cells in cells_at_points(cube):
-        pairs = pairs_of(run, cells)
-        pairs = Pairs(pairs.before[:, columns], pairs.after[:, columns], pairs.unit)
-        parts.append(_point(pairs, asked, angles, options))
-    return _dataset(cube, dims, asked, parts, options)
+    parts = [_point(pairs_of(run, cells, columns), names, angles, options) for cells in cells_at_points(cube)]
+    return _dataset(cube, names, parts, options)
 
 
 def _point(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: TransferOptions) -> dict[str, Any]:
@@ -361,12 +350,9 @@ _UNITS = {"escape_rate": "1/step", "passage": "steps"}
 
 
 def _dataset(
-    cube: xr.Dataset,
-    dims: Sequence[str],
-    names: Sequence[str],
-    parts: Sequence[dict[str, Any]],
-    options: TransferOptions,
+    cube: xr.Dataset, names: Sequence[str], parts: Sequence[dict[str, Any]], options: TransferOptions
 ) -> xr.Dataset:
+    model, dims = model_of(cube), point_dims(cube)
     shape = tuple(cube.sizes[d] for d in dims)
     own_dims = {"eigenvalue": ("mode",), "eigenvalue_imaginary": ("mode",), "width": ("axis",)}
     on_rows = _ON_SETS | _ON_BOXES
@@ -379,26 +365,22 @@ def _dataset(
         else:
             table = np.stack(rows).reshape((*shape, *rows[0].shape))
             variables[name] = ((*dims, *own_dims.get(name, ())), table, units)
-    model = model_of(cube)
-    coords = coordinates_of(cube, dims) | {"axis": list(names)}
-    ds = xr.Dataset(variables, coords=coords)
-    ds = ds.assign_coords(axis_units=("axis", [model.state(name).unit for name in names]))
+    own = {"axis": list(names), "axis_units": ("axis", [model.state(name).unit for name in names])}
     kept = ("model", "parameters", "noise", "title", "source")
     about = {name: cube.attrs[name] for name in kept if name in cube.attrs}
-    return ds.assign_attrs({**about, "confidence": options.confidence, "core": options.core})
+    about |= {"confidence": options.confidence, "core": options.core}
+    return xr.Dataset(variables, {**coordinates_of(cube, dims), **own}, about)
 
 
 def transfer_table(ds: xr.Dataset) -> Table:
     """Return a row for each set of each parameter point: measure, share, escape, and passages to other sets."""
     dims = [str(d) for d in ds[ROW_SIZE].dims]
     rows, lines = [], []
-    for at, where in points_of(ds, dims):
-        one = ds.isel(at)
-        index = tuple(at[d] for d in dims)
-        here = list(_rows(ds, rows_at(ds)[index], where))
+    for (at, where), places in zip(points_of(ds, dims), rows_at(ds).values(), strict=True):
+        here = list(_rows(ds, places, where))
         rows += here
         head = ", ".join(f"{d} {v:g}" for d, v in where.items())
-        lines.append(f"{head}{': ' if head else ''}{_summary(one, len(here))}")
+        lines.append(f"{head}{': ' if head else ''}{_summary(ds.isel(at), len(here))}")
         lines += aligned([_words(row) for row in here])
     return Table(rows, lines)
 
