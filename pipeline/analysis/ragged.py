@@ -178,7 +178,8 @@ def dense(ds: xr.Dataset, names: Collection[str] = (), *, points: bool = False) 
             rows = variable.transpose(SET, ...)
             found[str(name)] = (rows.dims[1:], rows.values, variable.attrs)
     if points and "attractor_points" in ds:
-        found["attractor_points"] = (("point", "state"), _padded(ds), ds["attractor_points"].attrs)
+        own_points = padded(points_of_rows(ds), ds.sizes["state"])
+        found["attractor_points"] = (("point", "state"), own_points, ds["attractor_points"].attrs)
     result = ds.drop_dims([SET, SAMPLE, TRANSITION], errors="ignore").drop_vars(ROW_SIZE)
     for name, (own_dims, values, attrs) in found.items():
         table = np.full((*ds[ROW_SIZE].shape, len(ids), *values.shape[1:]), _fill(name, values.dtype), values.dtype)
@@ -193,9 +194,9 @@ def _fill(name: str, dtype: np.dtype[Any]) -> float:
     return 0 if dtype.kind in "iu" or name in ("share", "fraction") else np.nan
 
 
-def _padded(ds: xr.Dataset) -> np.ndarray:
-    rows = points_of_rows(ds)
-    table = np.full((len(rows), max(map(len, rows), default=0), ds.sizes["state"]), np.nan)
+def padded(rows: Sequence[np.ndarray], n_states: int) -> np.ndarray:
+    """Return lists of points, each (any, n_states), as one array (row, point, state); NaN beyond the end of a list."""
+    table = np.full((len(rows), max(map(len, rows), default=0), n_states), np.nan)
     for one, points in zip(table, rows, strict=True):
         one[: len(points)] = points
     return table

@@ -41,27 +41,27 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.text.grammar import Tree
-from pipeline.analysis.attractors.destinations import Destinations, destinations_at
+from pipeline.analysis.attractors.destinations import Destinations, Followed, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.analysis.resilience.expressions import density_at, mean_over_cells, read_expression
-from pipeline.analysis.resilience.local import Local, local_stability
+from pipeline.analysis.resilience.local import local_stability
 from pipeline.analysis.resilience.shocks import (
     Asked,
     Bases,
     Found,
-    Settings,
-    Shocked,
-    ShockSearch,
+    Norm,
+    Seeds,
     Trials,
     bases_of,
     search_together,
+    sizes,
 )
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
+from pipeline.analysis.selection import listed, select_points
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
@@ -91,9 +91,6 @@ from pipeline.layout.vocabulary import (
 from pipeline.products.product import Table
 from pipeline.products.resilience import ResilienceOptions
 from pipeline.specification.tables import FREQUENCY
-
-PRECISION = 1e-6
-"""Relative length to which the last ray of a search is divided."""
 
 MOST_SEEDS = 8
 """Cells of other basins that start a search of the distance in any direction, for each base state."""
@@ -137,8 +134,7 @@ def needs_sweep(run: OpenRun, options: ResilienceOptions) -> None:
     check_starts(cube)
     select_points(cube, options.at)
     _chosen(run, options)
-    _, starts = split_dims(cube["status"])
-    states = _by_name(run, start_states(cube, starts))
+    states = _by_name(run, start_states(cube, split_dims(cube["status"])[1]))
     for point in parameter_points(run.spec):
         density_at(options.density, {**point, "f": point[FREQUENCY]}, states)
     _asked_quantity(run, options)
@@ -151,18 +147,12 @@ def settle_resilience(run: OpenRun, options: ResilienceOptions) -> ResilienceOpt
 
 def _chosen(run: OpenRun, options: ResilienceOptions) -> list[str]:
     """Return the names of the shocked states: those given, or the rates of other states, or all states."""
-    model = run.model
-    given = [name.strip() for name in options.states.split(",") if name.strip()]
+    model, given = run.model, listed(options.states)
     unknown = [name for name in given if name not in model.state_names]
     if unknown:
         raise ValueError(f"states = {unknown[0]!r} is no state of {model.name}; use {', '.join(model.state_names)}.")
-    rates = [state.rate for state in model.states if state.rate]
-    wanted = given or rates or list(model.state_names)
+    wanted = given or [state.rate for state in model.states if state.rate] or model.state_names
     return [name for name in model.state_names if name in wanted]
-
-
-def _places(run: OpenRun, options: ResilienceOptions) -> list[int]:
-    return [run.model.state_names.index(name) for name in _chosen(run, options)]
 
 
 def _asked_quantity(run: OpenRun, options: ResilienceOptions) -> Tree | None:
@@ -180,22 +170,23 @@ def _by_name(run: OpenRun, states: np.ndarray) -> dict[str, np.ndarray]:
 
 def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
     """Measure the response of the attractors at each parameter point to shocks."""
-    whole = run.derive("attractors")
-    cube, attractors = select_points(run.cube(), options.at), select_points(whole, options.at)
+    attractors, cube = (select_points(ds, options.at) for ds in (run.derive("attractors"), run.cube()))
     dims, starts = split_dims(attractors["attractor_id"])
-    result = _Result(run, options, attractors)
     labels = outcomes(attractors).transpose(*dims, *starts).values
     states = start_states(cube, starts)
+    by_name = _by_name(run, states)
+    timed = np.sort(np.random.default_rng(options.seed).permutation(len(states))[: options.timed])
+    result = _Result(run, options, attractors)
     for points in slabs(cube, Dynamics.of(cube), BUDGET):
         for index, there in destinations_at(cube, attractors, points):
-            work, own = _Point(there, options, run), labels[index].ravel()
-            weights = density_at(options.density, work.values, _by_name(run, states))
+            assert there.point.parameters is not None
+            known, own = {**there.point.parameters, "f": there.point.frequency}, labels[index].ravel()
+            weights = density_at(options.density, known, by_name)
             result.count(index, own, weights)
-            timed = work.timed(len(states))
-            result.time(index, *work.times(states[timed]), weights[timed])
-            result.shocks(index, work.shocks(states, own))
-            result.local(index, work.local())
-            result.quantity(index, {**work.values, **_by_name(run, states)}, own, weights)
+            result.time(index, there.follow(states[timed], options.near), weights[timed])
+            result.shocks(index, there, states, own)
+            result.local(index, there)
+            result.quantity(index, {**known, **by_name}, own, weights)
     return result.dataset()
 
 
@@ -210,80 +201,16 @@ def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> np.ndarray:
     return np.column_stack(columns)
 
 
-class _Point:
-    """The attractors of one parameter point, with what is asked of them."""
-
-    def __init__(self, there: Destinations, options: ResilienceOptions, run: OpenRun) -> None:
-        self._there, self._options = there, options
-        self._which = np.array(_places(run, options))
-        self._scales = np.asarray(there.geometry.scales)
-        o = options
-        self._settings = Settings(o.largest, o.directions, o.norm, PRECISION, o.confirmations, o.seed)
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Values of the parameters by name, and the drive frequency ``f`` [Hz]."""
-        assert self._there.point.parameters is not None
-        return {**self._there.point.parameters, "f": self._there.point.frequency}
-
-    def timed(self, n: int) -> np.ndarray:
-        """Draw the numbers of the initial states, of `n`, whose arrival is timed."""
-        rng = np.random.default_rng(self._options.seed)
-        return np.sort(rng.permutation(n)[: self._options.timed])
-
-    def times(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate initial states anew; return the label and the arrival time of each."""
-        found = self._there.follow(states, self._options.near)
-        return found.label, found.entered
-
-    def local(self) -> dict[int, Local]:
-        """Measure the stability of each attractor against small disturbances."""
-        here, point = self._there.here, self._there.point
-        assert point.parameters is not None
-        return {
-            own: local_stability(here.isel(attractor=own), point.parameters, point.frequency, self._scales)
-            for own in np.flatnonzero(here["stability"].values == ATTRACTS).tolist()
-        }
-
-    def shocks(self, states: np.ndarray, labels: np.ndarray) -> dict[tuple[int, str], tuple[Found, Bases]]:
-        """Search the shocks of each attractor: of the chosen states, of all states, and of each state alone."""
-        asked: dict[str, Asked] = {}
-        every = np.arange(states.shape[1])
-        parameters, frequency = self._there.point.parameters, self._there.point.frequency
-        assert parameters is not None
-        for own in sorted(self._there.told):
-            bases = bases_of(self._there.here.isel(attractor=own), parameters, frequency, self._options.phases)
-            asked[f"{own} shock"] = self._search(own, bases, self._which)
-            at_section = bases.sections
-            seeds = self._seeds(own, at_section, states, labels)
-            asked[f"{own} any"] = self._search(own, at_section, every, seeds)
-            for i in every:
-                asked[f"{own} {i}"] = self._search(own, at_section, np.array([i]))
-        found = search_together(asked, Shocked(self._there), self._scales, "trajectories after shocks")
-        keys = {key: key.split() for key in found}
-        return {(int(n), what): (found[key], asked[key].bases) for key, (n, what) in keys.items()}
-
-    def _search(
-        self, number: int, bases: Bases, which: np.ndarray, seeds: tuple[Trials, np.ndarray] | None = None
-    ) -> Asked:
-        search = ShockSearch(number, len(bases.states), len(which), self._settings, seeds)
-        return Asked(search.run(), bases, which)
-
-    def _seeds(
-        self, number: int, bases: Bases, states: np.ndarray, labels: np.ndarray
-    ) -> tuple[Trials, np.ndarray] | None:
-        """Return the cells of other basins nearest to each base state, as shocks from it."""
-        away = np.flatnonzero((labels != number) & (labels != -1))
-        if not len(away):
-            return None
-        base, shock, label = [], [], []
-        for k, state in enumerate(bases.states):
-            jumps = self._there.geometry.difference(states[away], state)
-            nearest = np.argsort(self._settings.size(jumps), kind="stable")[:MOST_SEEDS]
-            base.append(np.full(len(nearest), k))
-            shock.append(jumps[nearest])
-            label.append(labels[away[nearest]])
-        return Trials(np.concatenate(base), np.concatenate(shock)), np.concatenate(label)
+def _nearest_seeds(there: Destinations, bases: Bases, states: np.ndarray, labels: np.ndarray, norm: Norm) -> Seeds:
+    """Return the cells nearest to each base state, as shocks from it, with their labels."""
+    base, shock, label = [], [], []
+    for k, state in enumerate(bases.states):
+        jumps = there.geometry.difference(states, state)
+        nearest = np.argsort(sizes(jumps, norm), kind="stable")[:MOST_SEEDS]
+        base.append(np.full(len(nearest), k))
+        shock.append(jumps[nearest])
+        label.append(labels[nearest])
+    return Trials(np.concatenate(base), np.concatenate(shock)), np.concatenate(label)
 
 
 _SEARCHED: dict[str, tuple[str, float, str]] = {
@@ -305,34 +232,36 @@ class _Result:
         number = attractors["attractor"].values.tolist()
         self._rows = {at: {number[row]: row for row in rows} for at, rows in rows_at(attractors).items()}
         self._attracts = attractors["stability"].values == ATTRACTS
-        self._n_states = attractors.sizes["state"]
-        self.arrays: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
+        self._scales = np.asarray(run.model.scales)
+        self._values: dict[str, np.ndarray] = {}
+        self._attrs: dict[str, dict[str, str]] = {}
+        vector = ("float64", np.nan, ("state",), "see state_units")
         for what, text in (("shock", "smallest critical shock"), ("distance", "shortest way out of the basin")):
             for name, (dtype, fill, meaning) in _SEARCHED.items():
-                self._new(f"{what}_{name}", dtype, fill, f"{text}: {meaning}")
-            self._new(what, "float64", np.nan, f"{text}: jump of each state", ("state",), "see state_units")
-            self._new(f"{what}_from", "float64", np.nan, f"{text}: state before it", ("state",), "see state_units")
-        for name, (dtype, fill, meaning) in _SEARCHED.items():
-            if name in ("low", "high", "to", "n_undecided"):
-                self._new(f"along_{name}", dtype, fill, f"boundary along a state: {meaning}", ("state",))
-        self._new("along", "float64", np.nan, "boundary along a state: jump", ("state",), "see state_units")
+                self._new(f"{what}_{name}", f"{text}: {meaning}", dtype, fill)
+            self._new(what, f"{text}: jump of each state", *vector)
+            self._new(f"{what}_from", f"{text}: state before it", *vector)
+        for name in ("low", "high", "to", "n_undecided"):
+            dtype, fill, meaning = _SEARCHED[name]
+            self._new(f"along_{name}", f"boundary along a state: {meaning}", dtype, fill, ("state",))
+        self._new("along", "boundary along a state: jump", *vector)
         for name, (text, units) in _NUMBERS.items():
             dtype, fill = ("int64", 0) if name == "n_timed" else ("float64", np.nan)
-            self._new(name, dtype, fill, text, units=units)
+            self._new(name, text, dtype, fill, (), units)
 
-    def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
-        values = np.full((self._attractors.sizes[SET], *(self._n_states for _ in own)), fill, dtype)
-        units = units.format(time_unit(self._run.model))
-        self.arrays[name] = ((SET, *own), values, {"units": units, "long_name": text})
+    def _new(self, name: str, text: str, dtype: str, fill: float, own: tuple[str, ...] = (), units: str = "1") -> None:
+        shape = (self._attractors.sizes[SET], *(len(self._scales) for _ in own))
+        self._values[name] = np.full(shape, fill, dtype)
+        self._attrs[name] = {"units": units.format(time_unit(self._run.model)), "long_name": text}
 
-    def _put(self, name: str, at: Any, value: Any) -> None:
-        self.arrays[name][1][at] = value
+    def _attracting(self, index: tuple[int, ...]) -> list[tuple[int, int]]:
+        """Return the ids and rows of the sets of a parameter point that attract."""
+        return [(own, row) for own, row in self._rows[index].items() if self._attracts[row]]
 
     def _share(self, name: str, at: int, count: float, n: float) -> None:
-        low, high = binomial_interval(count, n, confidence=self._options.confidence, method=self._options.interval)
-        self._put(name, at, count / n if n else np.nan)
-        self._put(f"{name}_low", at, low)
-        self._put(f"{name}_high", at, high)
+        ends = binomial_interval(count, n, confidence=self._options.confidence, method=self._options.interval)
+        for end, value in zip(("", "_low", "_high"), (count / n if n else np.nan, *ends), strict=True):
+            self._values[f"{name}{end}"][at] = value
 
     def count(self, index: tuple[int, ...], labels: np.ndarray, weights: np.ndarray) -> None:
         """Fill in the shares of the cells that end on each attractor of a parameter point, plain and weighed."""
@@ -340,91 +269,101 @@ class _Result:
         total, squares = weights[counted].sum(), (weights[counted] ** 2).sum()
         # of weighed cells the share has the variance of as many independent cells (Kish, Survey Sampling, 1965)
         effective = total**2 / squares if squares > 0.0 else 0.0
-        for own, row in self._rows[index].items():
-            if self._attracts[row]:
-                here = labels == own
-                self._share("basin_stability", row, int(here.sum()), int(counted.sum()))
-                share = min(weights[here].sum() / total, 1.0) if effective else 0.0
-                self._share("weighted_stability", row, share * effective, effective)
-                self._put("n_effective", row, effective)
+        for own, row in self._attracting(index):
+            here = labels == own
+            self._share("basin_stability", row, int(here.sum()), int(counted.sum()))
+            share = min(weights[here].sum() / total, 1.0) if effective else 0.0
+            self._share("weighted_stability", row, share * effective, effective)
+            self._values["n_effective"][row] = effective
 
-    def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray, weights: np.ndarray) -> None:
+    def time(self, index: tuple[int, ...], found: Followed, weights: np.ndarray) -> None:
         """Fill in the arrival times of initial states, by attractor."""
+        label, entered, put = found.label, found.entered, self._values
         counted, total = int((label != -1).sum()), weights[label != -1].sum()
         for i in np.unique(label[label >= 0]).tolist():
             chosen, at = (label == i) & np.isfinite(entered), self._rows[index][i]
             own, weight = entered[chosen], weights[chosen]
-            self._put("n_timed", at, len(own))
-            self._share("arrived", at, int((own <= self._options.within).sum()), counted)
+            in_time = own <= self._options.within
+            put["n_timed"][at] = len(own)
+            self._share("arrived", at, int(in_time.sum()), counted)
             if len(own):
-                self._put("mean_time", at, own.mean())
-                self._put("longest_time", at, own.max())
+                put["mean_time"][at], put["longest_time"][at] = own.mean(), own.max()
             if total > 0.0:
-                self._put("weighted_arrived", at, weight[own <= self._options.within].sum() / total)
+                put["weighted_arrived"][at] = weight[in_time].sum() / total
             if weight.any():
-                self._put("weighted_time", at, np.average(own, weights=weight))
+                put["weighted_time"][at] = np.average(own, weights=weight)
             if len(own) > 1:
-                self._put("mean_time_stderr", at, own.std(ddof=1) / np.sqrt(len(own)))
+                put["mean_time_stderr"][at] = own.std(ddof=1) / np.sqrt(len(own))
 
-    def local(self, index: tuple[int, ...], found: dict[int, Local]) -> None:
+    def local(self, index: tuple[int, ...], there: Destinations) -> None:
         """Fill in the stability of the attractors of a parameter point against small disturbances."""
-        for own, one in found.items():
-            for name, value in one._asdict().items():
-                self._put(name, self._rows[index][own], value)
+        point = there.point
+        assert point.parameters is not None
+        for own in np.flatnonzero(there.here["stability"].values == ATTRACTS).tolist():
+            one = there.here.isel(attractor=own)
+            found = local_stability(one, point.parameters, point.frequency, np.asarray(there.geometry.scales))
+            for name, value in found._asdict().items():
+                self._values[name][self._rows[index][own]] = value
 
     def quantity(self, index: tuple[int, ...], known: dict[str, Any], labels: np.ndarray, weights: np.ndarray) -> None:
         """Fill in the user's own quantity, from the other results of a parameter point."""
         tree = _asked_quantity(self._run, self._options)
         if tree is None:
             return
-        for own, row in self._rows[index].items():
-            if self._attracts[row]:
-                results = {name: values[row] for name, (dims, values, _) in self.arrays.items() if dims == (SET,)}
-                more = {"orbit_period": float(self._attractors["orbit_period"].values[row])}
-                results |= {**more, "n_cells": float(self._attractors["n_cells"].values[row])}
-                self._put("quantity", row, mean_over_cells(tree, {**known, **results}, weights * (labels == own)))
+        for own, row in self._attracting(index):
+            results = {name: values[row] for name, values in self._values.items() if values.ndim == 1}
+            results |= {name: float(self._attractors[name].values[row]) for name in ("orbit_period", "n_cells")}
+            self._values["quantity"][row] = mean_over_cells(tree, {**known, **results}, weights * (labels == own))
 
-    def shocks(self, index: tuple[int, ...], found: dict[tuple[int, str], tuple[Found, Bases]]) -> None:
-        """Fill in the critical shocks of a parameter point."""
-        scales = np.asarray(self._run.model.scales)
-        which = _places(self._run, self._options)
-        for (own, what), (one, bases) in found.items():
+    def shocks(self, index: tuple[int, ...], there: Destinations, states: np.ndarray, labels: np.ndarray) -> None:
+        """Search the shocks of each attractor: of the chosen states, of all states, and of each state alone."""
+        point, options = there.point, self._options
+        assert point.parameters is not None
+        which = np.array([self._run.model.state_names.index(name) for name in _chosen(self._run, options)])
+        every = np.arange(len(self._scales))
+        asked: dict[tuple[int, str], Asked] = {}
+        for own in sorted(there.told):
+            bases = bases_of(there.here.isel(attractor=own), point.parameters, point.frequency, options.phases)
+            asked[own, "shock"] = Asked.of(own, bases, which, options)
+            away = (labels != own) & (labels != -1)
+            seeds = _nearest_seeds(there, bases.sections, states[away], labels[away], options.norm)
+            asked[own, "distance"] = Asked.of(own, bases.sections, every, options, seeds)
+            for i in every.tolist():
+                asked[own, str(i)] = Asked.of(own, bases.sections, every[[i]], options)
+        for (own, what), one in search_together(asked, there).items():
             at = self._rows[index][own]
-            if what not in ("shock", "any"):
+            if what in ("shock", "distance"):
+                self._shock(what, at, one, asked[own, what])
+            else:
                 self._searched("along", (at, int(what)), one)
-                self._put("along", (at, int(what)), one.shock[0] * scales[int(what)])
-                continue
-            name = "shock" if what == "shock" else "distance"
-            self._searched(name, at, one)
-            if one.base < 0:
-                continue
-            jump = np.zeros(self._n_states)
-            jump[which if what == "shock" else slice(None)] = one.shock
-            self._put(name, at, jump * scales)
-            self._put(f"{name}_phase", at, bases.phase[one.base])
-            self._put(f"{name}_from", at, bases.states[one.base])
+                self._values["along"][at, int(what)] = one.shock[0] * self._scales[int(what)]
+
+    def _shock(self, what: str, at: int, one: Found, asked: Asked) -> None:
+        self._searched(what, at, one)
+        if one.base >= 0:
+            jump = np.zeros(len(self._scales))
+            jump[asked.which] = one.shock
+            self._values[what][at] = jump * self._scales
+            self._values[f"{what}_phase"][at] = asked.bases.phase[one.base]
+            self._values[f"{what}_from"][at] = asked.bases.states[one.base]
 
     def _searched(self, name: str, at: Any, one: Found) -> None:
         for key in ("low", "high", "to", "safe", "n_below", "n_undecided"):
-            if f"{name}_{key}" in self.arrays:
-                self._put(f"{name}_{key}", at, getattr(one, key))
+            if f"{name}_{key}" in self._values:
+                self._values[f"{name}_{key}"][at] = getattr(one, key)
 
     def dataset(self) -> xr.Dataset:
         """Return all arrays, with the attractors' features."""
         kept = [name for name in ("kind", "stability", "orbit_period", "n_cells", "side") if name in self._attractors]
-        found, options = self._attractors[[ROW_SIZE, *kept]], self._options
-        scales = ("state", np.asarray(self._run.model.scales), {"long_name": "size that counts as 1"})
+        found, plain = self._attractors[[ROW_SIZE, *kept]], self._options.plain()
+        own = {n: ((SET, "state")[: v.ndim], v, self._attrs[n]) for n, v in self._values.items()}
         attrs = {**told_by(found.attrs), **section_attributes(self._run.model.crossing), "title": "resilience"}
-        plain = {
-            k: v
-            for k, v in options.plain().items()
-            if k in ("phases", "largest", "norm", "within", "near", "timed", "density", "quantity")
-        }
-        attrs |= {f"resilience_{k}": v for k, v in plain.items()}
-        attrs |= {"resilience_states": ", ".join(_chosen(self._run, options)), N_IDS: found.attrs[N_IDS]}
+        options = ("phases", "largest", "norm", "within", "near", "timed", "density", "quantity")
+        attrs |= {f"resilience_{name}": value for name, value in plain.items() if name in options}
+        attrs |= {"resilience_states": ", ".join(_chosen(self._run, self._options)), N_IDS: found.attrs[N_IDS]}
         states = {k: v.variable for k, v in self._attractors.coords.items() if k in ("state", "state_units")}
-        result = found.assign(self.arrays).assign_coords({**states, "state_scale": scales})
-        return result.drop_attrs(deep=False).assign_attrs(attrs)
+        states["state_scale"] = xr.Variable("state", self._scales, {"long_name": "size that counts as 1"})
+        return found.assign(own).assign_coords(states).drop_attrs(deep=False).assign_attrs(attrs)
 
 
 def end_of(label: int) -> str:

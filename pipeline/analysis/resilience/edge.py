@@ -36,13 +36,15 @@ from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import padded
 from pipeline.analysis.resilience.analysis import start_states
-from pipeline.analysis.resilience.edge_tracking import REASONS, Limits, Pair, Tracking, nearest_pairs, orbits_on
+from pipeline.analysis.resilience.edge_tracking import REASONS, Pair, Tracking, nearest_pairs, orbits_on
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, words_of
 from pipeline.analysis.tolerances import SAME_EQUILIBRIUM
+from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     BOUNDED_SET,
@@ -92,8 +94,7 @@ def _letters(names: tuple[str, str]) -> list[str]:
 def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     """Track the edge states between two attractors at a parameter point."""
     whole = run.derive("attractors")
-    cube = select_points(run.cube(), options.at, purpose=PURPOSE)
-    attractors = select_points(whole, options.at, purpose=PURPOSE)
+    cube, attractors = (select_points(ds, options.at, purpose=PURPOSE) for ds in (run.cube(), whole))
     dims, starts = split_dims(attractors["attractor_id"])
     here = attractors.isel(dict.fromkeys(dims, 0))
     between = _ids_of(here, options.between)
@@ -103,17 +104,16 @@ def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     if untold:
         raise ValueError(f"trajectories cannot be told to end on attractor {untold[0]}; track between two others.")
     labels = outcomes(here).transpose(*starts).values.ravel()
-    states = start_states(cube, starts)
-    candidates = nearest_pairs(states, labels, between, CANDIDATES * options.pairs, there, options.seed)
-    limits = Limits(options.closest, options.farthest, options.returns, there.options.max_orbit_period)
-    tracking = Tracking(there, between, limits)
+    candidates = nearest_pairs(start_states(cube, starts), labels, between, CANDIDATES * options.pairs, there, options)
+    tracking = Tracking(there, between, options)
     pairs = tracking.choose(candidates, options.pairs)
-    initial = np.array([pair.start for pair in pairs]).reshape(len(pairs), 2, -1)
     tracking.run(pairs)
     settled = all(isinstance(pair.found, Orbit | Equilibrium) for pair in pairs)
     paths = [np.array(pair.path) for pair in pairs if len(pair.path) > options.max_period]
     on_paths = [] if settled else orbits_on(paths, there, between, options.max_period)
-    return _dataset(run, there, between, pairs, on_paths, initial, here)
+    attrs = {**told_by(here.attrs), **section_attributes(run.model.crossing), "title": "edge states"}
+    attrs |= {"between": list(between), "between_letters": " ".join(map(letter, between))}
+    return _dataset(there, pairs, on_paths, here).assign_attrs(attrs)
 
 
 def _ids_of(here: xr.Dataset, names: tuple[str, str]) -> tuple[int, int]:
@@ -152,50 +152,30 @@ def _distinct(pairs: list[Pair], geometry: Geometry, least: float) -> tuple[list
     return found, [order.index(key) if key is not None else -1 for key in keys]
 
 
-def _dataset(
-    run: OpenRun,
-    there: Destinations,
-    between: tuple[int, int],
-    pairs: list[Pair],
-    on_paths: list[Orbit],
-    initial: np.ndarray,
-    here: xr.Dataset,
-) -> xr.Dataset:
+def _dataset(there: Destinations, pairs: list[Pair], on_paths: list[Orbit], here: xr.Dataset) -> xr.Dataset:
     found, edge_of = _distinct(pairs, there.geometry, there.settings.closure)
     tracked = [one for one in found if isinstance(one, Orbit)]
     found += [one for one in on_paths if number_of(one, tracked, there.geometry) == len(tracked)]
-    n_states = there.geometry.n_states
+    n = there.geometry.n_states
     points = [_points_of(one) for one in found]
-    section = np.full((len(found), max((len(p) for p in points), default=0), n_states), np.nan)
-    for i, own in enumerate(points):
-        section[i, : len(own)] = own
-    path = np.full((len(pairs), max((len(p.path) for p in pairs), default=0), n_states), np.nan)
-    for i, pair in enumerate(pairs):
-        path[i, : len(pair.path)] = np.array(pair.path).reshape(-1, n_states)
+    paths = [np.array(pair.path).reshape(-1, n) for pair in pairs]
+    initial = np.array([pair.start for pair in pairs]).reshape(len(pairs), 2, -1)
     units = {"units": "see state_units"}
-    flags = {"flag_values": np.arange(len(REASONS), dtype=np.int8), "flag_meanings": " ".join(REASONS)}
-    result = xr.Dataset(
-        {
-            "section": (("edge", "point", "state"), section, {**units, "long_name": "section points"}),
-            "n_points": ("edge", np.array([len(p) for p in points], np.int32), {"long_name": "section points"}),
-            **_about(found, n_states),
-            "n_pairs": ("edge", np.bincount([k for k in edge_of if k >= 0], minlength=len(found)), {"units": "1"}),
-            "pair_edge": ("pair", np.array(edge_of, np.int32), {"long_name": "edge state, -1 none"}),
-            "pair_reason": ("pair", np.array([p.reason for p in pairs], np.int8), {"long_name": "why none", **flags}),
-            "pair_start": (("pair", "side", "state"), initial, {**units, "long_name": "initial states"}),
-            "path": (("pair", "step", "state"), path, {**units, "long_name": "path along the boundary"}),
-            "n_steps": (
-                "pair",
-                np.array([len(p.path) for p in pairs], np.int32),
-                {"long_name": "sections of the path"},
-            ),
-        }
-    )
+    reasons = {"long_name": "why none", **code_flags(REASONS)}
+    variables = {
+        "section": (("edge", "point", "state"), padded(points, n), {**units, "long_name": "section points"}),
+        "n_points": ("edge", np.array([len(p) for p in points], np.int32), {"long_name": "section points"}),
+        **_about(found, n),
+        "n_pairs": ("edge", np.bincount([k for k in edge_of if k >= 0], minlength=len(found)), {"units": "1"}),
+        "pair_edge": ("pair", np.array(edge_of, np.int32), {"long_name": "edge state, -1 none"}),
+        "pair_reason": ("pair", np.array([p.reason for p in pairs], np.int8), reasons),
+        "pair_start": (("pair", "side", "state"), initial, {**units, "long_name": "initial states"}),
+        "path": (("pair", "step", "state"), padded(paths, n), {**units, "long_name": "path along the boundary"}),
+        "n_steps": ("pair", np.array([len(p) for p in paths], np.int32), {"long_name": "sections of the path"}),
+    }
     scalars = {str(k): v.variable for k, v in here.coords.items() if not v.ndim}
     states = {name: here[name].variable for name in ("state", "state_units") if name in here.coords}
-    attrs = {**told_by(here.attrs), **section_attributes(run.model.crossing), "title": "edge states"}
-    attrs |= {"between": list(between), "between_letters": " ".join(letter(i) for i in between)}
-    return result.assign_coords({**scalars, **states}).assign_attrs(attrs)
+    return xr.Dataset(variables).assign_coords({**scalars, **states})
 
 
 def _points_of(one: Orbit | Equilibrium | np.ndarray) -> np.ndarray:
@@ -207,27 +187,29 @@ def _points_of(one: Orbit | Equilibrium | np.ndarray) -> np.ndarray:
 def _about(found: list[Any], n_states: int) -> dict[str, Any]:
     """Return the variables of the edge states that are numbers: kind, period, multipliers, eigenvalues, residual."""
     none = np.full(n_states, np.nan + 0.0j)
-    orbits = [one if isinstance(one, Orbit) else None for one in found]
-    rests = [one if isinstance(one, Equilibrium) else None for one in found]
-    kinds = [PERIODIC_ORBIT if o else EQUILIBRIUM if r else BOUNDED_SET for o, r in zip(orbits, rests, strict=True)]
-    multipliers = np.array([none if o is None else o.multipliers for o in orbits]).reshape(len(found), n_states)
-    eigenvalues = np.array([none if r is None else r.eigenvalues for r in rests]).reshape(len(found), n_states)
-    residual = [one.residual if isinstance(one, Orbit | Equilibrium) else np.nan for one in found]
-    flags: dict[str, Any] = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
-
-    def column(
-        values: Any, dtype: str, text: str, units: str = "1", **attrs: Any
-    ) -> tuple[str, np.ndarray, dict[str, Any]]:
-        return "edge", np.array(values, dtype), {"units": units, "long_name": text, **attrs}
-
-    variables: dict[str, Any] = {
-        "kind": column(kinds, "int8", "kind of set", **flags),
-        "orbit_period": column([o.period if o else 0 for o in orbits], "int32", "period in drive periods or returns"),
-        "period_s": column([o.seconds if o else np.nan for o in orbits], "float64", "period", "s"),
-        "residual": column(residual, "float64", "scaled residual of Newton's method"),
+    rows: list[tuple[Any, ...]] = []
+    for one in found:
+        if isinstance(one, Orbit):
+            rows.append((PERIODIC_ORBIT, one.period, one.seconds, one.residual, one.multipliers, none))
+        elif isinstance(one, Equilibrium):
+            rows.append((EQUILIBRIUM, 0, np.nan, one.residual, none, one.eigenvalues))
+        else:
+            rows.append((BOUNDED_SET, 0, np.nan, np.nan, none, none))
+    kinds, periods, seconds, residuals, multipliers, eigenvalues = zip(*rows, strict=True) if rows else ((),) * 6
+    columns = {
+        "kind": (kinds, "int8", "1", "kind of set"),
+        "orbit_period": (periods, "int32", "1", "period in drive periods or returns"),
+        "period_s": (seconds, "float64", "s", "period"),
+        "residual": (residuals, "float64", "1", "scaled residual of Newton's method"),
     }
+    variables: dict[str, Any] = {
+        name: ("edge", np.array(values, dtype), {"units": units, "long_name": text})
+        for name, (values, dtype, units, text) in columns.items()
+    }
+    variables["kind"][2].update(code_flags(KINDS))
     for name, values, units in (("multiplier", multipliers, "1"), ("eigenvalue", eigenvalues, "1/s")):
-        for part, numbers in (("real", values.real), ("imag", values.imag)):
+        both = np.array(values, complex).reshape(len(found), n_states)
+        for part, numbers in (("real", both.real), ("imag", both.imag)):
             variables[f"{name}_{part}"] = (("edge", "multiplier"), numbers, {"units": units})
     return variables
 
@@ -256,13 +238,12 @@ _SENTENCES = {
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
-    names = [str(name) for name in ds["state"].values]
-    rows = []
+    names, rows = ds["state"].values.tolist(), []
     for i in range(ds.sizes["edge"]):
         one = ds.isel(edge=i)
-        for k in range(int(one["n_points"])):
-            point = {name: float(value) for name, value in zip(names, one["section"].values[k], strict=True)}
-            rows.append({"edge": i, "between": str(ds.attrs["between_letters"]), **_numbers(one), "point": k, **point})
+        head = {"edge": i, "between": str(ds.attrs["between_letters"]), **_numbers(one)}
+        for k, point in enumerate(one["section"].values[: int(one["n_points"])].tolist()):
+            rows.append({**head, "point": k, **dict(zip(names, point, strict=True))})
     return rows
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.sets import nearest_distances
 from pipeline.analysis.tolerances import PORTRAIT_RTOL, RECURRENCE
 from pipeline.products.reporting import report
+from pipeline.products.resilience import EdgeOptions
 
 REASONS = ("none", "third_attractor", "undecided", "lost", "not_settled", "parted")
 NONE, THIRD, UNKNOWN, LOST, NOT_SETTLED, PARTED = range(len(REASONS))
@@ -70,17 +72,6 @@ NEAREST = len(SHIFTS) // 2
 """How many of the smaller distances must show both basins."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits of the tracking."""
-
-    # scaled distance to which a pair is bisected, and beyond which it is bisected again
-    closest: float
-    farthest: float
-    returns: int  # most sections of a path
-    longest: int  # longest period of an edge orbit
-
-
 @dataclass
 class Pair:
     """A pair of states, one in each basin, and its path along the boundary."""
@@ -99,21 +90,10 @@ class Pair:
 
 
 class Tracking:
-    """The tracking of pairs between two attractors.
+    """The tracking of pairs between two attractors, whose ids are in the order of each pair's states."""
 
-    Parameters
-    ----------
-    there
-        Attractors of the parameter point.
-    between
-        Ids of the two attractors, in the order of each pair's states.
-    limits
-        Limits of the tracking.
-    """
-
-    def __init__(self, there: Destinations, between: tuple[int, int], limits: Limits) -> None:
-        self._there, self._between, self._limits = there, between, limits
-        self._geometry = there.geometry
+    def __init__(self, there: Destinations, between: tuple[int, int], options: EdgeOptions) -> None:
+        self._there, self._between, self._options, self._geometry = there, between, options, there.geometry
 
     def choose(self, candidates: Sequence[Pair], n: int) -> list[Pair]:
         """Bisect candidates; return `n` of them, those with a common boundary of the two basins first."""
@@ -123,9 +103,9 @@ class Tracking:
     def run(self, pairs: Sequence[Pair]) -> None:
         """Track bisected pairs until each has an edge state, or a reason why it has none, in place."""
         self._note(pairs)
-        for n in range(1, self._limits.returns + 1):
+        for n in range(1, self._options.returns + 1):
             going = [pair for pair in pairs if pair.goes_on]
-            report("tracking edge states", n, self._limits.returns)
+            report("tracking edge states", n, self._options.returns)
             if not going:
                 break
             before = [self._width(pair) for pair in going]
@@ -156,7 +136,7 @@ class Tracking:
         """
         width = self._width(pair)
         grown = width * max(width / before, 1.0)
-        return grown > self._limits.farthest or width < 1e-2 * self._limits.closest
+        return grown > self._options.farthest or width < 1e-2 * self._options.closest
 
     def _between_ends(self, pair: Pair, shares: np.ndarray) -> np.ndarray:
         """Return the states at shares of the segment from one end of a pair to the other."""
@@ -172,7 +152,7 @@ class Tracking:
         for i, (pair, own, codes) in enumerate(zip(pairs, states, status, strict=True)):
             if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all() and (own[0] != own[1]).any():
                 before, pair.ends = pair.ends[0], own
-                if self._width(pair) > WIDEST * self._limits.farthest:
+                if self._width(pair) > WIDEST * self._options.farthest:
                     pair.reason = PARTED
                     if self._there.point.is_flow:
                         self._pass(pair, before, float(flight.seconds[2 * i, 0]))
@@ -188,7 +168,7 @@ class Tracking:
         shares = np.arange(PARTS + 1) / PARTS
         due = {id(pair) for pair in pairs}
         for _ in range(MOST_DIVISIONS):
-            going = [p for p in pairs if p.goes_on and (id(p) in due or self._width(p) > self._limits.closest)]
+            going = [p for p in pairs if p.goes_on and (id(p) in due or self._width(p) > self._options.closest)]
             if not going:
                 return
             states = np.stack([self._between_ends(pair, shares) for pair in going])
@@ -197,7 +177,7 @@ class Tracking:
                 if self._take(pair, own, label):
                     due.discard(id(pair))
         for pair in pairs:
-            if pair.goes_on and (id(pair) in due or self._width(pair) > self._limits.farthest):
+            if pair.goes_on and (id(pair) in due or self._width(pair) > self._options.farthest):
                 pair.reason = UNKNOWN
 
     def _take(self, pair: Pair, states: np.ndarray, label: np.ndarray) -> bool:
@@ -208,14 +188,13 @@ class Tracking:
         first, second = (np.flatnonzero(label == number) for number in self._between)
         if not len(first) or not len(second):
             pair.ends = self._between_ends(pair, np.array([-1.0, 2.0]))
-            if not self._width(pair) <= CLOSE * self._limits.farthest:
+            if not self._width(pair) <= CLOSE * self._options.farthest:
                 pair.reason = LOST
             return False
-        steps = []
-        for i in first.tolist():
-            for j in second.tolist():
-                inside = label[min(i, j) + 1 : max(i, j)]
-                steps.append((bool((inside != UNDECIDED).any()), abs(i - j), i, j))
+        steps = [
+            (bool((label[min(i, j) + 1 : max(i, j)] != UNDECIDED).any()), abs(i - j), i, j)
+            for i, j in product(first.tolist(), second.tolist())
+        ]
         has_third, length, i, j = min(steps)
         if length == PARTS:
             pair.reason = THIRD if has_third else UNKNOWN
@@ -228,8 +207,8 @@ class Tracking:
     def _settle(self, pair: Pair) -> None:
         """Find the orbit or the equilibrium to which a pair's path has come, if there is one."""
         path = np.array(pair.path)
-        near = CLOSE * self._limits.farthest
-        most = min(self._limits.longest, len(path) - 1)
+        near = CLOSE * self._options.farthest
+        most = min(self._there.options.max_orbit_period, len(path) - 1)
         if most < 2:
             return
         # twice in turn: a chaotic path recurs once by chance more often
@@ -247,7 +226,7 @@ class Tracking:
 
     def _rest(self, pair: Pair, states: np.ndarray) -> bool:
         """Take the equilibrium near the end of a pair's path as its edge state, if there is one."""
-        near = CLOSE * self._limits.farthest
+        near = CLOSE * self._options.farthest
         for one in equilibria_near(self._there.point, states, self._geometry):
             unstable = one.eigenvalues.real > one.eigenvalue_error
             if unstable.sum() == 1 and self._geometry.distance(states, one.state).min() <= near:
@@ -278,29 +257,18 @@ class Tracking:
     def _as_set(self, pair: Pair) -> None:
         """Take the later half of a path as section points of a bounded set, if both its halves fill the same points."""
         later = np.array(pair.path[len(pair.path) // 2 :])
-        if len(later) >= LEG and is_stationary(later, self._geometry, self._limits.farthest):
+        if len(later) >= LEG and is_stationary(later, self._geometry, self._options.farthest):
             pair.found = later
         else:
             pair.reason = NOT_SETTLED
 
 
 def nearest_pairs(
-    states: np.ndarray, labels: np.ndarray, between: tuple[int, int], n: int, there: Destinations, seed: int
+    states: np.ndarray, labels: np.ndarray, between: tuple[int, int], n: int, there: Destinations, options: EdgeOptions
 ) -> list[Pair]:
-    """Return pairs of initial states, one in each basin, close to each other and spread along the boundary.
+    """Return at most `n` pairs of initial states, one in each basin, close to each other and spread along the boundary.
 
-    Parameters
-    ----------
-    states, labels
-        Initial states of the cells (cell, state), and the attractor on which each ends.
-    between
-        Ids of the two attractors.
-    n
-        Most pairs.
-    there
-        Attractors of the parameter point.
-    seed
-        Seed that chooses among the closer half of the possible pairs.
+    States (cell, state) have the ids of the attractors on which they end as labels.
     """
     geometry = there.geometry
     first, second = (states[labels == number] for number in between)
@@ -308,7 +276,7 @@ def nearest_pairs(
         return []
     away, nearest = geometry.tree(first).query(geometry.scaled(second), p=np.inf)
     closer = np.argsort(away, kind="stable")[: max(len(away) // 2, 1)]
-    chosen = np.random.default_rng(seed).permutation(closer)[:n]
+    chosen = np.random.default_rng(options.seed).permutation(closer)[:n]
     starts = [np.stack([first[nearest[k]], second[k]]) for k in chosen]
     return [Pair(start, start) for start in starts]
 
@@ -317,18 +285,7 @@ def orbits_on(
     paths: Sequence[np.ndarray], there: Destinations, between: tuple[int, int], max_period: int
 ) -> list[Orbit]:
     """Return the saddle orbits on the boundary that Newton's method finds from points of paths along it, and that the
-    paths come near.
-
-    Parameters
-    ----------
-    paths
-        Section points of paths on the boundary, shape (n, state) each.
-    there
-        Attractors of the parameter point.
-    between
-        Ids of the two attractors.
-    max_period
-        Longest period [drive periods or returns].
+    paths come near. Paths are section points of shape (n, state).
     """
     point = there.point
     if not paths or not max_period or (point.can_rest and not point.is_flow):

@@ -15,21 +15,12 @@ CONSTANTS = ("pi", "f")
 
 
 def read_expression(key: str, text: str, known: Iterable[str]) -> Tree:
-    """Parse the expression of an option.
-
-    Parameters
-    ----------
-    key
-        Name of the option, for errors.
-    text
-        Arithmetic expression; see `magpend_core.models.text.grammar`.
-    known
-        Names that it may use, beside `CONSTANTS`.
+    """Parse the expression of an option, which may use some names and `CONSTANTS`; the option's name is for errors.
 
     Raises
     ------
     ValueError
-        If it is no expression, or uses another name.
+        If it is no arithmetic expression (`magpend_core.models.text.grammar`), or uses another name.
     """
     known = [*known, *CONSTANTS]
     try:
@@ -45,19 +36,8 @@ def read_expression(key: str, text: str, known: Iterable[str]) -> Tree:
 def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -> float:
     """Return the value of an expression, as the weighted mean over cells if it depends on states.
 
-    Parameters
-    ----------
-    tree
-        Expression, from `read_expression`.
-    known
-        Values of its names: numbers, and arrays of shape (cell,).
-    weights
-        Weights of the cells, shape (cell,).
-
-    Returns
-    -------
-    float
-        NaN if it depends on states and there is no cell with a weight.
+    Values of its names are numbers, and arrays of shape (cell,), as the weights. NaN if it depends on states and there
+    is no cell with a weight.
     """
     value = np.asarray(value_of(tree, {"pi": np.pi, **known}), np.float64)
     if not value.ndim:
@@ -67,21 +47,9 @@ def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -
 
 
 def density_at(text: str, known: Mapping[str, Any], states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the density of initial states at cells, as their weights.
+    """Return the density of initial states at cells, as their weights, shape (cell,); not normalised.
 
-    Parameters
-    ----------
-    text
-        Expression of the states and of the names in `known`.
-    known
-        Values of parameters, and of ``f``.
-    states
-        Values of each state, shape (cell,).
-
-    Returns
-    -------
-    ndarray, (cell,)
-        Not normalised.
+    The text may use known numbers and states, the values of which have shape (cell,).
 
     Raises
     ------

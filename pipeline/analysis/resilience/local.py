@@ -57,20 +57,10 @@ class Local(NamedTuple):
 def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, scales: np.ndarray) -> Local:
     """Measure reactivity, amplification and return time of an attractor.
 
-    Parameters
-    ----------
-    one
-        Attractor: variables of `match` without parameter dims and `attractor`.
-    parameters, frequency
-        Parameters of the point, and drive frequency [Hz].
-    scales
-        Sizes of the states that count as 1, shape (state,).
-
-    Returns
-    -------
-    Local
-        All NaN for a set that is no equilibrium and no periodic orbit. Of an orbit the maxima are over `PHASES` phases
-        of a period, fewer of a long orbit, so they are lower bounds.
+    It is given by the variables of `match` without parameter dims and `attractor`, with the parameters and the drive
+    frequency [Hz] of its point, and the sizes of the states that count as 1. All is NaN for a set that is no
+    equilibrium and no periodic orbit. Of an orbit the maxima are over `PHASES` phases of a period, fewer of a long
+    orbit, so they are lower bounds.
     """
     kind, model = int(one["kind"]), parameters.model
     if kind == EQUILIBRIUM:
@@ -130,16 +120,9 @@ def amplification_at_rest(matrix: np.ndarray) -> tuple[float, float]:
 def amplification_of_orbit(steps: np.ndarray) -> tuple[float, int]:
     """Return the largest norm of products of consecutive steps round an orbit, and the number of steps in the product.
 
-    Parameters
-    ----------
-    steps
-        Scaled derivatives from each phase to the next, shape (phase, state, state); the last leads to the first.
-
-    Returns
-    -------
-    tuple
-        (1, 0) if no product is larger than 1; NaN if the products have not fallen to 1, or come to a limit, in
-        `MOST_PERIODS` periods.
+    Steps are scaled derivatives from each phase to the next, shape (phase, state, state); the last leads to the first.
+    (1, 0) if no product is larger than 1; NaN if the products have not fallen to 1, or come to a limit, in
+    `MOST_PERIODS` periods.
     """
     n, dim = steps.shape[:2]
     within = np.empty((n, n, dim, dim))  # after r + 1 steps from phase k

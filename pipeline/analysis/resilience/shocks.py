@@ -16,9 +16,9 @@ and Wagemakers, Chaos 33, 073151, 2023), after Halekotte and Feudel (Sci. Rep. 1
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Generator, Hashable, Mapping
+from dataclasses import dataclass, fields
+from typing import Literal, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -33,8 +33,10 @@ from pipeline.analysis.together import run_together
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, samples_per_period
 from pipeline.products.reporting import report
+from pipeline.products.resilience import ResilienceOptions
 
 Norm = Literal["euclidean", "largest"]
+K = TypeVar("K", bound=Hashable)
 
 RATIO = 2.0 ** (1.0 / 3.0)
 """Ratio of the sizes of neighbouring shells."""
@@ -66,6 +68,8 @@ ROUNDS = 20
 BESIDE = (-5.0, -0.3)
 """Decimal logarithms of the least and largest relative distance from the best ray at which shocks are tried."""
 
+PRECISION = 1e-6
+"""Relative length to which the last ray is divided."""
 
 MOST_POINTS = 8
 """Most section points of a set that does not close from which shocks start."""
@@ -83,35 +87,13 @@ Search = Generator[Trials, np.ndarray, "Found"]
 """A search: yields trials, receives their labels, returns what it found."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Settings of a search."""
+Seeds = tuple[Trials, np.ndarray]
+"""Shocks whose ends are known, with their labels."""
 
-    largest: float  # largest scaled size of a shock
-    directions: int  # number of directions of a shell, if more than one state is shocked
-    norm: Norm  # ``"euclidean"`` or ``"largest"``, of the scaled jumps
-    precision: float  # relative length to which the last ray is divided
-    confirmations: int  # random smaller shocks that are tried in a round of confirmation
-    seed: int  # seed of directions and random shocks
 
-    def size(self, shocks: np.ndarray) -> np.ndarray:
-        """Return the scaled sizes of shocks (..., dim)."""
-        return np.asarray(np.linalg.norm(shocks, axis=-1) if self.norm == "euclidean" else np.abs(shocks).max(axis=-1))
-
-    def unit(self, shocks: np.ndarray) -> np.ndarray:
-        """Return shocks of size 1 in the same directions."""
-        return np.asarray(shocks / self.size(shocks)[..., None])
-
-    def compass(self, dim: int, rng: np.random.Generator) -> np.ndarray:
-        """Return the directions of a shell, shape (n, dim): both axes of each state first."""
-        if dim == 1:
-            return np.array([[1.0], [-1.0]])
-        if dim == 2:
-            angles = 2.0 * np.pi * np.arange(self.directions) / self.directions
-            return self.unit(np.column_stack([np.cos(angles), np.sin(angles)]))
-        axes = np.concatenate([np.eye(dim), -np.eye(dim)])
-        drawn = rng.standard_normal((max(self.directions - len(axes), 0), dim))
-        return self.unit(np.concatenate([axes, drawn]))
+def sizes(shocks: np.ndarray, norm: Norm) -> np.ndarray:
+    """Return the scaled sizes of shocks (..., dim)."""
+    return np.asarray(np.linalg.norm(shocks, axis=-1) if norm == "euclidean" else np.abs(shocks).max(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -143,37 +125,45 @@ class _Rays:
     def take(self, rows: np.ndarray) -> _Rays:
         return _Rays(self.base[rows], self.unit[rows], self.low[rows], self.high[rows], self.label[rows])
 
+    def smallest(self, n: int) -> _Rays:
+        return self.take(np.argsort(self.high, kind="stable")[:n])
+
     def joined(self, other: _Rays) -> _Rays:
-        pairs = ((getattr(self, n), getattr(other, n)) for n in ("base", "unit", "low", "high", "label"))
-        return _Rays(*(np.concatenate(pair) for pair in pairs))
+        return _Rays(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(_Rays)))
 
 
 class ShockSearch:
-    """The search for the smallest shock that leads away from one attractor.
+    """The search for the smallest shock of `dim` states that leads away from an attractor, which is given by its id.
 
-    Parameters
-    ----------
-    own
-        Id of the attractor.
-    n_bases
-        Number of base states on the attractor, neighbours in time next to each other.
-    dim
-        Number of shocked states.
-    settings
-        Settings of the search.
-    seeds
-        Shocks that are known to lead away, with their labels.
+    Base states on it that are neighbours in time are next to each other. Seeds are shocks that lead away.
     """
 
     def __init__(
-        self, own: int, n_bases: int, dim: int, settings: Settings, seeds: tuple[Trials, np.ndarray] | None = None
+        self, own: int, n_bases: int, dim: int, options: ResilienceOptions, seeds: Seeds | None = None
     ) -> None:
-        self._own, self._n_bases, self._dim, self._settings = own, n_bases, dim, settings
-        self._rng = np.random.default_rng([settings.seed, dim])
-        self._seeds = seeds
+        self._own, self._n_bases, self._dim, self._options, self._seeds = own, n_bases, dim, options, seeds
+        self._rng = np.random.default_rng([options.seed, dim])
         self._sizes: list[np.ndarray] = []
         self._codes: list[np.ndarray] = []
         self._shells: list[tuple[float, bool]] = []
+
+    def _size(self, shocks: np.ndarray) -> np.ndarray:
+        return sizes(shocks, self._options.norm)
+
+    def _unit(self, shocks: np.ndarray) -> np.ndarray:
+        """Return shocks of size 1 in the same directions."""
+        return np.asarray(shocks / self._size(shocks)[..., None])
+
+    def _compass(self) -> np.ndarray:
+        """Return the directions of a shell, shape (n, dim): both axes of each state first."""
+        n, dim = self._options.directions, self._dim
+        if dim == 1:
+            return np.array([[1.0], [-1.0]])
+        if dim == 2:
+            angles = 2.0 * np.pi * np.arange(n) / n
+            return self._unit(np.column_stack([np.cos(angles), np.sin(angles)]))
+        drawn = self._rng.standard_normal((max(n - 2 * dim, 0), dim))
+        return self._unit(np.concatenate([np.eye(dim), -np.eye(dim), drawn]))
 
     def run(self) -> Search:
         """Search: a generator that yields trials, receives their labels and returns a `Found`."""
@@ -185,17 +175,17 @@ class ShockSearch:
         if self._dim > 1 or self._n_bases > 1:
             yield from self._descend(best)
         for _ in range(ROUNDS):
-            best = best.take(np.argsort(best.high, kind="stable")[:1])
-            yield from self._narrow(best, self._settings.precision)
+            best = best.smallest(1)
+            yield from self._narrow(best, PRECISION)
             worse = yield from self._contradictions(best)
             if not len(worse.base):
                 break
-            worse = worse.take(np.argsort(worse.high, kind="stable")[:MOST_RAYS])
+            worse = worse.smallest(MOST_RAYS)
             yield from self._narrow(worse, COARSE)
             best = self._best(worse)
             yield from self._descend(best)
-        best = best.take(np.argsort(best.high, kind="stable")[:1])
-        yield from self._narrow(best, self._settings.precision)
+        best = best.smallest(1)
+        yield from self._narrow(best, PRECISION)
         return self._found(best)
 
     # ---- trials --------------------------------------------------------------------------------
@@ -206,39 +196,32 @@ class ShockSearch:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         label = yield Trials(base, shock)
         code = np.where(label == UNDECIDED, -1, (label != self._own).astype(np.int64))
-        self._sizes.append(self._settings.size(shock))
+        self._sizes.append(self._size(shock))
         self._codes.append(code)
         return label, code
 
     def _outer(self) -> Generator[Trials, np.ndarray, _Rays]:
         """Try shells of rising size until a shock leads away; return the rays of the shocks that do."""
-        units = self._settings.compass(self._dim, self._rng)
+        units = self._compass()
         base, unit = np.repeat(np.arange(self._n_bases), len(units)), np.tile(units, (self._n_bases, 1))
-        before, low = 0.0, np.zeros(len(base))
+        low = np.zeros(len(base))
         rays = _Rays(*(x[:0] for x in (base, unit, low, low, base)))
-        for size in self._settings.largest * RATIO ** np.arange(1.0 - SHELLS, 1.0):
+        for size in self._options.largest * RATIO ** np.arange(1.0 - SHELLS, 1.0):
             label, code = yield from self._ask(base, size * unit)
             self._shells.append((float(size), bool((code == 0).all())))
             away = np.flatnonzero(code == 1)
             if len(away):
-                order = self._rng.permutation(len(away))[:MOST_RAYS]
-                away = np.sort(away[order])
+                away = np.sort(away[self._rng.permutation(len(away))[:MOST_RAYS]])
                 rays = _Rays(base[away], unit[away], low[away], np.full(len(away), size), label[away])
                 break
             low = np.where(code == 0, size, low)
-            before = float(size)
-        return rays.joined(self._seeded(rays.high.min() if len(rays.high) else np.inf, before))
+        return rays.joined(self._seeded(*self._seeds, rays.high.min(initial=np.inf))) if self._seeds else rays
 
-    def _seeded(self, below: float, before: float) -> _Rays:
-        """Return the rays of known shocks that lead away and are smaller than those found."""
-        if self._seeds is None:
-            empty = np.zeros(0, np.int64)
-            return _Rays(empty, np.zeros((0, self._dim)), np.zeros(0), np.zeros(0), empty)
-        trials, label = self._seeds
-        size = self._settings.size(trials.shock)
+    def _seeded(self, trials: Trials, label: np.ndarray, below: float) -> _Rays:
+        """Return the rays of known shocks that are smaller than those found."""
+        size = self._size(trials.shock)
         rows = np.flatnonzero((size < below) & (size > 0.0))
-        units = self._settings.unit(trials.shock[rows])
-        return _Rays(trials.base[rows], units, np.zeros(len(rows)), size[rows], label[rows])
+        return _Rays(trials.base[rows], self._unit(trials.shock[rows]), np.zeros(len(rows)), size[rows], label[rows])
 
     def _narrow(self, rays: _Rays, precision: float) -> Generator[Trials, np.ndarray, None]:
         """Divide the interval of each ray until it is short or holds undecided shocks only, in place."""
@@ -281,7 +264,7 @@ class ShockSearch:
     @property
     def _angle(self) -> float:
         """Typical angle between neighbouring directions of a shell [rad]."""
-        return 2.0 * np.pi / self._settings.directions if self._dim == 2 else 0.5
+        return 2.0 * np.pi / self._options.directions if self._dim == 2 else 0.5
 
     # ---- descent -------------------------------------------------------------------------------
 
@@ -299,7 +282,7 @@ class ShockSearch:
             ends = np.cumsum([len(base) for base, _ in asked])
             for row, (base, shock), end in zip(going.tolist(), asked, ends.tolist(), strict=True):
                 own = slice(end - len(base), end)
-                size = np.where(code[own] == 1, self._settings.size(shock), np.inf)
+                size = np.where(code[own] == 1, self._size(shock), np.inf)
                 k = int(np.argmin(size))
                 if not size[k] < rays.high[row]:
                     angle[row] /= 3.0
@@ -316,7 +299,7 @@ class ShockSearch:
             drawn = self._rng.standard_normal((N_RANDOM, len(plane))) @ plane
             drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
             turned = unit / np.linalg.norm(unit) + angle * np.concatenate([plane, -plane, drawn])
-            units.append(self._settings.unit(turned))
+            units.append(self._unit(turned))
             bases.append(np.full(len(turned), base))
         if self._n_bases > 1:
             units.append(np.repeat(unit[None], 2, axis=0))
@@ -332,7 +315,7 @@ class ShockSearch:
         Half of them have any direction and base state. The others are near the best ray at all distances below its
         shock: where the boundary is fractal, thin parts of other basins lie there, which dividing a ray misses.
         """
-        n, least, dim = self._settings.confirmations, float(best.high[0]), self._dim
+        n, least, dim = self._options.confirmations, float(best.high[0]), self._dim
         base = np.concatenate([self._rng.integers(self._n_bases, size=n), np.full(n, best.base[0])])
         drawn = self._rng.standard_normal((2 * n, dim))
         if dim > 1:
@@ -341,9 +324,9 @@ class ShockSearch:
             drawn[n:] = best.unit[0] + turned[:, None] * drawn[n:]
         else:
             drawn[n:] = best.unit[0]
-        below = 10.0 ** self._rng.uniform(np.log10(self._settings.precision), BESIDE[1], n)
-        share = np.concatenate([self._rng.uniform(0.25, 1.0 - self._settings.precision, n), 1.0 - below])
-        unit, size = self._settings.unit(drawn), least * share
+        below = 10.0 ** self._rng.uniform(np.log10(PRECISION), BESIDE[1], n)
+        share = np.concatenate([self._rng.uniform(0.25, 1.0 - PRECISION, n), 1.0 - below])
+        unit, size = self._unit(drawn), least * share
         label, code = yield from self._ask(base, size[:, None] * unit)
         away = np.flatnonzero(code == 1)
         return _Rays(base[away], unit[away], np.zeros(len(away)), size[away], label[away])
@@ -353,7 +336,7 @@ class ShockSearch:
     def _found(self, best: _Rays | None) -> Found:
         """Return the best shock, with what was tried below it; without a ray, that none was found."""
         size, code = np.concatenate([np.zeros(0), *self._sizes]), np.concatenate([np.zeros(0, int), *self._codes])
-        low, high, shock, base, label = self._settings.largest, np.inf, np.full(self._dim, np.nan), -1, UNDECIDED
+        low, high, shock, base, label = self._options.largest, np.inf, np.full(self._dim, np.nan), -1, UNDECIDED
         if best is not None:
             low, high, base, label = float(best.low[0]), float(best.high[0]), int(best.base[0]), int(best.label[0])
             shock = high * best.unit[0]
@@ -383,16 +366,9 @@ class Bases:
 
 
 def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases: int) -> Bases:
-    """Sample the states on an attractor at equally spaced phases.
+    """Sample the states on an attractor at equally spaced phases of a drive period, or of the period of a flow's orbit.
 
-    Parameters
-    ----------
-    one
-        Attractor: variables of `match` without parameter dims and `attractor`.
-    parameters, frequency
-        Parameters of the point, and drive frequency [Hz].
-    n_phases
-        Number of phases in a drive period, or in the period of an orbit of a flow.
+    The attractor is given by the variables of `match` without parameter dims and `attractor`.
     """
     stored = one["attractor_points"].transpose("point", "state").values
     points = stored[np.isfinite(stored).all(axis=-1)]
@@ -430,75 +406,60 @@ def _sampled(parameters: Parameters, points: np.ndarray, period: float, n_phases
     return Bases(states.reshape(-1, points.shape[1]), np.tile(phase, n), at_section)
 
 
-class Shocked:
-    """Shocked trajectories at a parameter point: brings them to the next section, and tells where they end."""
+def labels_after(there: Destinations, states: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Return the label of the attractor on which each shocked trajectory ends; see `Destinations.follow`.
 
-    def __init__(self, destinations: Destinations) -> None:
-        self._destinations, self._point = destinations, destinations.point
-
-    def labels(self, states: np.ndarray, phase: np.ndarray) -> np.ndarray:
-        """Return the label of the attractor on which each trajectory ends; see `Destinations.follow`.
-
-        Parameters
-        ----------
-        states
-            Shocked states, shape (n, state).
-        phase
-            Share of the drive period at which each shock happens, shape (n,).
-        """
-        label = np.full(len(states), UNDECIDED, np.int64)
-        states, status = self._to_section(states, phase)
-        label[status == Status.DIVERGED] = DIVERGED
-        good = np.flatnonzero(status == Status.BOUNDED)
-        label[good] = self._destinations.follow(states[good]).label
-        return label
-
-    def _to_section(self, states: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate trajectories that start within a drive period to its end; return their states and status."""
-        states, status = states.copy(), np.full(len(states), int(Status.BOUNDED), np.int64)
-        rows = np.flatnonzero(phase > 0.0) if not self._point.can_rest else np.zeros(0, np.int64)
-        if not len(rows):
-            return states, status
+    Shocked states (n, state) have phases (n,), shares of the drive period. They are integrated to the next section
+    first.
+    """
+    states, label = states.copy(), np.full(len(states), UNDECIDED, np.int64)
+    status = np.full(len(states), int(Status.BOUNDED), np.int64)
+    rows = np.flatnonzero(phase > 0.0) if not there.point.can_rest else np.zeros(0, np.int64)
+    if len(rows):
         phases, piece = np.unique(phase[rows], return_inverse=True)
-        period, settings = 1.0 / self._point.frequency, self._destinations.settings
+        period = 1.0 / there.point.frequency
         found = sample(
-            self._point.integrates,
-            np.tile(self._point.packed, (len(rows), 1)),
+            there.point.integrates,
+            np.tile(there.point.packed, (len(rows), 1)),
             states[rows],
             [np.array([period * (1.0 - p)]) for p in phases],
             piece=piece,
             drives=[Drive(np.array([period]), start_s=float(p) * period) for p in phases],
-            rtol=settings.rtol,
-            atol=settings.atol,
+            rtol=there.settings.rtol,
+            atol=there.settings.atol,
         )
         states[rows], status[rows] = found.states[:, 0], found.status
-        return states, status
+    label[status == Status.DIVERGED] = DIVERGED
+    good = np.flatnonzero(status == Status.BOUNDED)
+    label[good] = there.follow(states[good]).label
+    return label
 
 
 @dataclass(frozen=True)
 class Asked:
     """A search for shocks, with the base states and the states that are shocked."""
 
-    search: Search  # see `shocks.ShockSearch.run`
+    search: Search  # see `ShockSearch.run`
     bases: Bases
     which: np.ndarray  # numbers of the shocked states
 
+    @classmethod
+    def of(
+        cls, own: int, bases: Bases, which: np.ndarray, options: ResilienceOptions, seeds: Seeds | None = None
+    ) -> Asked:
+        """Begin a search from the attractor with an id; see `ShockSearch`."""
+        return cls(ShockSearch(own, len(bases.states), len(which), options, seeds).run(), bases, which)
 
-def search_together(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, Found]:
-    """Run searches for shocks in step, so that their trajectories fill the engine's lanes together.
 
-    Returns
-    -------
-    dict
-        Result of each search.
-    """
-    n_followed = 0
+def search_together(asked: Mapping[K, Asked], there: Destinations) -> dict[K, Found]:
+    """Run searches for shocks in step, so that their trajectories fill the engine's lanes together."""
+    n_followed, scales = 0, np.asarray(there.geometry.scales)
 
-    def answer(trials: dict[str, Trials], results: Mapping[str, Found]) -> dict[str, np.ndarray]:
+    def answer(trials: dict[K, Trials], results: Mapping[K, Found]) -> dict[K, np.ndarray]:
         nonlocal n_followed
-        report(what, n_followed, 0)
+        report("trajectories after shocks", n_followed, 0)
         states, phase = zip(*(_states(trial, asked[key], scales) for key, trial in trials.items()), strict=True)
-        found = shocked.labels(np.concatenate(states), np.concatenate(phase))
+        found = labels_after(there, np.concatenate(states), np.concatenate(phase))
         n_followed += len(found)
         ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
         return dict(zip(trials, np.split(found, ends), strict=True))

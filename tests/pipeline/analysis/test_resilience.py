@@ -11,10 +11,11 @@ from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.resilience.analysis import resilience_table
 from pipeline.analysis.resilience.edge import edge_table
-from pipeline.analysis.resilience.shocks import Asked, Bases, Settings, Shocked, ShockSearch, search_together
+from pipeline.analysis.resilience.shocks import Asked, Bases, search_together
 from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.plots.basins import plot_edge
 from pipeline.plots.resilience import plot_resilience
+from pipeline.products.resilience import ResilienceOptions
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 from tests.core.cells import scipy_end
@@ -218,11 +219,9 @@ def test_shocks__magnetic_pendulum_as_published(magnets):
     there = at_point(magnets)
     resting = np.array([one.state for one in there.point.equilibria])
     place, own = np.array([1.0, 0.0, 0.0, 0.0]), int(np.argmax(resting[:, 0]))
-    settings = Settings(2.0, 64, "euclidean", 1e-6, 256, 0)
     for state, least in ((place, 0.3923), (resting[own], 0.40204)):
         bases, which = Bases(state[None], np.zeros(1), np.ones(1, bool)), np.array([0, 1])
-        search = ShockSearch(own, 1, 2, settings)
-        one = search_together({"it": Asked(search.run(), bases, which)}, Shocked(there), np.ones(4), "")["it"]
+        one = search_together({"it": Asked.of(own, bases, which, ResilienceOptions())}, there)["it"]
         assert one.high == pytest.approx(least, abs=1e-4)
         assert one.to in {0, 1, 2} - {own}
     # Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above

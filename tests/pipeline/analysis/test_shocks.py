@@ -4,20 +4,17 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.destinations import UNDECIDED
-from pipeline.analysis.resilience.shocks import Settings, ShockSearch, Trials
+from pipeline.analysis.resilience.shocks import ShockSearch, Trials
+from pipeline.products.resilience import ResilienceOptions
 
 OWN, OTHER = 0, 4
 NORMAL = np.array([0.36, -0.48, 0.8])
 
 
-def settings(**changes):
-    given = {"largest": 2.0, "directions": 32, "norm": "euclidean", "precision": 1e-6, "confirmations": 128, "seed": 0}
-    return Settings(**{**given, **changes})
-
-
 def found(label_of, dim, n_bases=1, seeds=None, **changes):
     """Result of a search whose trials a function of base and shock labels; and all shocks that were tried."""
-    search, tried = ShockSearch(OWN, n_bases, dim, settings(**changes), seeds).run(), []
+    options = ResilienceOptions(**{"directions": 32, "confirmations": 128, **changes})
+    search, tried = ShockSearch(OWN, n_bases, dim, options, seeds).run(), []
     trials = next(search)
     while True:
         tried.append(trials)
