@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,12 +41,11 @@ def needs_drift(run: OpenRun, options: TippingOptions) -> None:
     spec = run.spec
     total = spec.integration.n_transient + spec.integration.n_keep
     packed, frequency = _cells(run)
-    late = ends_s(spec, packed, frequency) * frequency > total * (1.0 + 1e-9)
-    if late.any():
-        needed = int(np.ceil((ends_s(spec, packed, frequency) * frequency).max() - 1e-9))
+    last = (ends_s(spec, packed, frequency) * frequency).max()
+    if last > total * (1.0 + 1e-9):
         raise ValueError(
-            f"the run ends after {total} periods, while its parameters move until period {needed}; raise "
-            "integration.n_transient or n_keep."
+            f"the run ends after {total} periods, while its parameters move until period {int(np.ceil(last - 1e-9))}; "
+            "raise integration.n_transient or n_keep."
         )
     if axis_name(options.parameter) not in run.cube()["status"].dims and spec.axes:
         raise ValueError(f"{options.parameter} is not an axis of this run; its axes: {', '.join(spec.axes)}.")
@@ -67,29 +67,19 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     for group, own in zip(groups, ids, strict=True):
         outcome[group.cells] = [own.get(int(o), int(o)) for o in group.outcome]
     outcome = outcome.reshape(shape)
-    result = xr.Dataset(table).assign(
-        outcome=(
-            order,
-            outcome.astype(np.int32),
-            {"units": "1", "long_name": "attractor reached, -2 diverged, -1 none"},
-        )
-    )
+    about = {"units": "1", "long_name": "attractor reached, -2 diverged, -1 none"}
+    result = xr.Dataset({**table, "outcome": (order, outcome.astype(np.int32), about)})
     result = result.assign_coords({k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)})
     axis = parameter_name(options.parameter)
+    others = tuple(name for name in run.spec.axes if name != axis)
     brackets: list[Bracket] = []
     whole: list[Bracket] = []
     if axis in run.spec.axes and len(run.spec.axes[axis].array()) > 1:
-        whole = _brackets(run, axis, outcome, dims)
-        brackets = Bisection(run, axis, _others(run, axis), groups, ids, options).run_all(whole[: options.brackets])
-    unit = _unit(run, axis)
-    result = result.assign(_of_brackets(brackets, axis, _others(run, axis), unit))
+        whole = _brackets(run, axis, others, outcome, dims)
+        brackets = Bisection(run, axis, others, groups, ids, options).run_all(whole[: options.brackets])
+    unit = "Hz" if axis == FREQUENCY else model.parameter(axis).unit
     attrs = {"model": model_attribute(model), **drift_attributes(model), "parameter": axis, "n_brackets": len(whole)}
-    return result.assign_attrs(attrs)
-
-
-def _unit(run: OpenRun, axis: str) -> str:
-    """Return the unit of a swept number."""
-    return "Hz" if axis == FREQUENCY else run.spec.model.parameter(axis).unit
+    return result.assign(_of_brackets(brackets, axis, others, unit)).assign_attrs(attrs)
 
 
 def _cells(run: OpenRun) -> tuple[np.ndarray, np.ndarray]:
@@ -99,68 +89,49 @@ def _cells(run: OpenRun) -> tuple[np.ndarray, np.ndarray]:
     return inputs.parameters[:, 0], inputs.frequency_hz[:, 0]
 
 
-def _others(run: OpenRun, axis: str) -> tuple[str, ...]:
-    return tuple(name for name in run.spec.axes if name != axis)
-
-
 def _numbered(groups: list[Group]) -> tuple[list[dict[int, int]], dict[str, Any]]:
     """Number the attractors of all groups, and return the numbers by group with a table of the attractors."""
     ids: list[dict[int, int]] = []
-    rows: list[dict[str, Any]] = []
+    rows: list[tuple[int, int, xr.Dataset]] = []
     for number, group in enumerate(groups):
-        own: dict[int, int] = {}
-        reached = sorted({int(o) for o in group.outcome if o >= 0})
-        for local in reached:
+        ids.append({})
+        for local in sorted({int(o) for o in group.outcome if o >= 0}):
             assert group.ids is not None
-            one = group.ids.isel(attractor=local)
-            own[local] = len(rows)
-            rows.append(
-                {
-                    "group": number,
-                    "kind": words_of(one["kind"])[int(one["kind"])],
-                    "period": int(one["orbit_period"]),
-                    "n_cells": int((group.outcome == local).sum()),
-                    "point": one["attractor_points"].values[0],
-                }
-            )
-        ids.append(own)
-    states = groups[0].final.parameters.model.state_names
-    empty = np.zeros((0, len(states)))
-    table = {
-        "attractor_kind": ("attractor", np.array([r["kind"] for r in rows], dtype="U32")),
-        "attractor_period": ("attractor", np.array([r["period"] for r in rows], np.int32), {"units": "1"}),
-        "attractor_group": ("attractor", np.array([r["group"] for r in rows], np.int32), {"units": "1"}),
-        "attractor_n_cells": ("attractor", np.array([r["n_cells"] for r in rows], np.int64), {"units": "1"}),
-        "attractor_point": (("attractor", "state"), np.array([r["point"] for r in rows]) if rows else empty),
-        "final_parameters": ("group", np.array([_sentence(g, groups) for g in groups], dtype=str)),
+            ids[-1][local] = len(rows)
+            rows.append((number, int((group.outcome == local).sum()), group.ids.isel(attractor=local)))
+    kinds = [words_of(one["kind"])[int(one["kind"])] for *_, one in rows]
+    points = [one["attractor_points"].values[0] for *_, one in rows]
+    n_states = len(groups[0].final.parameters.model.state_names)
+    pure = {"units": "1"}
+    return ids, {
+        "attractor_kind": ("attractor", np.array(kinds, dtype="U32")),
+        "attractor_period": ("attractor", np.array([int(one["orbit_period"]) for *_, one in rows], np.int32), pure),
+        "attractor_group": ("attractor", np.array([number for number, *_ in rows], np.int32), pure),
+        "attractor_n_cells": ("attractor", np.array([n for _, n, _ in rows], np.int64), pure),
+        "attractor_point": (("attractor", "state"), np.reshape(points, (len(rows), n_states))),
+        "final_parameters": ("group", np.array(_sentences(groups), dtype=str)),
     }
-    return ids, {name: xr.Variable(*entry) for name, entry in table.items()}
 
 
-def _sentence(group: Group, groups: list[Group]) -> str:
-    """Return the final parameters that distinguish a group, as a text; empty if there is one group."""
-    parts = []
+def _sentences(groups: list[Group]) -> list[str]:
+    """Return the final parameters that distinguish each group, as texts; empty if there is one group."""
     values = [{**g.final.parameters, "frequency_hz": g.final.frequency_hz} for g in groups]
-    own = {**group.final.parameters, "frequency_hz": group.final.frequency_hz}
-    for name, value in own.items():
-        if len({v[name] for v in values}) > 1:
-            parts.append(f"{name} = {value:g}")
-    return ", ".join(parts)
+    differ = [name for name in values[0] if len({own[name] for own in values}) > 1]
+    return [", ".join(f"{name} = {own[name]:g}" for name in differ) for own in values]
 
 
-def _brackets(run: OpenRun, axis: str, outcome: np.ndarray, dims: tuple[str, ...]) -> list[Bracket]:
+def _brackets(
+    run: OpenRun, axis: str, others: tuple[str, ...], outcome: np.ndarray, dims: tuple[str, ...]
+) -> list[Bracket]:
     """Return the intervals of the swept number in which cells change their attractor."""
-    at = [parameter_name(d) for d in dims].index(axis)
-    values = run.spec.axes[axis].array()
-    others = [run.spec.axes[name].array() for name in _others(run, axis)]
-    moved = np.moveaxis(outcome, at, -1)
-    n_points = tuple(len(o) for o in others)
-    flat = moved.reshape(*n_points, -1, len(values))
+    values, *beside = (run.spec.axes[name].array() for name in (axis, *others))
+    moved = np.moveaxis(outcome, [parameter_name(d) for d in dims].index(axis), -1)
+    flat = moved.reshape(*(len(o) for o in beside), -1, len(values))
     found = []
     for *point, start in np.ndindex(flat.shape[:-1]):
         row = flat[(*point, start)]
-        for a, b in brackets_of(values, row):
-            here = tuple(float(o[i]) for o, i in zip(others, point, strict=True))
+        here = tuple(float(o[i]) for o, i in zip(beside, point, strict=True))
+        for a, b in brackets_of(row):
             found.append(Bracket(start, here, float(values[a]), float(values[b]), int(row[a]), int(row[b])))
     return found
 
@@ -172,7 +143,7 @@ def _of_brackets(brackets: list[Bracket], axis: str, others: tuple[str, ...], un
         return xr.Variable("critical", np.array(values, dtype), {"units": units, "long_name": long_name})
 
     found = {
-        "critical_value": column([0.5 * (b.low + b.high) for b in brackets], "float64", f"critical {axis}", unit),
+        "critical_value": column([b.middle for b in brackets], "float64", f"critical {axis}", unit),
         "critical_low": column([b.low for b in brackets], "float64", "last value with the first attractor", unit),
         "critical_high": column([b.high for b in brackets], "float64", "first value with the second one", unit),
         "critical_from": column([b.outcome_low for b in brackets], "int32", "attractor below, -2 diverged"),
@@ -208,9 +179,7 @@ def tipping_table(ds: xr.Dataset) -> Table:
 def _row(one: xr.Dataset) -> Row:
     row: Row = {
         "start": int(one["critical_start"]),
-        "value": float(one["critical_value"]),
-        "low": float(one["critical_low"]),
-        "high": float(one["critical_high"]),
+        **{name: float(one[f"critical_{name}"]) for name in ("value", "low", "high")},
         "from": outcome_word(int(one["critical_from"])),
         "to": outcome_word(int(one["critical_to"])),
         "n_evaluated": int(one["critical_n_evaluated"]),
@@ -236,47 +205,41 @@ def _words(row: Row, unit: str) -> dict[str, str | None]:
 
 
 def _attractors(ds: xr.Dataset) -> list[dict[str, str | None]]:
-    words = []
-    for i in range(ds.sizes["attractor"]):
-        one = ds.isel(attractor=i)
-        at = str(ds["final_parameters"].values[int(one["attractor_group"])])
-        states = ", ".join(f"{x:.6g}" for x in np.atleast_1d(one["attractor_point"].values))
-        words.append(
-            {
-                "letter": letter(i),
-                "kind": plain(str(one["attractor_kind"].values)),
-                "period": str(int(one["attractor_period"]) or "-"),
-                "cells": str(int(one["attractor_n_cells"])),
-                "a section point": f"({states})",
-                "at": at or None,
-            }
-        )
-    return words
+    names = ("attractor_kind", "attractor_period", "attractor_n_cells", "attractor_point", "attractor_group")
+    return [
+        {
+            "letter": letter(i),
+            "kind": plain(kind),
+            "period": str(period or "-"),
+            "cells": str(n),
+            "a section point": f"({', '.join(f'{x:.6g}' for x in point)})",
+            "at": str(ds["final_parameters"].values[group]) or None,
+        }
+        for i, (kind, period, n, point, group) in enumerate(zip(*(ds[k].values.tolist() for k in names), strict=True))
+    ]
 
 
 def _counts(ds: xr.Dataset) -> list[str]:
     """Return the lines with the numbers of cells on each attractor, per value of the swept number."""
     dim = axis_name(str(ds.attrs["parameter"]))
-    dims, _ = split_dims(ds["outcome"])
     outcome = ds["outcome"]
     seen = sorted({int(o) for o in np.unique(outcome.values)}, key=lambda o: (o < 0, o))
-    if dim not in dims:
+    if dim not in outcome.dims:
         counts = ", ".join(f"{outcome_word(o)} {int((outcome == o).sum())}" for o in seen)
         return [f"cells: {counts}"]
-    values = ds[dim].values
     rows: list[dict[str, Any]] = []
-    for i, value in enumerate(values):
+    for i, value in enumerate(ds[dim].values):
         here = outcome.isel({dim: i}).values
         found = {outcome_word(o): str(int((here == o).sum())) for o in seen}
         if rows and [rows[-1][word] for word in found] == list(found.values()):
             rows[-1]["to"] = value
             continue
         rows.append({"from": value, **found, "to": value})
-    head = f"{dim}{unit_of(ds, dim)}"
     words = []
     for row in rows:
         first, last = row.pop("from"), row.pop("to")
-        words.append({head: f"{first:g}" if first == last else f"{first:g} to {last:g}", **row})
+        text = f"{first:g}" if first == last else f"{first:g} to {last:g}"
+        words.append({f"{dim}{unit_of(ds, dim)}": text, **row})
     return ["cells on each", *aligned(words)]
 
 
@@ -295,48 +258,32 @@ class Bracket:
     n_evaluated: int = 0  # trajectories integrated by the bisection
     is_decided: bool = True  # false if the bisection met a trajectory whose attractor could not be found
 
-    def halved(self, middle: float, outcome: int) -> Bracket:
-        """Return the half at whose ends the outcomes differ, the lower one if both do."""
+    @property
+    def middle(self) -> float:
+        """Middle of the interval."""
+        return 0.5 * (self.low + self.high)
+
+    def halved(self, outcome: int) -> Bracket:
+        """Return the half at whose ends the outcomes differ, the lower one if both do, by the outcome in the middle."""
         n = self.n_evaluated + 1
         if outcome == NONE:
             return replace(self, n_evaluated=n, is_decided=False)
         if outcome == self.outcome_low:
-            return replace(self, low=middle, n_evaluated=n)
-        return replace(self, high=middle, outcome_high=outcome, n_evaluated=n)
+            return replace(self, low=self.middle, n_evaluated=n)
+        return replace(self, high=self.middle, outcome_high=outcome, n_evaluated=n)
 
 
-def brackets_of(values: np.ndarray, outcomes: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of neighbouring known outcomes that differ, as indices of the swept values.
-
-    Parameters
-    ----------
-    values
-        Of the swept number, rising, shape (n,).
-    outcomes
-        At these values, shape (n,); `NONE` where nothing is known.
-    """
+def brackets_of(outcomes: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs of indices of neighbouring known outcomes that differ; `NONE` is not known."""
     known = np.flatnonzero(outcomes != NONE)
-    pairs = zip(known[:-1].tolist(), known[1:].tolist(), strict=True)
-    return [(a, b) for a, b in pairs if outcomes[a] != outcomes[b]]
+    return [(a, b) for a, b in pairwise(known.tolist()) if outcomes[a] != outcomes[b]]
 
 
 class Bisection:
-    """A bisection of many brackets at the same time.
+    """A bisection of many brackets of a run's swept number at the same time.
 
-    Parameters
-    ----------
-    run
-        Run whose parameters move.
-    axis
-        Name of the swept number.
-    others
-        Names of the other swept parameters, in the order of `Bracket.point`.
-    groups
-        What is known of the run's own cells, see `endings`.
-    ids
-        For each group the numbers that its attractors have in the brackets.
-    options
-        Width and lengths.
+    The others are the names of the other swept parameters, in the order of `Bracket.point`. Groups tell what is known
+    of the run's own cells (see `endings`), and ids the numbers that the attractors of each have in the brackets.
     """
 
     def __init__(
@@ -350,8 +297,7 @@ class Bisection:
     ) -> None:
         self.run, self.axis, self.others, self.options = run, axis, others, options
         self.starts = initial_states(run.spec.initial_conditions)
-        span = run.spec.axes[axis].array()
-        self.width = options.width * float(np.ptp(span))
+        self.width = options.width * float(np.ptp(run.spec.axes[axis].array()))
         self.known = {
             group.final.key: (group.final, *_examples(group, own)) for group, own in zip(groups, ids, strict=True)
         }
@@ -364,25 +310,22 @@ class Bisection:
             if not open_:
                 break
             report("bisecting", step, MOST_STEPS)
-            middles = np.array([0.5 * (found[i].low + found[i].high) for i in open_])
-            outcomes = self._outcomes([found[i] for i in open_], middles)
-            for i, middle, outcome in zip(open_, middles.tolist(), outcomes.tolist(), strict=True):
-                found[i] = found[i].halved(middle, outcome)
+            for i, outcome in zip(open_, self._outcomes([found[i] for i in open_]).tolist(), strict=True):
+                found[i] = found[i].halved(outcome)
         return found
 
     def _is_open(self, bracket: Bracket) -> bool:
-        middle = 0.5 * (bracket.low + bracket.high)
-        is_wide = bracket.high - bracket.low > self.width and bracket.low < middle < bracket.high
+        is_wide = bracket.high - bracket.low > self.width and bracket.low < bracket.middle < bracket.high
         return bracket.is_decided and is_wide
 
-    def _outcomes(self, brackets: list[Bracket], middles: np.ndarray) -> np.ndarray:
-        """Return the attractors that trajectories reach with given values of the swept number."""
+    def _outcomes(self, brackets: list[Bracket]) -> np.ndarray:
+        """Return the attractors that trajectories reach in the middles of brackets."""
         spec = self.run.spec
         names = spec.values.names
         packed = np.tile(spec.values.pack(), (len(brackets), 1))
         frequency = np.full(len(brackets), np.nan if spec.frequency_hz is None else spec.frequency_hz)
         for i, bracket in enumerate(brackets):
-            here = {self.axis: middles[i], **dict(zip(self.others, bracket.point, strict=True))}
+            here = {self.axis: bracket.middle, **dict(zip(self.others, bracket.point, strict=True))}
             frequency[i] = here.pop(FREQUENCY, frequency[i])
             for name, value in here.items():
                 packed[i, names.index(name)] = value

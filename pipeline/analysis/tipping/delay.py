@@ -11,7 +11,8 @@ import xarray as xr
 from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, aligned, counted, number, unit_of
+from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tabular import Row, aligned, at_point, counted, number, points_of
 from pipeline.layout.cells import at_section
 from pipeline.layout.vocabulary import drift_attributes, model_attribute, model_of, split_dims
 from pipeline.products.product import Table
@@ -21,47 +22,22 @@ from pipeline.products.tipping import DelayOptions
 def lags(section: np.ndarray, period: int, model: Model) -> np.ndarray:
     """Return the distance of each section from the one `period` sections before, in units of the states' scales.
 
-    Parameters
-    ----------
-    section
-        Shape (..., n_keep, n_states).
-    period
-        Lag [sections].
-    model
-        Says which states are angles, and their scales.
-
-    Returns
-    -------
-    ndarray, (..., n_keep)
-        NaN for the first `period` sections.
+    Sections have the shape (..., n_keep, n_states). NaN for the first `period` of them.
     """
     found = np.full(section.shape[:-1], np.nan)
-    step = np.abs(section[..., period:, :] - section[..., :-period, :])
-    angles = np.array(model.is_angle)
-    step = np.where(angles, np.minimum(step, np.abs(2.0 * np.pi - step)), step)
-    found[..., period:] = (step / np.array(model.scales)).max(axis=-1)
+    geometry = Geometry(tuple(model.is_angle), tuple(model.scales))
+    found[..., period:] = geometry.distance(section[..., period:, :], section[..., :-period, :])
     return found
 
 
 def left_at(lag: np.ndarray, distance: float) -> np.ndarray:
     """Return the index at which a trajectory has left an orbit: the first lag above a distance after one below it.
 
-    Parameters
-    ----------
-    lag
-        See `lags`; shape (..., n_keep).
-    distance
-        Bound of the lags on the orbit.
-
-    Returns
-    -------
-    ndarray of int, (...)
-        -1 if the trajectory was never on such an orbit, or does not leave it.
+    -1 if the trajectory was never on such an orbit, or does not leave it. Lags (..., n_keep) are those of `lags`.
     """
     with np.errstate(invalid="ignore"):
         near, far = lag <= distance, lag > distance
-    been = np.maximum.accumulate(near, axis=-1)
-    leaves = far & been
+    leaves = far & np.maximum.accumulate(near, axis=-1)
     return np.where(leaves.any(axis=-1), leaves.argmax(axis=-1), -1)
 
 
@@ -78,13 +54,7 @@ def needs_sections(run: OpenRun, options: DelayOptions) -> None:
 
 
 def moving_parameter(ramps: Sequence[Ramp], wanted: str) -> str:
-    """Return the moving parameter that is meant: the one that is named, or the only one.
-
-    Raises
-    ------
-    ValueError
-        If it does not move, or several do.
-    """
+    """Return the moving parameter that is named, or the only one; raise ValueError if there is none."""
     names = [ramp.parameter for ramp in ramps]
     if not names:
         raise ValueError("no parameter moves in this run; give its specification a table [drift.NAME].")
@@ -103,56 +73,39 @@ def delay(run: OpenRun, options: DelayOptions) -> xr.Dataset:
     order = (*dims, *starts)
     section = cube["section"].transpose(*order, "period_index", "state").values
     at = left_at(lags(section, options.period, model), options.distance)
-    values = (
-        cube[at_section(name)].broadcast_like(cube["section"].isel(state=0)).transpose(*order, "period_index").values
-    )
-    left = np.take_along_axis(values, np.maximum(at, 0)[..., None], axis=-1)[..., 0]
+    values = cube[at_section(name)].broadcast_like(cube["section"].isel(state=0)).transpose(*order, "period_index")
+    left = np.take_along_axis(values.values, np.maximum(at, 0)[..., None], axis=-1)[..., 0]
+    left = np.where(at >= 0, left, np.nan)
     unit = model.parameter(name).unit
-    result = xr.Dataset(
-        {
-            "left": (order, np.where(at >= 0, left, np.nan), {"units": unit, "long_name": f"{name} where it leaves"}),
-            "left_index": (
-                order,
-                at.astype(np.int32),
-                {"units": "1", "long_name": "section at which it leaves, or -1"},
-            ),
-        }
-    )
-    attrs: dict[str, Any] = {
-        "model": model_attribute(model),
-        **drift_attributes(model),
-        "moving": name,
-        "period": options.period,
-        "distance": options.distance,
+    variables: dict[str, Any] = {
+        "left": (order, left, {"units": unit, "long_name": f"{name} where it leaves"}),
+        "left_index": (order, at.astype(np.int32), {"units": "1", "long_name": "section at which it leaves, or -1"}),
     }
+    attrs: dict[str, Any] = {"model": model_attribute(model), **drift_attributes(model)}
+    attrs |= {"moving": name, "period": options.period, "distance": options.distance}
     if options.static is not None:
         attrs["static"] = options.static
-        result["delay"] = (order, result["left"].values - options.static, {"units": unit, "long_name": "left - static"})
-    coords = {k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)}
-    return result.assign_coords(coords).assign_attrs(attrs)
+        variables["delay"] = (order, left - options.static, {"units": unit, "long_name": "left - static"})
+    return xr.Dataset(variables, {k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)}, attrs)
 
 
 def delay_table(ds: xr.Dataset) -> Table:
     """Return a row per parameter point: the range of the values at which its cells leave the orbit."""
     dims, _ = split_dims(ds["left"])
     rows: list[Row] = []
-    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
-        one = ds.isel(dict(zip(dims, index, strict=True)))
-        left = one["left"].values.ravel()
+    for at, where in points_of(ds, dims):
+        left = ds["left"].isel(at).values.ravel()
         known = left[np.isfinite(left)]
-        row: Row = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
-        row |= {"n_cells": left.size, "n_left": len(known)}
-        row |= {
-            k: float(f(known)) if len(known) else np.nan
-            for k, f in (("low", np.min), ("median", np.median), ("high", np.max))
-        }
+        row: Row = {**where, "n_cells": left.size, "n_left": len(known)}
+        for key, summary in (("low", np.min), ("median", np.median), ("high", np.max)):
+            row[key] = float(summary(known)) if len(known) else np.nan
         if "static" in ds.attrs:
             row["delay"] = row["median"] - float(ds.attrs["static"])
         rows.append(row)
     name = str(ds.attrs["moving"])
     words = [
         {
-            **{f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims},
+            **at_point(ds, row, dims),
             "cells": str(row["n_cells"]),
             "leave": str(row["n_left"]),
             f"at {name}": number(row["median"], ".6g"),

@@ -11,12 +11,12 @@ import xarray as xr
 
 from magpend_core import Status
 from magpend_core.models.drift.ramps import motions_of
-from magpend_core.models.model import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.outcomes import DIVERGED, outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
-from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute
 from pipeline.motion.steady import Inputs, Steady
 from pipeline.products.tipping import TippingOptions
 from pipeline.specification.spec import Spec
@@ -41,30 +41,15 @@ class Final:
 
 
 def finals_of(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> list[Final]:
-    """Return the final parameters of cells.
-
-    Parameters
-    ----------
-    spec
-        Specification of a run whose parameters move.
-    packed
-        Parameters of the run, shape (cell, n_parameters).
-    frequency_hz
-        Shape (cell,).
-    """
-    names, still = spec.values.names, spec.model.still  # type: ignore[attr-defined]
-    motions = motions_of(spec.ramps, names, packed, frequency_hz)
-    known: dict[bytes, Final] = {}
-    found = []
-    for cell, row in enumerate(packed):
-        values = dict(zip(names, row.tolist(), strict=True))
-        values |= {m.ramp.parameter: float(m.end[cell]) for m in motions}
-        own = {name: values[name] for name in still.parameter_names}
-        key = np.array([*own.values(), frequency_hz[cell]]).tobytes()
-        if key not in known:
-            known[key] = Final(Parameters(still, own), float(frequency_hz[cell]))
-        found.append(known[key])
-    return found
+    """Return the final parameters of cells of a run, from their own (cell, n_parameters) and their frequencies."""
+    still: Model = spec.model.still  # type: ignore[attr-defined]
+    ends = {m.ramp.parameter: m.end for m in motions_of(spec.ramps, spec.values.names, packed, frequency_hz)}
+    own = dict(zip(spec.values.names, packed.T, strict=True)) | ends
+    rows = np.column_stack([*(own[name] for name in still.parameter_names), frequency_hz])
+    distinct, which = np.unique(rows, axis=0, return_inverse=True)
+    values = [(dict(zip(still.parameter_names, row, strict=False)), row[-1]) for row in distinct.tolist()]
+    finals = [Final(Parameters(still, given), frequency) for given, frequency in values]
+    return [finals[k] for k in which.ravel()]
 
 
 def ends_s(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarray:
@@ -90,18 +75,7 @@ def endings(
 ) -> Iterator[Group]:
     """Integrate cells on at their final parameters, and find the attractors on which they end.
 
-    Parameters
-    ----------
-    run
-        Run whose parameters move.
-    finals
-        Final parameters of each cell.
-    states
-        Last sections, shape (cell, n_states).
-    status
-        Codes of `Status`, shape (cell,).
-    options
-        Lengths of the integration.
+    Finals, last sections (cell, n_states) and codes of `Status` are those of the cells.
     """
     keys = [final.key for final in finals]
     for key in dict.fromkeys(keys):
@@ -130,18 +104,8 @@ def _going_on(run: OpenRun, final: Final, states: np.ndarray, options: TippingOp
     data["section"] = ((START, "period_index", "state"), found.section[:, 0])
     if model.angles:
         data["turns"] = ((START, model.angle_dim), found.turns[:, 0])
-    attrs = {
-        **run.spec.integration.model_dump(),
-        **length,
-        "kind": "sweep",
-        "model": model_attribute(model),
-        "parameters": "\n".join(f"{k} = {v!r}" for k, v in final.parameters.items()),
-    }
-    coords = {
-        "state": list(model.state_names),
-        "state_units": ("state", list(model.state_units)),
-        FREQUENCY_DIM: final.frequency_hz,
-    }
-    ds = xr.Dataset(data, coords=coords, attrs=attrs)
-    assert parameters_of(ds) == final.parameters
-    return ds
+    attrs = {**run.spec.integration.model_dump(), **length, "kind": "sweep", "model": model_attribute(model)}
+    attrs["parameters"] = "\n".join(f"{k} = {v!r}" for k, v in final.parameters.items())
+    units = ("state", list(model.state_units))
+    coords = {"state": list(model.state_names), "state_units": units, FREQUENCY_DIM: final.frequency_hz}
+    return xr.Dataset(data, coords=coords, attrs=attrs)

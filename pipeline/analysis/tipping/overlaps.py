@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
@@ -10,7 +12,7 @@ from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import choose, place
+from pipeline.analysis.selection import choose, place, start_dims
 from pipeline.analysis.tabular import Row, aligned, with_interval
 from pipeline.analysis.tipping.analysis import outcome_word
 from pipeline.layout.vocabulary import axis_name
@@ -23,26 +25,9 @@ UNKNOWN = -1
 def overlap_counts(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Count the initial states in the overlap of each basin before with each basin after a change.
 
-    Parameters
-    ----------
-    before, after
-        Labels of the same initial states, arrays of one shape; -1 for states without an outcome, which are left out.
-
-    Returns
-    -------
-    labels_before, labels_after : ndarray of int
-        The labels that occur, rising.
-    counts : ndarray of int, (len(labels_before), len(labels_after))
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ.
+    Labels before and after are those of the same initial states; states with a label -1, without an outcome, are left
+    out. Returns the labels that occur before and after, rising, and the counts (before, after).
     """
-    if before.shape != after.shape:
-        raise ValueError(
-            f"basins of shapes {before.shape} and {after.shape} have no overlap; they need the same starts."
-        )
     known = (before != UNKNOWN) & (after != UNKNOWN)
     first, i = np.unique(before[known], return_inverse=True)
     last, j = np.unique(after[known], return_inverse=True)
@@ -70,42 +55,29 @@ def overlaps(run: OpenRun, options: OverlapOptions) -> xr.Dataset:
     """
     found = dense(run.derive("attractors"))
     axis = axis_name(options.parameter)
-    labels = outcomes(found)
-    whole = found.assign(outcome=labels)
-    part = choose(whole, options.at, (axis, *_start_dims(labels)), "overlaps are those of one parameter point")
+    whole = found.assign(outcome=outcomes(found))
+    part = choose(whole, options.at, (axis, *start_dims(found)), "overlaps are those of one parameter point")
     before, after = (
         part["outcome"].isel({axis: place(part[axis], value)}).values for value in (options.before, options.after)
     )
     first, last, counts = overlap_counts(before, after)
     total = counts.sum(axis=1, keepdims=True)
     low, high = binomial_interval(counts, np.broadcast_to(total, counts.shape), confidence=options.confidence)
-    dims = ("before", "after")
+    columns = {
+        "count": (counts, "starts in both basins"),
+        "probability": (counts / np.maximum(total, 1), "tipping probability"),
+        "low": (low, "lower end of the interval"),
+        "high": (high, "upper end of the interval"),
+    }
     one = {"units": "1"}
-    return xr.Dataset(
-        {
-            "count": (dims, counts, {**one, "long_name": "starts in both basins"}),
-            "probability": (dims, counts / np.maximum(total, 1), {**one, "long_name": "tipping probability"}),
-            "low": (dims, low, {**one, "long_name": "lower end of the interval"}),
-            "high": (dims, high, {**one, "long_name": "upper end of the interval"}),
-            "n_unknown": ((), int(((before == UNKNOWN) | (after == UNKNOWN)).sum()), one),
-        },
-        coords={
-            "before": ("before", first, {**one, "long_name": "attractor before, -2 diverges"}),
-            "after": ("after", last, {**one, "long_name": "attractor after, -2 diverges"}),
-        },
-        attrs={
-            "parameter": axis,
-            "value_before": options.before,
-            "value_after": options.after,
-            "confidence": options.confidence,
-        },
-    )
-
-
-def _start_dims(labels: xr.DataArray) -> tuple[str, ...]:
-    from pipeline.layout.vocabulary import split_dims
-
-    return split_dims(labels)[1]
+    variables: dict[str, Any] = {n: (("before", "after"), v, {**one, "long_name": t}) for n, (v, t) in columns.items()}
+    variables["n_unknown"] = ((), int(((before == UNKNOWN) | (after == UNKNOWN)).sum()), one)
+    coords = {
+        "before": ("before", first, {**one, "long_name": "attractor before, -2 diverges"}),
+        "after": ("after", last, {**one, "long_name": "attractor after, -2 diverges"}),
+    }
+    attrs = {"parameter": axis, "value_before": options.before, "value_after": options.after}
+    return xr.Dataset(variables, coords, {**attrs, "confidence": options.confidence})
 
 
 def overlaps_table(ds: xr.Dataset) -> Table:
@@ -113,14 +85,9 @@ def overlaps_table(ds: xr.Dataset) -> Table:
     rows: list[Row] = []
     for i, j in np.ndindex(ds["count"].shape):
         one = ds.isel(before=i, after=j)
-        rows.append(
-            {
-                "before": outcome_word(int(one["before"])),
-                "after": outcome_word(int(one["after"])),
-                "count": int(one["count"]),
-                **{name: float(one[name]) for name in ("probability", "low", "high")},
-            }
-        )
+        row: Row = {name: outcome_word(int(one[name])) for name in ("before", "after")}
+        row |= {"count": int(one["count"]), **{name: float(one[name]) for name in ("probability", "low", "high")}}
+        rows.append(row)
     words = [
         {
             "before": row["before"],
