@@ -116,7 +116,9 @@ Stop = Callable[[list[Point]], str]
 """A check of the points so far; it returns the reason to end the trace, or an empty text."""
 
 
-def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, between: Between) -> Steps[Trace]:
+def trace(
+    problem: Problem, start: Point, settings: Settings, stop: Stop | None = None, between: Between | None = None
+) -> Steps[Trace]:
     """Follow a solution curve from a start point along its tangent.
 
     `between` may refuse a step, which is then tried with half the length; `stop` is asked after every
@@ -128,14 +130,15 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
         here = found.points[-1]
         guess = _ahead(found.points, step)
         there = yield from correct(problem, guess, here.tangent, settings)
-        if there is None or not _is_near(here, there, step, settings) or not (yield from between(here, there)):
+        is_near = there is not None and _is_near(here, there, step, settings)
+        if there is None or not is_near or (between and not (yield from between(here, there))):
             step *= 0.5
             if step < settings.shortest_step:
                 found.end = "stuck"
                 return found
             continue
         found.points.append(there)
-        found.end = stop(found.points)
+        found.end = stop(found.points) if stop else ""
         if found.end:
             return found
         if there.n_iterations <= 3:

@@ -13,7 +13,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct
 from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstable, settle_sides
 from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem
+from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem, Problem
 
 ENDS = (
     *("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section"),
@@ -173,7 +173,7 @@ def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
     return family.state(u), float(family.values(u)[0])
 
 
-def first_point(problem: OneParameter, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+def first_point(problem: Problem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     """Refine an orbit at a fixed parameter value, and direct its tangent to rising parameter values."""
     normal = np.zeros(problem.size)
     normal[-1] = 1.0

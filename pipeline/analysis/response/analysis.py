@@ -70,14 +70,10 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     base = parameters_of(run.cube())
     places = [(i, j) for i in range(located.sizes["branch"]) for j in range(int(located["n_points"][i]))]
     run.echo(f"response: {len(places)} orbits")
-    rows = tuple(np.array(places, int).reshape(-1, 2).T)
-    variables: dict[str, Any] = {}
     flow = of_flow(base).model
-    orbits = [_at_point(located, base, *p) for p in places]
-    for name, (dims, found, about) in measured(orbits, flow, options.harmonics).items():
-        whole = np.full((located.sizes["branch"], located.sizes["point"], *found.shape[1:]), np.nan)
-        whole[rows] = found
-        variables[name] = (("branch", "point", *dims), whole, about)
+    orbits = {place: _at_point(located, base, *place) for place in places}
+    sizes = {d: located.sizes[d] for d in ("branch", "point")}
+    variables: dict[str, Any] = measured_along(orbits, sizes, flow, options.harmonics)
     events = [_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
     there = measured(events, flow, options.harmonics)
     variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
@@ -120,6 +116,19 @@ def measured(orbits: Sequence[Orbit], model: Model, n_harmonics: int) -> dict[st
     variables["harmonic_amplitude"] = (both, np.abs(harmonics), {"long_name": "amplitude of the harmonic"})
     about = {"units": "rad", "long_name": "lag of the harmonic behind that of the drive"}
     variables["phase"] = (both, lags_of(orbits, harmonics), about)
+    return variables
+
+
+def measured_along(
+    orbits: Mapping[tuple[int, int], Orbit], sizes: Mapping[str, int], model: Model, n_harmonics: int
+) -> dict[str, Variable]:
+    """Return the measures of orbits at places along two dims as variables; NaN where there is no orbit."""
+    rows = tuple(np.array([*orbits], int).reshape(-1, 2).T)
+    variables: dict[str, Variable] = {}
+    for name, (dims, found, about) in measured([*orbits.values()], model, n_harmonics).items():
+        whole = np.full((*sizes.values(), *found.shape[1:]), np.nan)
+        whole[rows] = found
+        variables[name] = ((*sizes, *dims), whole, about)
     return variables
 
 
@@ -175,16 +184,17 @@ def _jumps(
     if base.model.crossing is not None:  # a flow that spirals to rest crosses the section for ever
         words = ["at_rest" if a.max() < CLOSURE else word for a, word in zip(amplitude, words, strict=True)]
     codes = np.array([[*LANDINGS].index(word) for word in words], np.int8)
-    columns: dict[str, tuple[Any, str]] = {
-        "jump_bifurcation": (np.array([k for k, _ in ends], np.int32), "bifurcation at which a stable orbit ends"),
-        "jump_rises": (np.array([way > 0 for _, way in ends], np.int8), "1 if the parameter rises"),
-        "jump_beyond": (np.array(beyond, float), "value of the parameter beyond it"),
-        "jump_period": (
-            np.array([0 if orbit is None else orbit.period for _, orbit in landed], np.int32),
-            "period of the orbit on which a trajectory lands",
-        ),
+    periods = [0 if orbit is None else orbit.period for _, orbit in landed]
+    columns = {
+        "jump_bifurcation": ([k for k, _ in ends], "int32", "bifurcation at which a stable orbit ends"),
+        "jump_rises": ([way > 0 for _, way in ends], "int8", "1 if the parameter rises"),
+        "jump_beyond": (beyond, "float64", "value of the parameter beyond it"),
+        "jump_period": (periods, "int32", "period of the orbit on which a trajectory lands"),
     }
-    found: dict[str, Variable] = {n: (("jump",), v, {"long_name": text}) for n, (v, text) in columns.items()}
+    found: dict[str, Variable] = {
+        name: (("jump",), np.array(values, dtype), {"long_name": text})
+        for name, (values, dtype, text) in columns.items()
+    }
     about = {"long_name": "where a trajectory lands", **code_flags([*LANDINGS])}
     found["jump_beyond"][2]["units"] = str(located.attrs["parameter_units"])
     found["jump_landing"] = (("jump",), codes, about)
@@ -252,7 +262,8 @@ def response_table(ds: xr.Dataset) -> Table:
     lines = [f"amplitude of {first}{_unit(ds)} along {name}, the largest of each branch"]
     detached = dict.fromkeys(isolas_of(ds), "isola") | dict.fromkeys(cut_of(ds), "detached within the interval")
     lines += ["", *aligned([_peak(ds, name, i, detached) for i in range(ds.sizes["branch"])], "")]
-    jumps = [_jump(ds, name, k) for k in np.argsort(_jump_values(ds), kind="stable")]
+    values = ds["value"].values[ds["jump_bifurcation"].values]
+    jumps = [_jump(ds, name, int(k)) for k in np.argsort(values, kind="stable")]
     none = "no jump: no stable orbit ends at a fold or a subcritical bifurcation"
     lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", none]
     lines += searched_lines(ds)
@@ -260,23 +271,28 @@ def response_table(ds: xr.Dataset) -> Table:
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
-    name = parameter_name(str(ds.attrs["parameter"]))
-    rows = []
-    arrays = {key: ds[key].values for key in ("parameter", "n_unstable", "orbit_period", "harmonic_amplitude", "phase")}
-    isolas = isolas_of(ds)
-    measures = {key: ds[key].values for key in ("amplitude", "mean", "rms", "error", "dominant_order")}
+    name = _own_name(parameter_name(str(ds.attrs["parameter"])))
+    values, unstable, isolas = ds["parameter"].values, ds["n_unstable"].values, isolas_of(ds)
+    heads: dict[tuple[int, int], Row] = {}
     for i in range(ds.sizes["branch"]):
         fixed = {_own_name(key): value for key, value in fixed_of(ds, i).items()}
+        about = {**fixed, "branch": i, "period": int(ds["orbit_period"][i]), "isola": i in isolas}
         for j in range(int(ds["n_points"][i])):
-            for c, channel in enumerate(ds["channel"].values):
-                row: Row = {_own_name(name): float(arrays["parameter"][i, j]), **fixed, "branch": i}
-                row |= {"period": int(arrays["orbit_period"][i]), "isola": i in isolas}
-                row |= {"stable": bool(arrays["n_unstable"][i, j] == 0)}
-                row |= {"channel": str(channel), **{key: float(v[i, j, c]) for key, v in measures.items()}}
-                for k, order in enumerate(ds["harmonic"].values):
-                    row[f"harmonic_{order}"] = float(arrays["harmonic_amplitude"][i, j, c, k])
-                    row[f"phase_{order}"] = float(arrays["phase"][i, j, c, k])
-                rows.append(row)
+            heads[i, j] = {name: float(values[i, j]), **about, "stable": bool(unstable[i, j] == 0)}
+    return channel_rows(ds, heads, ("amplitude", "mean", "rms", "error", "dominant_order"))
+
+
+def channel_rows(ds: xr.Dataset, heads: Mapping[tuple[int, int], Row], names: Sequence[str]) -> list[Row]:
+    """Return a row for each channel of each orbit: the columns of the orbit, its measures, and its harmonics."""
+    measures = {key: ds[key].values for key in names}
+    sizes, phases = ds["harmonic_amplitude"].values, ds["phase"].values
+    rows = []
+    for at, head in heads.items():
+        for c, channel in enumerate(ds["channel"].values):
+            row: Row = {**head, "channel": str(channel), **{key: float(v[(*at, c)]) for key, v in measures.items()}}
+            for k, order in enumerate(ds["harmonic"].values):
+                row |= {f"harmonic_{order}": float(sizes[(*at, c, k)]), f"phase_{order}": float(phases[(*at, c, k)])}
+            rows.append(row)
     return rows
 
 
@@ -302,12 +318,8 @@ def _peak(ds: xr.Dataset, name: str, branch: int, detached: Mapping[int, str]) -
     }
 
 
-def _jump_values(ds: xr.Dataset) -> np.ndarray:
-    return np.asarray(ds["value"].values[ds["jump_bifurcation"].values])
-
-
 def _jump(ds: xr.Dataset, name: str, k: int) -> Words:
-    one: Any = ds.isel(jump=int(k))
+    one = ds.isel(jump=k)
     event = int(one["jump_bifurcation"])
     branch = int(ds["of_branch"][event])
     word = words_of(ds["jump_landing"])[int(one["jump_landing"])]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,10 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.pointwise import rates
 from pipeline.analysis.branches.analysis import fixed_of, interval_of, swept_axis
-from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.curves import lies_on
 from pipeline.analysis.branches.lockstep import run_alone, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, Family, parameter_units
-from pipeline.analysis.response.analysis import channel_coordinates, measured
+from pipeline.analysis.response.analysis import channel_coordinates, channel_rows, measured_along
 from pipeline.analysis.response.resonance import (
     ENDS,
     Curve,
@@ -173,22 +172,16 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
     if not starts:
         left_out.append(f"phase resonance: {options.channel} is on no branch of period 1 in quadrature")
     for problem, guess in starts:
-        own = [c for c in curves if _is_alike(c.problem, problem)]
+        own = [c for c in curves if c.problem.base == problem.base and c.kind == "phase_resonance"]
         found = run_alone(phase_resonance(problem, guess))
         if found is None:
             frequency, force = problem.family.values(guess)
             where = f"{frequency:g} Hz, {options.drive} {force:g}"
             left_out.append(f"phase resonance at {where}: Newton's method found no orbit within the bounds")
-        elif not any(lies_on(c.points, c.problem.family, _nearest(found, guess)) for c in own):
+            continue
+        nearest = min(found.points, key=lambda p: float(np.linalg.norm(p.u - guess)))
+        if not any(lies_on(c.points, c.problem.family, nearest) for c in own):
             curves.append(found)
-
-
-def _is_alike(one: ResonanceProblem | ModeProblem, other: ResonanceProblem) -> bool:
-    return isinstance(one, ResonanceProblem) and one.base == other.base
-
-
-def _nearest(curve: Curve, guess: Array) -> Point:
-    return min(curve.points, key=lambda p: float(np.linalg.norm(p.u - guess)))
 
 
 def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[ResonanceProblem, Array]]:
@@ -283,18 +276,14 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         section[i, j] = curve.problem.family.state(point.u)
         residual[i, j], unstable[i, j] = curve.gap(point), curve.n_unstable(point)
         multiplier[i, j, : len(own)] = own
-    variables: dict[str, Any] = {}
-    orbits = [curves[i].problem.orbit(curves[i].points[j].u) for i, j in places]
-    rows = tuple(np.array(places, int).reshape(-1, 2).T)
-    for name, (dims, measures, attrs) in measured(orbits, model, HARMONICS).items():
-        whole = np.full((*shape, *measures.shape[1:]), np.nan)
-        whole[rows] = measures
-        variables[name] = (("curve", "point", *dims), whole, attrs)
+    orbits = {(i, j): curves[i].problem.orbit(curves[i].points[j].u) for i, j in places}
+    variables: dict[str, Any] = measured_along(orbits, {"curve": len(curves), "point": n}, model, HARMONICS)
     over, unit = ("curve", "point"), {"units": "1"}
     force_units = parameter_units(options.drive, model) if options.drive else "1"
     linear = [c.problem.linear_hz if isinstance(c.problem, ModeProblem) else np.nan for c in curves]
     first, last = ([ENDS.index(c.ends[k]) for c in curves] for k in (0, 1))
     about = "multipliers that decide the stability"
+    linear_about = {"units": "Hz", "long_name": "frequency of the linear mode"}
     variables |= {
         "parameter": (over, frequency, {"units": "Hz", "long_name": "frequency"}),
         "force": (over, force, {"units": force_units, "long_name": options.drive or "force"}),
@@ -307,25 +296,12 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         "n_points": ("curve", np.array([len(c.points) for c in curves], np.int32), unit),
         "first_end": ("curve", np.array(first, np.int8), code_flags(ENDS)),
         "last_end": ("curve", np.array(last, np.int8), code_flags(ENDS)),
-        "linear_frequency": (
-            "curve",
-            np.array(linear, float),
-            {"units": "Hz", "long_name": "frequency of the linear mode"},
-        ),
+        "linear_frequency": ("curve", np.array(linear, float), linear_about),
     }
-    return xr.Dataset(
-        variables,
-        coords={**channel_coordinates(model, HARMONICS), "state": list(model.state_names)},
-        attrs={
-            "model": model_attribute(run.model),
-            **section_attributes(run.model.crossing),
-            "parameter": FREQUENCY,
-            "parameter_units": "Hz",
-            "of_channel": options.channel,
-            "force": options.drive,
-            "left_out": "\n".join(left_out),
-        },
-    )
+    coords = {**channel_coordinates(model, HARMONICS), "state": list(model.state_names)}
+    attrs = {"model": model_attribute(run.model), **section_attributes(run.model.crossing), "parameter": FREQUENCY}
+    attrs |= {"parameter_units": "Hz", "of_channel": options.channel, "force": options.drive}
+    return xr.Dataset(variables, coords, {**attrs, "left_out": "\n".join(left_out)})
 
 
 def backbone_table(ds: xr.Dataset) -> Table:
@@ -349,25 +325,16 @@ def backbone_table(ds: xr.Dataset) -> Table:
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
-    rows: list[Row] = []
-    name = parameter_name(str(ds.attrs["parameter"]))
-    kinds = words_of(ds["kind"])
+    name, kinds = parameter_name(str(ds.attrs["parameter"])), words_of(ds["kind"])
     moduli = np.abs(ds["multiplier_real"].values + 1j * ds["multiplier_imag"].values)
-    measures = {key: ds[key].values for key in ("amplitude", "mean", "rms", "error", "harmonic_amplitude", "phase")}
-    single = {key: ds[key].values for key in ("parameter", "force", "residual", "n_unstable")}
+    frequency, force, residual, unstable = (ds[key].values for key in ("parameter", "force", "residual", "n_unstable"))
+    heads: dict[tuple[int, int], Row] = {}
     for i in range(ds.sizes["curve"]):
         for j in range(int(ds["n_points"][i])):
-            at: Mapping[str, float] = {key: float(values[i, j]) for key, values in single.items()}
-            for c, channel in enumerate(ds["channel"].values):
-                row: Row = {"curve": i, "kind": kinds[int(ds["kind"][i])], name: at["parameter"]}
-                row |= {"force": at["force"], "stable": at["n_unstable"] == 0, "residual": at["residual"]}
-                row |= {"largest_multiplier": float(np.nanmax(moduli[i, j], initial=0.0)), "channel": str(channel)}
-                row |= {key: float(measures[key][i, j, c]) for key in ("amplitude", "mean", "rms", "error")}
-                for k, order in enumerate(ds["harmonic"].values):
-                    row[f"harmonic_{order}"] = float(measures["harmonic_amplitude"][i, j, c, k])
-                    row[f"phase_{order}"] = float(measures["phase"][i, j, c, k])
-                rows.append(row)
-    return rows
+            row: Row = {"curve": i, "kind": kinds[int(ds["kind"][i])], name: float(frequency[i, j])}
+            row |= {"force": float(force[i, j]), "stable": bool(unstable[i, j] == 0), "residual": float(residual[i, j])}
+            heads[i, j] = {**row, "largest_multiplier": float(np.nanmax(moduli[i, j], initial=0.0))}
+    return channel_rows(ds, heads, ("amplitude", "mean", "rms", "error"))
 
 
 def _words(ds: xr.Dataset, i: int, channel: str, force: str) -> Words:

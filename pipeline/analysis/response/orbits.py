@@ -70,19 +70,8 @@ class Measures:
 def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = False) -> Measures:
     """Integrate orbits over one period each, and measure them. Samples are doubled until the measures settle.
 
-    Parameters
-    ----------
-    orbits
-        Of one model.
-    n_harmonics
-        Number of harmonics.
-    of_orbit
-        Whether the harmonics are those of the orbit's own period, with a drive as well.
-
-    Returns
-    -------
-    Measures
-        NaN for orbits that could not be integrated.
+    Orbits are of one model. Harmonics are those of the orbit's own period if `of_orbit`, with a drive as well. NaN for
+    orbits that could not be integrated.
     """
     model = of_flow(orbits[0].parameters).model if orbits else None
     n_channels = 0 if model is None else len(model.states) + len(model.quantities)

@@ -20,9 +20,9 @@ import numpy as np
 
 from magpend_core.models.model import Parameters
 from magpend_core.pointwise import rates_packed
-from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
+from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, trace
 from pipeline.analysis.branches.bifurcations import multipliers_of
-from pipeline.analysis.branches.following import opposite
+from pipeline.analysis.branches.following import first_point, opposite
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import FREQUENCY, ONE_SIDED_STEP, Ends, Family, FamilyProblem, Rows, Value
 from pipeline.analysis.response.orbits import FEWEST, Orbit, harmonics_of, lags_of, sampled
@@ -70,18 +70,10 @@ class ResonanceProblem(FamilyProblem):
         last = np.array([self.family.mismatch(u, image) for image in ends.images[:, -1]])
         cosines = self._cosines(u)
         matrix = self.family.scaled(ends.monodromy[0]) - np.eye(self.system.n_states)
-        return Value(
-            np.append(last[0], cosines[0]),
-            np.vstack(
-                [
-                    np.column_stack([matrix, (last[1:] - last[0]).T / ONE_SIDED_STEP]),
-                    (cosines[1:] - cosines[0]) / ONE_SIDED_STEP,
-                ]
-            ),
-            ends.images[0],
-            ends.monodromy[0],
-            float(ends.times[0].sum()),
-        )
+        above = np.column_stack([matrix, (last[1:] - last[0]).T / ONE_SIDED_STEP])
+        derivative = np.vstack([above, (cosines[1:] - cosines[0]) / ONE_SIDED_STEP])
+        residual = np.append(last[0], cosines[0])
+        return Value(residual, derivative, ends.images[0], ends.monodromy[0], float(ends.times[0].sum()))
 
     def _cosines(self, u: Array) -> Array:
         """Return the cosine of the lag of the motion from a start, and from starts displaced in each unknown."""
@@ -136,19 +128,14 @@ class ModeProblem(FamilyProblem):
             mismatch = np.full(n, np.nan)
         rate = rates_packed(self.system, image[None], self.family.rows(u[None]).parameters, np.array([frequency]))[0]
         rate = rate / np.asarray(self.system.scales)
-        closure = np.column_stack(
-            [self.family.scaled(monodromy) - np.eye(n), -rate / frequency**2 * self.family.scales[0]]
-        )
+        by_frequency = -rate / frequency**2 * self.family.scales[0]
+        closure = np.column_stack([self.family.scaled(monodromy) - np.eye(n), by_frequency])
         if not (np.isfinite(mismatch).all() and np.isfinite(closure).all()):
             return Value(np.full(n, np.nan), np.zeros((n, n + 1)), ends.images[0], monodromy)
         spanned = np.linalg.svd(closure)[0][:, : n - 1].T
-        return Value(
-            np.append(spanned @ mismatch, self._along @ (u - self._last)),
-            np.vstack([spanned @ closure, self._along]),
-            ends.images[0],
-            monodromy,
-            1.0 / frequency,
-        )
+        residual = np.append(spanned @ mismatch, self._along @ (u - self._last))
+        derivative = np.vstack([spanned @ closure, self._along])
+        return Value(residual, derivative, ends.images[0], monodromy, 1.0 / frequency)
 
     def distance(self, u: Array) -> float:
         """Return the scaled distance of the orbit's point from the equilibrium."""
@@ -202,31 +189,19 @@ class Curve:
 
 def phase_resonance(problem: ResonanceProblem, guess: Array) -> Steps[Curve | None]:
     """Refine an orbit at its force, and follow phase resonance in both directions; None if there is no such orbit."""
-    level = np.zeros(problem.size)
-    level[-1] = 1.0
-    found = yield from correct(problem, guess, level, RESONANCE)
-    if found is None:
+    start = yield from first_point(problem, guess, RESONANCE)
+    if start is None:
         return None
-    tangent = kernel_of(found.value)
-    start = Point(found.u, tangent * np.copysign(1.0, tangent[-1]), found.value, found.n_iterations)
-    size = max(1.0, float(np.linalg.norm(found.u[: problem.system.n_states])))
+    size = max(1.0, float(np.linalg.norm(start.u[: problem.system.n_states])))
     settings = replace(RESONANCE, longest_step=size * RESONANCE.longest_step)
-    back = yield from trace(problem, opposite(start), settings, _goes_on, _any_step)
-    ahead = yield from trace(problem, start, settings, _goes_on, _any_step)
+    back = yield from trace(problem, opposite(start), settings)
+    ahead = yield from trace(problem, start, settings)
     points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
     return Curve(problem, points, (_end(problem, back), _end(problem, ahead)))
 
 
 def normal_mode(problem: ModeProblem, direction: Array) -> Steps[Curve | None]:
-    """Follow a normal mode from its linear mode; None if the orbits do not close.
-
-    Parameters
-    ----------
-    problem
-        The equations.
-    direction
-        Scaled state on the linear mode, of length 1.
-    """
+    """Follow a normal mode from a scaled state of length 1 on its linear mode; None if the orbits do not close."""
     normal = np.append(direction, 0.0)
     start = np.append(problem.equilibrium, 1.0) + SMALL * normal
 
@@ -243,17 +218,8 @@ def normal_mode(problem: ModeProblem, direction: Array) -> Steps[Curve | None]:
     if found is None or not (yield from is_closed(found, found)):
         return None
     settings = replace(MODE, longest_step=problem.bounds[1][1] * MODE.longest_step)
-    followed = yield from trace(problem, found, settings, _goes_on, is_closed)
+    followed = yield from trace(problem, found, settings, between=is_closed)
     return Curve(problem, followed.points, ("linear_mode", _end(problem, followed)))
-
-
-def _goes_on(points: list[Point]) -> str:
-    return ""
-
-
-def _any_step(before: Point, after: Point) -> Steps[bool]:
-    yield from ()
-    return True
 
 
 def _end(problem: ResonanceProblem | ModeProblem, found: Trace) -> str:
@@ -268,18 +234,12 @@ def _end(problem: ResonanceProblem | ModeProblem, found: Trace) -> str:
 def mode_start(base: Parameters, vector: Array, channel: int) -> Array:
     """Return a scaled state of length 1 on a linear mode, at an instant at which the channel's state is largest.
 
-    Parameters
-    ----------
-    base
-        Parameters of the conservative system.
-    vector
-        Complex eigenvector of the Jacobian at the equilibrium.
-    channel
-        Number of a state; where it does not take part, that with the largest part, also if it is a quantity's.
+    The mode is an eigenvector of the Jacobian at the equilibrium. Where the channel is a quantity, or a state that does
+    not take part, it is the state with the largest part.
     """
     scaled = vector / np.asarray(base.model.system.scales)
-    own = channel if channel < len(scaled) and abs(scaled[channel]) > 1e-6 * np.abs(scaled).max() else -1
-    k = own if own >= 0 else int(np.abs(scaled).argmax())
+    takes_part = channel < len(scaled) and abs(scaled[channel]) > 1e-6 * np.abs(scaled).max()
+    k = channel if takes_part else int(np.abs(scaled).argmax())
     real = np.asarray((scaled * np.conj(scaled[k])).real)
     return np.asarray(real / np.linalg.norm(real))
 

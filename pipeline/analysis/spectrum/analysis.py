@@ -8,6 +8,7 @@ enough that almost no power lies in the upper half of the band, where it would f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -69,11 +70,8 @@ def needs_axis(run: OpenRun, options: SpectrumFigureOptions | WaterfallOptions) 
     if isinstance(options, WaterfallOptions):
         free = [d for d in split_dims(run.cube()["status"])[0] if run.cube().sizes[d] > 1 and d not in options.at]
         if len(free) != 1:
-            left = (
-                f"{len(free)} are left ({', '.join(free)}): choose values of others with --at"
-                if free
-                else "none is left"
-            )
+            more = f"{len(free)} are left ({', '.join(free)}): choose values of others with --at"
+            left = more if free else "none is left"
             raise ValueError(f"a waterfall is drawn along one axis, and {left}; plot spectrum draws a parameter point.")
     elif options.cell is None and not options.nearest:
         select_points(run.cube(), options.at, purpose="spectra are drawn of one parameter point or one cell")
@@ -141,13 +139,8 @@ def _average(motion: Motion, place: int, options: SpectrumOptions) -> dict[str, 
         values = sampled(motion, rate, n_periods, n_samples, place)
         if values is None:
             return {"estimate": NONE}
-        found = averaged(
-            [values],
-            rate * n_samples,
-            window=options.window,
-            nperseg=options.segment * n_samples,
-            scaling=options.scaling,
-        )
+        settings = {"window": options.window, "scaling": options.scaling}
+        found = averaged([values], rate * n_samples, nperseg=options.segment * n_samples, **settings)
         high = found.power[len(found.power) // 2 :].sum()
         too_long = 2 * n_samples * n_periods * len(motion.state) > 8 * AT_ONCE
         if high <= FOLDED * found.power.sum() or 2 * n_samples > MOST or too_long:
@@ -159,17 +152,9 @@ def _row(
     motion: Motion, found: Averaged, values: Array, rate: float, n_samples: int, options: SpectrumOptions
 ) -> dict[str, Any]:
     n = options.orders * options.segment + 1
-    row = {
-        "estimate": AVERAGE,
-        "frequency_hz": found.frequency_hz[:n],
-        "power": found.power[:n],
-        "n_averages": found.n_averages,
-        "resolution_hz": found.resolution_hz,
-        "bandwidth_hz": found.bandwidth_hz,
-        "variance": found.variance,
-        "kept": found.power_below(n, options.scaling) / found.variance if found.variance else np.nan,
-        "rate_hz": rate,
-    }
+    row = {**asdict(found), "frequency_hz": found.frequency_hz[:n], "power": found.power[:n]}
+    row |= {"estimate": AVERAGE, "rate_hz": rate}
+    row["kept"] = found.power_below(n, options.scaling) / found.variance if found.variance else np.nan
     if motion.kind == TORUS:
         drive = None if motion.parameters.model.autonomous else rate
         own = frequencies_of(values, rate * n_samples, drive)

@@ -102,10 +102,8 @@ def motions_of(run: OpenRun, options: CellOptions) -> list[Motion]:
         if not attractor or letter(number) == attractor:
             at = {d: float(values[i]) for d, values in axes.items()}
             columns = ("kind", "stability", "orbit_period", "period_s", "share")
-            kind, stability, period, seconds, share = (here[name].values[i] for name in columns)
-            base, hertz = _parameters(found, at)
-            told = (int(kind), int(stability), int(period), float(seconds), float(share))
-            motions.append(Motion(at, number, *told, points[i][0], base, hertz))
+            told = (here[name].values[i].item() for name in columns)
+            motions.append(Motion._make((at, number, *told, points[i][0], *_parameters(found, at))))
     if not motions:
         there = ", ".join(letter(i) for i in sorted(set(here["attractor"].values.tolist()))) or "none"
         raise ValueError(f"no set {attractor} is there; it has {there} (magpend analyse attractors).")
@@ -118,8 +116,8 @@ def _of_cell(found: xr.Dataset, cell: xr.Dataset, where: dict[str, float]) -> Mo
     kept = np.flatnonzero(np.isfinite(section).all(axis=1))
     if not len(kept):
         raise ValueError(f"the cell has no section from which it could go on: {Status(int(cell['status'])).sentence}.")
-    base, hertz = _parameters(found, where)
-    return Motion(where, -1, BOUNDED_SET, NOT_SETTLED, 0, np.nan, np.nan, section[kept[-1]], base, hertz)
+    told = (BOUNDED_SET, NOT_SETTLED, 0, np.nan, np.nan)
+    return Motion._make((where, -1, *told, section[kept[-1]], *_parameters(found, where)))
 
 
 def _parameters(found: xr.Dataset, where: Mapping[str, float]) -> tuple[Parameters, float]:
