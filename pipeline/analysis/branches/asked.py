@@ -47,8 +47,7 @@ def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, flo
             )
         if not options.all_equilibria:
             raise SpecError("--within is the box of --all-equilibria; give that, too, such as --all-equilibria 1.")
-        problems = _box_problems(model, options.within)
-        if problems:
+        if problems := _box_problems(model, options.within):
             raise SpecError(problems)
 
 
@@ -71,10 +70,9 @@ def start_problems(model: Model, options: StartOptions, *others: str) -> list[st
 
 
 def _box_problems(model: Model, within: Mapping[str, tuple[float, float]]) -> list[str]:
-    problems = [
-        f"--within: {unknown_name('state', n, model.state_names)}" for n in within if n not in model.state_names
-    ]
-    for state, is_angle in zip(model.state_names, model.is_angle, strict=True):
+    names = model.state_names
+    problems = [f"--within: {unknown_name('state', name, names)}" for name in within if name not in names]
+    for state, is_angle in zip(names, model.is_angle, strict=True):
         if state not in within:
             if not is_angle:
                 problems.append(f"--within: no range of {state}; add {state}=LOW:HIGH.")
@@ -193,11 +191,7 @@ def _count(family: Family, value: float, where: Mapping[str, float], base: Param
 
 
 def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any]:
-    """Return dataset variables on the equilibria that were counted; none without a count.
-
-    Returns, over ``box``: ``box_value`` and the values of other axes (``box_...``), ``n_equilibria``,
-    ``n_stable_equilibria``, ``equilibria_index_sum``, and ``box_verdict``, of `COUNTS`.
-    """
+    """Return dataset variables on the equilibria that were counted, over ``box``; none without a count."""
     if not counted:
         return {}
     expected = expected_index(counted[0].family.system)

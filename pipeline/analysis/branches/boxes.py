@@ -88,12 +88,7 @@ class Enclosed:
 def enclose_equilibria(rates: Rates, box: Box) -> Enclosed:
     """Enclose all equilibria of a box; parts in which they touch, or nearly do, stay undecided.
 
-    Parameters
-    ----------
-    rates
-        Enclosures of rates and Jacobian; without an obstacle.
-    box
-        Box of states.
+    The enclosures of rates and Jacobian have no obstacle.
     """
     search = _Search(rates, box)
     turn = np.where(box.is_full, TURN, 0.0)
@@ -167,14 +162,14 @@ class _Search:
                 break
             low, high = closer
         for shift, (a, b), (c, d) in self._known():
-            moved = low + shift - TINY_ANGLE * abs(np.sign(shift)), high + shift + TINY_ANGLE * abs(np.sign(shift))
+            error = TINY_ANGLE * abs(np.sign(shift))
+            moved = low + shift - error, high + shift + error
             if ((c <= moved[0]) & (moved[1] <= d)).all() or ((wide_low + shift <= a) & (b <= wide_high + shift)).all():
                 return
             if ((moved[0] <= b) & (a <= moved[1])).all():
                 self.found.undecided.append((low, high))
                 return
-        inside = (self.box.is_full | ((self.box.low <= low) & (high <= self.box.high))).all()
-        if not inside:
+        if not (self.box.is_full | ((self.box.low <= low) & (high <= self.box.high))).all():
             beside = ~self.box.is_full & ((high < self.box.low) | (low > self.box.high))
             middle, others = 0.5 * (low + high), self.found.on_border
             if not beside.any() and not any((np.abs(middle - one) < SMALLEST * self.box.width).all() for one in others):
@@ -204,8 +199,7 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
         radius = np.nextafter(np.maximum(last - middle, middle - first), np.inf)
         good = np.asarray(np.isfinite(radius).all(axis=(1, 2)))
         good[good] = np.abs(np.linalg.det(middle[good])) > 0.0
-        inverse = np.where(good[:, None, None], middle, np.eye(n))
-        inverse = np.linalg.inv(inverse)
+        inverse = np.linalg.inv(np.where(good[:, None, None], middle, np.eye(n)))
         good &= np.isfinite(inverse).all(axis=(1, 2))
         centre = 0.5 * (low + high)
         reach = np.nextafter(np.maximum(high - centre, centre - low), np.inf)
@@ -213,8 +207,8 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
         value = 0.5 * (at[0] + at[1])
         spread = np.nextafter(np.maximum(at[1] - value, value - at[0]), np.inf)
         size = np.abs(inverse)
-        product_size = size @ np.abs(middle)
-        slope = np.abs(np.eye(n) - inverse @ middle) + size @ radius + ROUNDING * (1.0 + product_size)
+        rounding = ROUNDING * (1.0 + size @ np.abs(middle))
+        slope = np.abs(np.eye(n) - inverse @ middle) + size @ radius + rounding
         step = (inverse @ value[..., None])[..., 0]
         error = (size @ (spread + ROUNDING * np.abs(value))[..., None])[..., 0] + (slope @ reach[..., None])[..., 0]
         error = error * (1.0 + ROUNDING) + 4.0 * np.spacing(np.abs(centre) + np.abs(step))
@@ -226,19 +220,7 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
 def search_equilibria(system: System, packed: np.ndarray, box: Box, known: np.ndarray) -> np.ndarray:
     """Search a box for equilibria by Newton's method from random starts; each one found is deflated.
 
-    Parameters
-    ----------
-    system, packed
-        Flow without a drive, and its packed parameters.
-    box
-        Box of states.
-    known
-        Equilibria that are known, shape (any, n_states).
-
-    Returns
-    -------
-    ndarray, (n, n_states)
-        The known ones first.
+    Return the known ones first, shape (n, n_states). The system is a flow without a drive.
     """
     generator, found = np.random.default_rng(0), list(known)
     for _ in range(1 + ROUNDS):

@@ -74,19 +74,8 @@ def null_vectors(matrix: np.ndarray, value: complex = 0.0) -> tuple[np.ndarray, 
 def normal_form(rest: Rest, values: Sequence[complex], order: int) -> dict[tuple[int, tuple[int, ...]], complex]:
     """Compute the normal form on the centre manifold of an equilibrium, by a power series up to some order.
 
-    Parameters
-    ----------
-    rest
-        The equilibrium.
-    values
-        Its critical eigenvalues, 0 or imaginary: at most one 0, and each pair as i omega, -i omega.
-    order
-        Degree of the last terms.
-
-    Returns
-    -------
-    dict
-        For the equation of each critical eigenvalue and each resonant monomial, by exponents: its coefficient.
+    Critical eigenvalues are 0 or imaginary: at most one 0, and each pair as i omega, -i omega. Returns the coefficient
+    of each resonant monomial, by exponents, in the equation of each critical eigenvalue.
     """
     n, m = len(rest.matrix), len(values)
     of = monomials(m, order)

@@ -21,21 +21,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import csr_array
 
-from pipeline.analysis.branches.sheets import (
-    ENDED,
-    GOING,
-    LINKED,
-    LONGEST,
-    NEAR,
-    OPEN,
-    UNTRIED,
-    Array,
-    Grid,
-    Orbits,
-    Values,
-)
+from pipeline.analysis.branches.sheets import ENDED, GOING, LONGEST, NEAR, OPEN, UNTRIED, Array, Grid, Orbits, Values
 from pipeline.analysis.tolerances import SAME_CONNECTED
 from pipeline.products.reporting import report
 
@@ -75,14 +63,8 @@ class Web:
 def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:
     """Link the orbits that lie on one branch or sheet.
 
-    Parameters
-    ----------
-    grid
-        Parameter points; it has an axis or more.
-    place
-        Parameter point of each orbit.
-    orbits
-        Section points (period, n_states) of each in the order of time.
+    The grid has an axis or more. Each orbit has its parameter point, and section points (period, n_states) in the order
+    of time.
     """
     scaled = [np.asarray(x) / np.asarray(grid.system.scales) for x in orbits]
     # the result depends neither on the order of the orbits nor on where they begin
@@ -177,13 +159,9 @@ class _Flood(Orbits):
     def _sharing_a_point(self, chosen: Array) -> tuple[Array, Array]:
         """Return the pairs of chosen components that have orbits of one period at one point, in both orders."""
         rows = np.flatnonzero(chosen[self.component])
-        column = np.unique(
-            self.nodes["period"][rows] * len(self.grid.packed) + self.nodes["place"][rows], return_inverse=True
-        )[1]
-        held = coo_array(
-            (np.ones(len(rows)), (self.component[rows], column)), shape=(len(chosen), column.max(initial=0) + 1)
-        )
-        held = held.tocsr()
+        column = np.unique(self._key(self.nodes["period"][rows], self.nodes["place"][rows]), return_inverse=True)[1]
+        shape = (len(chosen), column.max(initial=0) + 1)
+        held = csr_array((np.ones(len(rows)), (self.component[rows], column)), shape=shape)
         first, second = (held @ held.T).nonzero()
         return first, second
 
@@ -211,11 +189,11 @@ class _Flood(Orbits):
         walk["gap"] = self._gap(walk["z"], images, walk["period"])
         half = nodes["points"][rows, walk["period"] // 2]
         walk["half"] = self._difference(half * self.scales, walk["z"] * self.scales)
+        targets = self._targets(walk)
         for axis in range(len(self.grid.axes)):
             on = np.flatnonzero(walk["axis"] == axis)
-            walk["u"][on] = self.grid.value(nodes["place"][on], axis)
-            walk["end"][on] = self.grid.value(self._targets(walk[on]), axis)
-        walk["h"] = whole = np.abs(walk["end"] - walk["u"])
+            walk["u"][on], walk["end"][on] = (self.grid.value(place[on], axis) for place in (nodes["place"], targets))
+        whole = np.abs(walk["end"] - walk["u"])
         reach = np.minimum(nodes["reach"][rows, walk["axis"]], _longest(walk["slope"]))
         walk["h"] = np.minimum(whole, reach)
         walk["shortest"] = np.minimum(SHORTEST, whole / LEAST_STEPS)
@@ -330,12 +308,8 @@ class _Flood(Orbits):
             return
         n = len(self.nodes)
         new: Any = np.zeros(len(w), self.nodes.dtype)
-        new["place"], new["period"], new["slopes"], new["det"] = (
-            self._targets(w),
-            w["period"],
-            v.slopes[rows],
-            v.det[rows],
-        )
+        new["place"], new["period"] = self._targets(w), w["period"]
+        new["slopes"], new["det"] = v.slopes[rows], v.det[rows]
         new["points"], new["reach"] = np.nan, np.inf
         new["reach"][np.arange(len(w)), w["axis"]] = w["reach"]
         width = v.images.shape[1]
@@ -351,8 +325,7 @@ class _Flood(Orbits):
             own = np.flatnonzero(~doubled & (w["axis"] == axis))
             up = w["way"][own] > 0
             a, b = np.where(up, w["origin"][own], target[own]), np.where(up, target[own], w["origin"][own])
-            free = (self.nodes["ways"][a, axis, 0] != LINKED) & (self.nodes["ways"][b, axis, 1] != LINKED)
-            a, b = a[free], b[free]
+            a, b = self._free(a, b, axis)
             _, one = np.unique(a, return_index=True)
             a, b = a[one], b[one]
             _, one = np.unique(b, return_index=True)

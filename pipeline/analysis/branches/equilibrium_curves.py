@@ -111,7 +111,7 @@ class EquilibriumCurve(FamilyProblem):
             values = np.linalg.eigvals(jacobian)
             upper = values[values.imag > 0.0]
             if omega is None and len(upper):
-                omega = float(np.abs(upper[np.argmin(np.abs(upper.real))]))
+                omega = _nearest_pair(upper)
             extra = ((omega or 0.0) * self._unit_of(jacobian)) ** 2
         return np.concatenate([u[:n], [extra], u[-2:]])
 
@@ -131,9 +131,8 @@ class EquilibriumCurve(FamilyProblem):
         # of either sign where the singular value is 0 but for rounding, which would turn the imperfection's
         right, left = (v * np.copysign(1.0, v[np.argmax(np.abs(v))]) for v in vectors)
         steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
-        found = np.array(
-            [self._equations(one, right, left) for one in (u, *(u + np.diag(steps)), *(u - np.diag(steps)))]
-        )
+        places = (u, *(u + np.diag(steps)), *(u - np.diag(steps)))
+        found = np.array([self._equations(one, right, left) for one in places])
         derivative = (found[1 : 1 + self.size] - found[1 + self.size :]).T / (2.0 * steps)
         derivative[:n, :n] = self.family.scaled(jacobian) * self.unit
         seconds = np.nan
@@ -197,20 +196,8 @@ def _pair_at(values: np.ndarray, kappa: float) -> tuple[int, int]:
 # ---- points of codimension two -----------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Vectors:
-    """Null vectors of a fold, turned as those at the point before."""
-
-    right: np.ndarray
-    left: np.ndarray
-
-    @classmethod
-    def of(cls, matrix: np.ndarray, before: _Vectors | None) -> _Vectors:
-        """Compute the null vectors of a matrix, with the signs of those before."""
-        right, left = null_vectors(matrix)
-        if before is not None:
-            right, left = (v * np.copysign(1.0, v @ w) for v, w in ((right, before.right), (left, before.left)))
-        return cls(right, left)
+_Vectors = tuple[np.ndarray, np.ndarray]
+"""Right and left null vector of a fold, turned as those at the point before."""
 
 
 @dataclass(eq=False)
@@ -222,8 +209,10 @@ class EquilibriumDetector(Detector):
     problem: EquilibriumCurve  # type: ignore[assignment]
 
     def _tests(self, point: Point, frame: _Vectors | None) -> Steps[tuple[_Vectors, dict[str, float]]]:  # type: ignore[override]
-        rest = self._rest(point)
-        vectors, kind = _Vectors.of(rest.matrix, frame), self.problem.kind
+        rest, kind = self._rest(point), self.problem.kind
+        right, left = null_vectors(rest.matrix)
+        if frame is not None:
+            right, left = (v * np.copysign(1.0, v @ w) for v, w in zip((right, left), frame, strict=True))
         if kind == HOPF:
             kappa = float(point.u[len(rest.matrix)])
             others = self._others(point)
@@ -232,13 +221,13 @@ class EquilibriumDetector(Detector):
         else:
             values = np.linalg.eigvals(rest.matrix)
             others = np.delete(values, int(np.argmin(np.abs(values))))
-            product = float(vectors.left @ vectors.right)
+            product = float(left @ right)
             tests = {BT: product, ZERO_HOPF: _pairs(others)}
             if kind == PITCHFORK:  # by symmetry B(q, q) has no part along p
                 tests[DEGENERATE] = cusp(rest)["c"] * product
             else:
-                tests[CUSP] = float(rest.second(vectors.right, vectors.right).real @ vectors.left)
-        return vectors, tests
+                tests[CUSP] = float(rest.second(right, right).real @ left)
+        return (right, left), tests
         yield  # type: ignore[unreachable]  # a computation that asks for nothing
 
     def _test(self, kind: str, frame: _Vectors, point: Point) -> Steps[float]:  # type: ignore[override]
@@ -277,16 +266,19 @@ class EquilibriumDetector(Detector):
             elif not len(upper) or np.abs(upper.real).min() > 1e-6 * np.abs(upper).max():
                 return None
             else:
-                omega = float(np.abs(upper[np.argmin(np.abs(upper.real))]))
-                own = _omega(point) if is_hopf else 0.0
-                found = (
-                    partial(double_hopf, rest, *sorted((own, omega))) if is_hopf else partial(zero_hopf, rest, omega)
-                )
+                omega = _nearest_pair(upper)
+                pairs = sorted((_omega(point), omega)) if is_hopf else [omega]
+                found = partial(double_hopf if is_hopf else zero_hopf, rest, *pairs)
         return replace(one, coefficients=found())
 
 
 def _omega(point: Point) -> float:
     return 2.0 * np.pi / point.value.seconds
+
+
+def _nearest_pair(upper: np.ndarray) -> float:
+    """Return the size of that eigenvalue of some which is nearest to the imaginary axis."""
+    return float(np.abs(upper[np.argmin(np.abs(upper.real))]))
 
 
 def _pairs(values: np.ndarray) -> float:

@@ -101,48 +101,32 @@ class Arm:
 def follow_homoclinic(
     problem: HomoclinicProblem, start: Point, bounds: Bounds, settings: Settings = SETTINGS
 ) -> Steps[Arm]:
-    """Follow homoclinic orbits in the plane of two parameters in one direction.
+    """Follow homoclinic orbits in the plane of two parameters in the direction of the tangent of a start.
 
-    Parameters
-    ----------
-    problem, start
-        From `homoclinic_point`; the tangent of `start` gives the direction.
-    bounds
-        Intervals of both parameters.
-    settings
-        Step lengths, tolerance and limits.
-
-    Returns
-    -------
-    Arm
-        Points with the saddle as their state. Its end is ``bound``, ``closed``, ``max_points``, ``stuck``,
-        ``bogdanov_takens`` and ``saddle_node_homoclinic`` where leading eigenvalues vanish, or ``heteroclinic`` where
-        the orbit comes near another saddle. Neutral saddles and these ends are among its special points.
+    Points of the arm have the saddle as their state. Its end is ``bound``, ``closed``, ``max_points``, ``stuck``,
+    ``bogdanov_takens`` and ``saddle_node_homoclinic`` where leading eigenvalues vanish, or ``heteroclinic`` where the
+    orbit comes near another saddle. Neutral saddles and these ends are among its special points.
     """
-    arm = Arm()
+    arm = Arm([as_rest(problem, start)])
     here, step = start, settings.first_step
-    arm.points.append(as_rest(problem, start))
-    while True:
+    while not arm.end:
         watch = _Watch(problem, settings, bounds, arm)
         rest = replace(settings, first_step=step, max_points=AT_ONCE)
         found = yield from trace(problem, here, rest, watch.stop, watch.between)
-        if found.end == "max_points" and len(arm.points) < settings.max_points:
-            before, here = found.points[-2:]
-            step = float(np.linalg.norm(here.u - before.u))
-            loop = loop_of(problem, here.u)
-            if meets_another(loop):
-                arm.end = HETEROCLINIC
-                return arm
-            laid = yield from _laid_anew(problem, here, settings)
-            if laid is None:
-                arm.end = "stuck"
-                return arm
+        if found.end != "max_points" or len(arm.points) >= settings.max_points:
+            arm.end = found.end
+            break
+        before, here = found.points[-2:]
+        step = float(np.linalg.norm(here.u - before.u))
+        if meets_another(loop_of(problem, here.u)):
+            arm.end = HETEROCLINIC
+        elif (laid := (yield from _laid_anew(problem, here, settings))) is None:
+            arm.end = "stuck"
+        else:
             problem, here = laid
-            continue
-        arm.end = found.end
-        if found.end in (BT, NONCENTRAL):
-            _carry_on(problem.family, arm)
-        return arm
+    if arm.end in (BT, NONCENTRAL):
+        _carry_on(problem.family, arm)
+    return arm
 
 
 def _laid_anew(
@@ -175,11 +159,14 @@ class _Watch:
 
     def stop(self, points: list[Point]) -> str:
         here = as_rest(self.problem, points[-1])
-        values = self.problem.family.values(here.u)
-        if not all(low <= v <= high for v, (low, high) in zip(values, self.bounds, strict=True)):
+        if not self._is_inside(here):
             return "bound"
         self.arm.points.append(here)
         return vanished(self.arm.points) or ("closed" if _is_closed(self.arm.points) else "")
+
+    def _is_inside(self, rest: Point) -> bool:
+        values = self.problem.family.values(rest.u)
+        return all(low <= v <= high for v, (low, high) in zip(values, self.bounds, strict=True))
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
         """Locate a neutral saddle between two points; refuse a step on which the saddle is lost."""
@@ -191,12 +178,11 @@ class _Watch:
             if ends is None:
                 self.arm.n_missed += 1
                 return True
-            (low, at_low), (high, at_high) = ends
-            values = [as_rest(self.problem, p) for p in (low, high)]
+            (low, at_low), (high, at_high) = ((as_rest(self.problem, point), value) for point, value in ends)
             family = self.problem.family
-            bracket = np.abs(family.values(values[1].u) - family.values(values[0].u))
-            nearest = values[0] if abs(at_low) <= abs(at_high) else values[1]
-            if all(lo <= v <= hi for v, (lo, hi) in zip(family.values(nearest.u), self.bounds, strict=True)):
+            bracket = np.abs(family.values(high.u) - family.values(low.u))
+            nearest = low if abs(at_low) <= abs(at_high) else high
+            if self._is_inside(nearest):
                 self.arm.special.append(SpecialPoint(NEUTRAL, family, nearest, bracket))
         return True
 
@@ -293,18 +279,8 @@ def _at_zero(x: np.ndarray, u: np.ndarray) -> np.ndarray:
 def loops_of(branches: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[Loop]:
     """Return the last cycles of all branches that end as ``homoclinic``, as approximate homoclinic orbits.
 
-    Parameters
-    ----------
-    branches
-        Result of `dataset_of`.
-    parameters
-        Parameters of the run; the value of `second` is that of the branches.
-    second
-        Name of the second parameter.
-    bounds
-        Interval of the branches' parameter, and that of the second.
-    max_period
-        Longest period of the cycles [returns].
+    The value of the second parameter is that of the run's parameters. Bounds are the interval of the branches'
+    parameter, and that of the second; cycles of more returns than `max_period` are left out.
     """
     found = []
     for one, end, family in _ends_of(branches, HOMOCLINIC, parameters, second, bounds, max_period):
@@ -364,19 +340,8 @@ def _cycle(
 def homoclinic_curves(loops: Sequence[Loop], bounds: Bounds, settings: Settings = SETTINGS) -> list[HomoclinicCurve]:
     """Follow homoclinic orbits in both directions in the plane of two parameters, no curve twice.
 
-    Parameters
-    ----------
-    loops
-        Approximate homoclinic orbits, such as those of `loops_of`, or predictions from Bogdanov-Takens points.
-    bounds
-        Intervals of both parameters.
-    settings
-        Step lengths, tolerance and limits.
-
-    Returns
-    -------
-    list of HomoclinicCurve
-        Without those whose first orbit could not be refined.
+    Loops are approximate orbits, such as those of `loops_of`, or predictions from Bogdanov-Takens points. Curves whose
+    first orbit could not be refined are left out.
     """
     firsts = run_together([homoclinic_point(loop, settings) for loop in loops])
     found: list[HomoclinicCurve] = []
@@ -389,9 +354,8 @@ def homoclinic_curves(loops: Sequence[Loop], bounds: Bounds, settings: Settings 
         if back.end == "closed":
             ahead = Arm([back.points[0]], end="closed")
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
-        middle = _middle(problem, start)
-        special, n_missed = back.special + ahead.special, back.n_missed + ahead.n_missed
-        found.append(HomoclinicCurve(loop.family, points, (back.end, ahead.end), special, n_missed, middle))
+        ends, special, n_missed = (back.end, ahead.end), back.special + ahead.special, back.n_missed + ahead.n_missed
+        found.append(HomoclinicCurve(loop.family, points, ends, special, n_missed, _middle(problem, start)))
     return found
 
 
@@ -423,19 +387,8 @@ def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
 
     To leading order the orbit is the loop x = x_s + 3/2 (x_f - x_s) sech(k t)**2 about the focus x_f beside the saddle
     x_s, with 4 k**2 = -l_u l_s. The damping, which is linear in x, does no work on it where a seventh of the trace of
-    the critical eigenvalues at x_s and six sevenths of that at x_f add up to 0 (Melnikov's integral).
-
-    Parameters
-    ----------
-    takens
-        The point, with the family of its equilibria.
-    away
-        Distance of the parameters from the point, in units of their scales.
-
-    Returns
-    -------
-    Loop or None
-        None if no direction in the plane of the parameters fulfils the condition.
+    the critical eigenvalues at x_s and six sevenths of that at x_f add up to 0 (Melnikov's integral). None if no
+    direction in the plane of the parameters fulfils the condition. Distances are in units of the parameters' scales.
     """
     known = [(angle, _pair_at(takens, away, angle)) for angle in np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)]
     for one, other in pairwise(known):

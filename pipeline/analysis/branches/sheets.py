@@ -56,9 +56,9 @@ class Grid:
 
     def neighbour(self, place: Array, axis: int, way: int) -> Array:
         """Return the next point along an axis, up (1) or down (-1); -1 beyond the border."""
-        at = list(np.unravel_index(place, self.shape))
-        at[self.axes[axis].dim] = at[self.axes[axis].dim] + way
-        inside = (at[self.axes[axis].dim] >= 0) & (at[self.axes[axis].dim] < self.shape[self.axes[axis].dim])
+        at, dim = list(np.unravel_index(place, self.shape)), self.axes[axis].dim
+        at[dim] = at[dim] + way
+        inside = (at[dim] >= 0) & (at[dim] < self.shape[dim])
         return np.where(inside, np.ravel_multi_index(tuple(at), self.shape, mode="clip"), -1)
 
     def value(self, place: Array, axis: int) -> Array:
@@ -114,14 +114,8 @@ class Orbits:
         keys = self._key(self.nodes["period"], self.nodes["place"])
         self._order = np.argsort(keys, kind="stable")
         self._keys = keys[self._order]
-        found = self._evaluated(
-            place,
-            np.full(len(place), -1),
-            np.zeros(len(place)),
-            self.nodes["points"][:, 0],
-            self.nodes["period"],
-            np.ones(len(place), bool),
-        )
+        n, firsts = len(place), self.nodes["points"][:, 0]
+        found = self._evaluated(place, np.full(n, -1), np.zeros(n), firsts, self.nodes["period"], np.ones(n, bool))
         self.nodes["slopes"], self.nodes["det"] = found.slopes, found.det
         self._mark_borders(np.arange(len(place)))
 
@@ -222,13 +216,17 @@ class Orbits:
                 a, b = self._pairs(new, self.grid.neighbour(self.nodes["place"][new], axis, way))
                 if way < 0:
                     a, b = b, a
-                free = (self.nodes["ways"][a, axis, 0] != LINKED) & (self.nodes["ways"][b, axis, 1] != LINKED)
-                a, b = a[free], b[free]
+                a, b = self._free(a, b, axis)
                 good = self._is_one_step(a, b, axis)
                 a, b = a[good], b[good]
                 only = (np.bincount(a, minlength=1)[a] == 1) & (np.bincount(b, minlength=1)[b] == 1)
                 self._link(a[only], b[only], axis)
         self._join()
+
+    def _free(self, a: Array, b: Array, axis: int) -> tuple[Array, Array]:
+        """Return the pairs of orbits that are not linked yet, up and down an axis."""
+        free = (self.nodes["ways"][a, axis, 0] != LINKED) & (self.nodes["ways"][b, axis, 1] != LINKED)
+        return a[free], b[free]
 
     def _is_one_step(self, a: Array, b: Array, axis: int) -> Array:
         """Return whether a step along the tangent from each of two orbits leads to the other, at one phase."""
@@ -253,9 +251,8 @@ class Orbits:
         """Merge the components of all that was linked."""
         a, b = (np.concatenate(x) for x in zip(*self._joined, strict=True))
         self._joined.clear()
-        if not len(a):
-            return
-        self.component = _merged(self.component, a, b)
+        if len(a):
+            self.component = _merged(self.component, a, b)
 
     def _taken(self, new: Any) -> Array:
         """Add orbits unless they are known, and return the number of each."""
@@ -274,8 +271,8 @@ class Orbits:
         among = known >= n
         known[among] = known[known[among] - n]
         kept = np.flatnonzero(known == np.arange(n, n + m))
-        number = known.copy()
         among = known >= n
+        number = known.copy()
         number[among] = n + np.searchsorted(kept, known[among] - n)
         self._store[n : n + len(kept)] = new[kept]
         self.nodes = self._store[: n + len(kept)]

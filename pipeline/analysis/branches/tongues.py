@@ -35,6 +35,7 @@ from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of,
 from pipeline.products.branches import TongueOptions
 from pipeline.products.product import Table
 from pipeline.products.rotation import RotationFlag
+from pipeline.specification.problems import SpecError
 
 BISECTIONS = 26
 """Most halvings of an interval of the parameter in which a fraction is passed between two cells."""
@@ -50,8 +51,6 @@ TOLERANCE = 1e-9
 
 LOCKED = 1e-6
 """Largest distance of a closed cell's rotation number from a fraction that counts as equal."""
-
-PURPOSE = "tongues are searched on one row of cells"
 
 IN_TONGUE = Settings(longest_step=0.05)
 """Settings with long steps: of the orbits in a tongue only the folds are wanted."""
@@ -72,9 +71,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Settings of the search for locked orbits: the family of orbits, the rotating state and the number of periods to
-    average over.
-    """
+    """Settings of the search for locked orbits: family, rotating state and number of periods to average over."""
 
     family: Family
     turning: TurningState
@@ -102,9 +99,7 @@ class Search:
         return np.asarray(np.where(found.error <= CLOSED_TURNS, found.rotation, np.nan))
 
     def sections(self, values: np.ndarray, states: np.ndarray, n_transient: int, n_keep: int) -> np.ndarray:
-        """Integrate trajectories over a transient, and return the next `n_keep` section points, shape (trajectory,
-        n_keep, state).
-        """
+        """Integrate trajectories over a transient; return the next section points (trajectory, n_keep, state)."""
         rows = self.family.rows(self._unknowns(values, states))
         found = run_branches(
             rows.parameters[:, None],
@@ -130,21 +125,9 @@ def fractions_between(low: float, high: float, most: int) -> list[Fraction]:
 
 
 def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start | None]:
-    """Find an orbit for each rotation number p/q that occurs along a row of cells.
+    """Find an orbit for each rotation number p/q that occurs along a row of cells, with q up to a largest one.
 
-    Parameters
-    ----------
-    row
-        The cells.
-    search
-        The setting of the search.
-    most
-        Largest denominator.
-
-    Returns
-    -------
-    dict
-        Starting orbit by fraction, in rising order; None where no closed cell has it and the search failed.
+    Fractions are in rising order; None where no closed cell has it and the search failed.
     """
     known = row.rotation[np.isfinite(row.rotation)]
     if not known.size:
@@ -159,9 +142,7 @@ def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start |
 
 
 def _of_cells(row: Row, search: Search, fraction: Fraction) -> Start | None:
-    """Return the periodic orbit of least period among the cells with a given rotation number; None if there is no such
-    cell.
-    """
+    """Return the periodic orbit of least period among the cells with a rotation number; None if there is none."""
     has = (row.orbit_period > 0) & (np.abs(row.rotation - float(fraction)) < LOCKED)
     if not has.any():
         return None
@@ -229,14 +210,8 @@ def _corrected(start: Start, number: int) -> Steps[Start | None]:
     return Start(start.family, state, parameter, number)
 
 
-def fractions_of(branches: Sequence[Branch], search: Search) -> list[Fraction | None]:
-    """Return the rotation number p/q of each branch, from its first orbit; None if the orbit's turns are not a whole
-    number.
-    """
-    return [_fraction_of(branch, search) for branch in branches]
-
-
-def _fraction_of(branch: Branch, search: Search) -> Fraction | None:
+def fraction_of(branch: Branch, search: Search) -> Fraction | None:
+    """Return the rotation number p/q of a branch, from its first orbit; None if its turns are no whole number."""
     family, first = branch.family, branch.points[0]
     values, states = family.values(first.u), family.state(first.u)[None]
     closed = None if search.turning.of_section else np.array([family.period])
@@ -245,9 +220,7 @@ def _fraction_of(branch: Branch, search: Search) -> Fraction | None:
 
 
 def needs_rotation(run: OpenRun, options: TongueOptions) -> None:
-    """Raise ValueError unless the run has rotation numbers and sweeps the parameter along which tongues are
-    searched.
-    """
+    """Raise ValueError unless the run has rotation numbers and sweeps the parameter of the row of cells."""
     cube = run.cube()
     if "rotation" not in cube:
         raise ValueError("the cube has no rotation numbers; run it with [products] rotation = {} in its specification")
@@ -257,14 +230,11 @@ def needs_rotation(run: OpenRun, options: TongueOptions) -> None:
 
 def settle_tongues(run: OpenRun, options: TongueOptions) -> TongueOptions:
     """Fill in the parameter, its interval and the row of cells; raise SpecError unless the two parameters differ."""
-    from pipeline.specification.problems import SpecError
-
-    parameter = options.parameter
-    if axis_name(options.second) == axis_name(parameter):
+    if axis_name(options.second) == axis_name(options.parameter):
         raise SpecError(f"{options.second} is swept already; give another second parameter, or --parameter.")
-    low, high = interval_of(run, parameter, options.low, options.high)
+    low, high = interval_of(run, options.parameter, options.low, options.high)
     interval_of(run, options.second, options.second_low, options.second_high)
-    return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
+    return options.model_copy(update={"low": low, "high": high})
 
 
 def tongues(run: OpenRun, options: TongueOptions) -> xr.Dataset:
@@ -283,7 +253,7 @@ def tongues(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     of = f"{counted(len(found), 'starting orbit')} of {counted(len(starts), 'fraction')}"
     run.echo(f"tongues: {of}, periods up to {longest}")
     branches = explore(list(found.values()), Scope(options.low, options.high, longest, 0, IN_TONGUE))
-    numbers = fractions_of(branches, search)
+    numbers = [fraction_of(branch, search) for branch in branches]
     located = dataset_of(branches, first, base)
     on_row = _on_row(list(starts), numbers, located, ACCURACY * (options.high - options.low))
     folds = located.isel(bifurcation=[k for tongue in on_row for k in tongue.folds])
@@ -303,7 +273,9 @@ def _row_of(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     long = [d for d in others if part.sizes[d] > 1]
     if long:
         value = float(part[long[0]].values[part.sizes[long[0]] // 2])
-        raise ValueError(f"{PURPOSE}; choose a value of {', '.join(long)}, such as --at {long[0]}={value:g}")
+        raise ValueError(
+            f"tongues are searched on one row of cells; choose a value of {', '.join(long)}, such as --at {long[0]}={value:g}"
+        )
     return part.isel(dict.fromkeys(others, 0))
 
 
@@ -423,10 +395,9 @@ def _is_thin(row: TableRow) -> bool:
 
 
 def _words(row: TableRow) -> Words:
-    words = {name: number(row[name], ".7f") for name in ("from", "to")}
     return {
         "tongue": row["tongue"],
-        **words,
+        **{name: number(row[name], ".7f") for name in ("from", "to")},
         "width": number(row["width"], ".3g"),
         "error": number(row["error"], ".1g"),
         "branches": str(row["branches"]),
