@@ -273,9 +273,8 @@ def _row_of(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     long = [d for d in others if part.sizes[d] > 1]
     if long:
         value = float(part[long[0]].values[part.sizes[long[0]] // 2])
-        raise ValueError(
-            f"tongues are searched on one row of cells; choose a value of {', '.join(long)}, such as --at {long[0]}={value:g}"
-        )
+        told = f"choose a value of {', '.join(long)}, such as --at {long[0]}={value:g}"
+        raise ValueError(f"tongues are searched on one row of cells; {told}")
     return part.isel(dict.fromkeys(others, 0))
 
 
