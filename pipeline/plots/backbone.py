@@ -100,7 +100,7 @@ def _handles(ds: xr.Dataset, kinds: Sequence[str], levels: Mapping[Any, str]) ->
         where = ", ".join(f"{name} = {value:g}" for name, value in level)
         lines.append({"color": colour, "label": f"response, {where}" if where else "response"})
     lines.append({**UNSTABLE, "label": "unstable"})
-    return [Line2D([], [], **{k: v for k, v in look.items() if k != "zorder"}) for look in lines]
+    return style.handles(lines)
 
 
 def draw_backbone(run: OpenRun, options: BackboneFigureOptions) -> style.DataFigure:

@@ -11,7 +11,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
-from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.analysis import isolas_of, limits_of
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
@@ -140,9 +139,7 @@ def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, s
 def _stored(ds: xr.Dataset) -> xr.Dataset:
     """Drop from the branches' dataset what NetCDF cannot store."""
     plain = {k: v for k, v in ds.attrs.items() if isinstance(v, str | int | float | np.ndarray)}
-    return ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object]).assign_attrs(
-        {**plain, "title": "branches of periodic orbits"}
-    )
+    return style.storable(ds, "branches of periodic orbits").assign_attrs(plain)
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
@@ -291,7 +288,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
                 zorder=9.0,
                 gid=f"name:{name.text}",
                 arrowprops=_LEADER,
-                path_effects=[withStroke(linewidth=1.5, foreground="white")],
+                path_effects=style.halo(1.5),
             )
             break
 
@@ -334,8 +331,7 @@ def _free(
 def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
     present = {kind for kind, branch, *_ in [*_located(ds), *_limits(ds)] if branch in chosen}
     return [
-        Line2D([], [], label="stable", **{k: v for k, v in STABLE.items() if k != "zorder"}),
-        Line2D([], [], label="unstable", **{k: v for k, v in UNSTABLE.items() if k != "zorder"}),
+        *style.handles([{**STABLE, "label": "stable"}, {**UNSTABLE, "label": "unstable"}]),
         *(
             Line2D(
                 [],
@@ -405,7 +401,7 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
     Points of codimension two have their names if there is one panel; several are too small.
     """
     along, across = ("first", "second") if str(ds.attrs["first_parameter"]) == x else ("second", "first")
-    halo = [withStroke(linewidth=2.2, foreground="white")]
+    halo = style.halo(2.2)
     for ax in axes:
         low, high = ax.get_xlim(), ax.get_ylim()
         for i in range(ds.sizes["curve"]):
@@ -439,7 +435,7 @@ def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, 
     A name that would lie over another one is left out.
     """
     names = str(ds["special_kind"].attrs["flag_meanings"]).split()
-    halo = [withStroke(linewidth=2.0, foreground="white")]
+    halo = style.halo()
     taken: list[np.ndarray] = []
     for k in range(ds.sizes["special"]):
         at = float(ds[f"special_{along}"][k]), float(ds[f"special_{across}"][k])

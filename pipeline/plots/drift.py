@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -80,9 +81,8 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> tuple[
     y = section.copy(data=measure.shown(section.values))
     y.attrs = {"units": measure.unit, "long_name": measure.name}
     x = part[at_section(parameter)].broadcast_like(section).transpose(*section.dims)
-    return x.reset_coords(drop=True).drop_vars(at_section(parameter), errors="ignore"), y.drop_vars(
-        at_section(parameter)
-    )
+    x = x.reset_coords(drop=True).drop_vars(at_section(parameter), errors="ignore")
+    return x, y.drop_vars(at_section(parameter))
 
 
 def _ramp() -> ListedColormap:
@@ -95,9 +95,7 @@ def _colours(part: xr.Dataset, swept: list[str]) -> list[str]:
     if not swept:
         return [style.BLUE]
     values = part[swept[0]].values.astype(float)
-    share = (values - values.min()) / np.ptp(values)
-    ramp = _ramp()
-    return [to_hex(ramp(s)) for s in share]
+    return [to_hex(colour) for colour in _ramp()((values - values.min()) / np.ptp(values))]
 
 
 def _draw_cells(ax: Axes, data: xr.Dataset, parameter: str, swept: list[str], colours: list[str]) -> None:
@@ -131,13 +129,6 @@ def draw(run: OpenRun, options: DriftFigureOptions) -> style.DataFigure:
     cube = run.cube()
     at, notes = values_of(run, options)
     below = run.of(options.over).cube() if options.over else None
-    figure = plot_drift(
-        cube,
-        moving_parameter(getattr(model_of(cube), "ramps", ()), options.moving),
-        below=below,
-        state=options.state,
-        at=at,
-        degrees=options.degrees,
-        frame=frame_of(options),
-    )
-    return noted(figure, notes)
+    moving = moving_parameter(getattr(model_of(cube), "ramps", ()), options.moving)
+    look: dict[str, Any] = {"state": options.state, "degrees": options.degrees, "frame": frame_of(options)}
+    return noted(plot_drift(cube, moving, below=below, at=at, **look), notes)

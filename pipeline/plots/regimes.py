@@ -375,8 +375,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
         The colour shows the kind, the dashes show the period. Points of codimension two have a dot and their
         short name. Its `data` are the curves.
     """
-    stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])
-    fig = style.new_figure(4.4, stored.assign_attrs(title="curves of bifurcations"), frame)
+    fig = style.new_figure(4.4, style.storable(ds, "curves of bifurcations"), frame)
     ax = fig.add_subplot()
     style.style_axes(ax)
     periods = sorted({int(p) for p in ds["orbit_period"].values})

@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of
 from pipeline.analysis.branches.kinds import KINDS, LABELS
@@ -115,12 +114,8 @@ def plot_response(
 
 
 def _stored(ds: xr.Dataset, points: Mapping[str, np.ndarray] | None) -> xr.Dataset:
-    plain = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object]).assign_attrs(
-        title="frequency response"
-    )
-    if points is None:
-        return plain
-    return plain.assign({f"measured_{name}": ("measured", values) for name, values in points.items()})
+    measured = {f"measured_{name}": ("measured", values) for name, values in (points or {}).items()}
+    return style.storable(ds, "frequency response").assign(measured)
 
 
 def levels_of(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
@@ -194,10 +189,9 @@ def _name_isolas(ax: Axes, ds: xr.Dataset, amplitude: np.ndarray) -> None:
     for i in isolas:
         highest = int(np.nanargmax(amplitude[i]))
         at = float(ds["parameter"].values[i, highest]), amplitude[i, highest]
-        halo = [withStroke(linewidth=1.5, foreground="white")]
         ax.annotate(
             "isola", at, (0.0, 4.0), textcoords="offset points", ha="center", va="bottom",
-            fontsize=style.figure_of(ax).look.tick, zorder=9.0, path_effects=halo,
+            fontsize=style.look_of(ax).tick, zorder=9.0, path_effects=style.halo(1.5),
         )  # fmt: skip
 
 
@@ -216,7 +210,7 @@ def _handles(ds: xr.Dataset, levels: Mapping[Any, str], has_points: bool) -> lis
     lines += [{**mark, "marker": MARKERS[k], "label": f"{LABELS[k]} {NAMES[k]}"} for k in kinds]
     if has_points:
         lines.append({**_POINTS, "label": "measured"})
-    return [Line2D([], [], **{k: v for k, v in look.items() if k != "zorder"}) for look in lines]
+    return style.handles(lines)
 
 
 def read_points(path: str | Path, parameter: str) -> dict[str, np.ndarray]:
@@ -246,11 +240,5 @@ def draw(run: OpenRun, options: ResponseFigureOptions) -> style.DataFigure:
         raise SpecError(f"--harmonic {options.harmonic}: only {options.harmonics} are computed; raise --harmonics.")
     points = read_points(options.points, options.parameter) if options.points else None
     found = run.derive("response", **options.part(ResponseOptions))
-    return plot_response(
-        found,
-        channel=options.channel,
-        harmonic=options.harmonic,
-        points=points,
-        degrees=options.degrees,
-        frame=frame_of(options),
-    )
+    chosen: dict[str, Any] = {name: getattr(options, name) for name in ("channel", "harmonic", "degrees")}
+    return plot_response(found, points=points, frame=frame_of(options), **chosen)

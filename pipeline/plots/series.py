@@ -69,10 +69,6 @@ def _title(ax: Axes, text: str) -> None:
     ax.set_title(text, loc="left", fontsize=style.look_of(ax).legend)
 
 
-def _nothing(ax: Axes) -> None:
-    ax.text(0.5, 0.5, "too few samples", transform=ax.transAxes, ha="center", va="center")
-
-
 def _portrait(ax: Axes, ds: xr.Dataset) -> None:
     name, unit = str(ds.attrs["channel"]), str(ds.attrs["unit"])
     now, later = ds["vector"].values.T
@@ -93,7 +89,7 @@ def _divergence(ax: Axes, ds: xr.Dataset) -> None:
         ax.plot(ds["elapsed"], ds["divergence"], color="black", linewidth=0.9, gid="divergence")
         ax.plot(ds["elapsed"], ds["fit_line"], color=style.VERMILLION, linewidth=1.6, gid="fit")
     else:
-        _nothing(ax)
+        style.write(ax, "too few samples")
     style.label_axes(ax, labels.with_unit("time", "s"), "mean log distance")
     _title(ax, f"exponent {_told(ds, 'exponent', '.2g')}")
 
@@ -126,7 +122,7 @@ def _recurrences(ax: Axes, ds: xr.Dataset) -> None:
         image = ds["recurrent"].values[::stride, ::stride]
         ax.imshow(image, cmap="Greys", origin="lower", extent=(0.0, end, 0.0, end), aspect="auto", interpolation="none")
     else:
-        _nothing(ax)
+        style.write(ax, "too few samples")
     style.label_axes(ax, labels.with_unit("time", "s"), labels.with_unit("time", "s"))
     _title(ax, f"determinism {_told(ds, 'determinism', '.3f')}")
 

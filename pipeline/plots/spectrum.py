@@ -10,7 +10,6 @@ from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
-from matplotlib.patheffects import withStroke
 from scipy.signal import find_peaks
 
 from pipeline.analysis.run import OpenRun
@@ -157,7 +156,7 @@ def _draw_one(ax: Axes, one: xr.Dataset, column: str, measure: Measure, colour: 
     if len(y):
         ax.set_ylim(max(low, 0.3 * y.min()), 10.0 * y.max())
     else:
-        ax.text(0.5, 0.5, "at rest", transform=ax.transAxes, ha="center", va="center")
+        style.write(ax, "at rest")
     style.label_axes(ax, None, labels.with_unit(f"{what} of {measure.symbol}", unit if unit != "1" else ""))
 
 
@@ -165,15 +164,18 @@ def _evidence(one: xr.Dataset, column: str) -> list[str]:
     """Return what a spectrum rests on: the resolution of an average; of a torus its second frequency."""
     if "estimate" in one and int(one["estimate"]) == LINES:
         return []
-    width = float(one["resolution_hz"])
-    rate = float(one["rate_hz"]) if "rate_hz" in one else np.nan
-    fine = f"{width / rate:.3g} orders" if column == "order" and np.isfinite(rate) else f"{width:.3g} Hz"
-    told = [f"{int(one['n_averages'])} averages", f"resolution {fine}"]
+    told = [_resolution(one, column)]
     if "kind" in one and int(one["kind"]) == TORUS:
         second = float(one["second_hz"])
-        own = f"$f_2$ = {second:.6g} Hz" if np.isfinite(second) else "no second frequency decided"
-        told.insert(0, own)
+        told.insert(0, f"$f_2$ = {second:.6g} Hz" if np.isfinite(second) else "no second frequency decided")
     return told
+
+
+def _resolution(one: xr.Dataset, column: str) -> str:
+    """Return the number of averages of a spectrum, and its resolution."""
+    width, rate = (float(one[name]) if name in one else np.nan for name in ("resolution_hz", "rate_hz"))
+    fine = f"{width / rate:.3g} orders" if column == "order" and np.isfinite(rate) else f"{width:.3g} Hz"
+    return style.join([f"{int(one['n_averages'])} averages", f"resolution {fine}"])
 
 
 def _name_lines(ax: Axes, one: xr.Dataset, column: str) -> None:
@@ -192,10 +194,10 @@ def _name_lines(ax: Axes, one: xr.Dataset, column: str) -> None:
         free = all(abs(spot[0] - a) > APART[0] or abs(spot[1] - b) > APART[1] for a, b in taken)
         if name and free and 0.03 < spot[0] < 0.97 and len(taken) < MOST_NAMES:
             taken.append(spot)
-            size = style.look_of(ax).tick
-            look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": size}
-            halo = [withStroke(linewidth=2.0, foreground="white")]
-            ax.annotate(name, (x[peak], y[peak]), (0, 2), path_effects=halo, **look)
+            look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom"}
+            ax.annotate(
+                name, (x[peak], y[peak]), (0, 2), path_effects=style.halo(), fontsize=style.look_of(ax).tick, **look
+            )
 
 
 def _names(one: xr.Dataset, column: str) -> list[tuple[float, str]]:
@@ -203,10 +205,9 @@ def _names(one: xr.Dataset, column: str) -> list[tuple[float, str]]:
     first, second = float(one["first_hz"]), float(one["second_hz"])
     unit = first if column == "order" else 1.0
     both = [(m, n) for m in range(-MOST_NAMED, MOST_NAMED + 1) for n in range(-MOST_NAMED, MOST_NAMED + 1)]
-    places = [
-        ((m * first + n * second) / unit, m, n) for m, n in sorted(both, key=lambda one: abs(one[0]) + abs(one[1]))
-    ]
-    return [(place, _combination(m, n)) for place, m, n in places if place > 0.0]
+    both.sort(key=lambda one: abs(one[0]) + abs(one[1]))
+    places = [((m * first + n * second) / unit, _combination(m, n)) for m, n in both]
+    return [(place, name) for place, name in places if place > 0.0]
 
 
 def _combination(first: int, second: int) -> str:
@@ -283,10 +284,8 @@ def _told(data: xr.Dataset, column: str) -> str:
     own = data["estimate"].values == AVERAGE
     parts = [_fixed(data)]
     if own.any():
-        one = data.isel(spectrum=int(np.flatnonzero(own)[0]))
-        fine = float(one["resolution_hz"])
-        told = f"{fine / float(one['rate_hz']):.3g} orders" if column == "order" else f"{fine:.3g} Hz"
-        parts.append(f"where no orbit closes: {int(one['n_averages'])} averages, resolution {told}")
+        told = _resolution(data.isel(spectrum=int(np.flatnonzero(own)[0])), column)
+        parts.append(f"where no orbit closes: {told}")
     ids = sorted(set(data["attractor"].values.tolist()))
     parts.append(f"sets {', '.join(map(letter, ids))}" if len(ids) > 1 else f"set {letter(ids[0])}")
     return style.join(parts)
@@ -323,9 +322,8 @@ def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str) -> tuple[np
             continue
         amplitude = one["amplitude"].values[: len(own)]
         shown = 0.5 * amplitude**2 / float(one["bandwidth_hz"]) if is_density else amplitude
-        rows = np.floor(own / np.nanmax(bins) * ROWS + 1e-6).astype(
-            int
-        )  # of equal orders the same, in spite of rounding
+        # of equal orders the same, in spite of rounding
+        rows = np.floor(own / np.nanmax(bins) * ROWS + 1e-6).astype(int)
         for thick in (-1, 0, 1):
             near = np.clip(rows + thick, 0, ROWS - 1)
             image[near, place] = np.fmax(image[near, place], shown)

@@ -24,6 +24,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import AutoMinorLocator, MaxNLocator
 
 from pipeline.layout.own_words import arguments_in_own_words
@@ -436,3 +437,23 @@ def fill_columns(
 def join(parts: Iterable[str]) -> str:
     """Join the texts that are not empty with commas."""
     return ", ".join(part for part in parts if part)
+
+
+def halo(width: float = 2.0) -> list[AbstractPathEffect]:
+    """Return the path effects of a text or a line with a white rim [pt], which is read over colours."""
+    return [withStroke(linewidth=width, foreground="white")]
+
+
+def handles(looks: Iterable[Mapping[str, Any]]) -> list[Line2D]:
+    """Return the legend entries of lines and markers with given looks."""
+    return [Line2D([], [], **{name: value for name, value in look.items() if name != "zorder"}) for look in looks]
+
+
+def storable(ds: xr.Dataset, title: str) -> xr.Dataset:
+    """Return a dataset with a title and without what NetCDF cannot store."""
+    return ds.drop_vars([name for name, v in ds.variables.items() if v.dtype == object]).assign_attrs(title=title)
+
+
+def write(ax: Axes, text: str) -> None:
+    """Write a text in the middle of a panel that has no data."""
+    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.run import OpenRun
@@ -36,6 +36,8 @@ CLOSE = 1e-6
 """Largest distance of the rotation number of a closed orbit from p/q."""
 
 UNKNOWN = "0.8"
+
+_NAME: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom"}
 
 
 @style.drawn
@@ -89,11 +91,9 @@ def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
 
 def _about(part: xr.Dataset) -> str:
     known, error = part["rotation"].notnull(), part["rotation_error"]
-    size = (
-        f"errors up to {float(error.max()):.1g}, half of them below {float(error.median()):.1g}" if known.any() else ""
-    )
+    size = f"errors up to {float(error.max()):.1g}, half of them below {float(error.median()):.1g}"
     missing = int((~known).sum())
-    return style.join([size, f"{missing} of {known.size} cells have none" if missing else ""])
+    return style.join([size if known.any() else "", f"{missing} of {known.size} cells have none" if missing else ""])
 
 
 def _draw_staircase(fig: style.DataFigure, ax: Axes, data: xr.Dataset, axis: xr.DataArray) -> None:
@@ -105,16 +105,8 @@ def _draw_staircase(fig: style.DataFigure, ax: Axes, data: xr.Dataset, axis: xr.
     style.label_axes(ax, labels.parameter_label(axis), f"rotation number [{data['rotation'].attrs['long_name']}]")
     style.legend_above(fig, [style.dot("locked: closed orbits", style.BLUE), style.dot("not locked", "0.55")])
     for fraction, (low, high) in _steps(x[locked], rotation[locked], axis).items():
-        ax.annotate(
-            f"{fraction.numerator}/{fraction.denominator}",
-            (0.5 * (low + high), float(fraction)),
-            (0.0, 4.0),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=fig.look.tick,
-            annotation_clip=True,
-        )
+        text, at = f"{fraction.numerator}/{fraction.denominator}", (0.5 * (low + high), float(fraction))
+        ax.annotate(text, at, (0.0, 4.0), fontsize=fig.look.tick, annotation_clip=True, **_NAME)
 
 
 def _steps(x: np.ndarray, rotation: np.ndarray, axis: xr.DataArray) -> dict[Fraction, tuple[float, float]]:
@@ -170,8 +162,7 @@ def plot_tongues(
     Edges are black over the map of a cube's rotation numbers, if it is given; else their colour tells the denominator.
     """
     first, second = str(ds.attrs["first_parameter"]), str(ds.attrs["second_parameter"])
-    stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])
-    stored = stored.assign_attrs(title="Arnold tongues")
+    stored = style.storable(ds, "Arnold tongues")
     data = rotation_data(cube, [first, second]) if cube is not None else None
     fig = style.new_figure(4.4, stored if data is None else stored.merge(data), frame)
     ax = fig.add_subplot()
@@ -183,24 +174,14 @@ def plot_tongues(
     if data is not None:
         ax.set_xlim(low)
         ax.set_ylim(high)
-    style.label_axes(
-        ax,
-        labels.swept_label(first, shown_unit(ds["first"].attrs)),
-        labels.swept_label(second, shown_unit(ds["second"].attrs)),
-    )
+    named = ((name, shown_unit(ds[role].attrs)) for name, role in ((first, "first"), (second, "second")))
+    style.label_axes(ax, *(labels.swept_label(name, unit) for name, unit in named))
     if data is None:
         _explain(fig, ds)
-    n_found = int((ds["n_branches"] > 0).sum())
-    style.caption(
-        ax,
-        style.join(
-            [
-                f"{n_found} of {ds.sizes['tongue']} tongues with denominators up to {ds.attrs['max_denominator']}",
-                f"searched at {second} = {ds.attrs['row']:g}",
-                labels.caption(ds, with_start=False),
-            ]
-        ),
-    )
+    found = f"{int((ds['n_branches'] > 0).sum())} of {ds.sizes['tongue']} tongues"
+    told = f"{found} with denominators up to {ds.attrs['max_denominator']}"
+    searched = f"searched at {second} = {ds.attrs['row']:g}"
+    style.caption(ax, style.join([told, searched, labels.caption(ds, with_start=False)]))
     style.limits(ax, frame)
     _name_tongues(fig, ax, ds)
     style.finish(fig)
@@ -212,22 +193,15 @@ def _colour(denominator: int) -> str:
 
 
 def _draw_edges(ax: Axes, ds: xr.Dataset, over_map: bool) -> None:
-    halo = [withStroke(linewidth=2.0, foreground="white")]
     for i in range(ds.sizes["curve"]):
         n, p, q = (int(ds[name][i]) for name in ("n_points", "numerator", "denominator"))
-        ax.plot(
-            ds["first"].values[i, :n],
-            ds["second"].values[i, :n],
-            color="black" if over_map else _colour(q),
-            linewidth=0.9,
-            path_effects=halo if over_map else None,
-            gid=f"tongue:{p}/{q}",
-        )
+        look: dict[str, Any] = {"color": "black", "path_effects": style.halo()} if over_map else {"color": _colour(q)}
+        line = ds["first"].values[i, :n], ds["second"].values[i, :n]
+        ax.plot(*line, linewidth=0.9, gid=f"tongue:{p}/{q}", **look)
 
 
 def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
     """Write the name p/q of each tongue at the highest point of its edges, if there is room."""
-    halo = [withStroke(linewidth=2.0, foreground="white")]
     taken: list[np.ndarray] = []
     (left, right), (bottom, ceiling) = ax.get_xlim(), ax.get_ylim()
     order = np.lexsort((ds["numerator"].values, ds["denominator"].values))
@@ -243,18 +217,8 @@ def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
         at = np.minimum(top, [1.0, 0.955])
         if not take_room(ax, (left + at[0] * (right - left), bottom + at[1] * (ceiling - bottom)), taken):
             continue
-        ax.annotate(
-            f"{p}/{q}",
-            at,
-            (0.0, 1.5),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=fig.look.tick,
-            path_effects=halo,
-            zorder=7,
-        )
+        look = {**_NAME, "fontsize": fig.look.tick, "path_effects": style.halo(), "zorder": 7}
+        ax.annotate(f"{p}/{q}", at, (0.0, 1.5), xycoords="axes fraction", **look)
 
 
 def _explain(fig: style.DataFigure, ds: xr.Dataset) -> None:
