@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+import magpend
 from magpend_core import Status, load_preset
 from magpend_core.models.sectioned import sectioned
 from pipeline.compute.integrate import rest_states
@@ -74,6 +75,23 @@ def sweep(model, starts, *, axes=(), frequency_hz=None, lengths=(200, 8), tolera
         more["parameters"] = {"frequency_hz": frequency_hz, **more.get("parameters", {})}
     spec = {"kind": "sweep", "model": model, "initial_conditions": grid, "integration": integration, **more}
     return {**spec, "axes": dict(axes)} if axes else spec
+
+
+def swept(model, out, starts, lengths, *, section=None, parameters=None, **axes):
+    """Run a sweep from listed starts, or from four random ones in ranges of the states.
+
+    Axes are lists of values, or their first and last value and their number; a section is a state and a direction.
+    """
+    spec = magpend.Spec("sweep", model)
+    for name, values in axes.items():
+        spec = spec.with_axis(name, *values) if isinstance(values, tuple) else spec.with_axis(name, values=values)
+    if parameters is not None:
+        spec = spec.with_parameters(**parameters)
+    if section is not None:
+        spec = spec.with_section(of=section[0], value=0.0, direction=section[1])
+    is_random = isinstance(starts, dict)
+    spec = spec.with_start_random(n=4, seed=0, **starts) if is_random else spec.with_start_list(points=starts)
+    return magpend.run(spec.with_integration(n_transient=lengths[0], n_keep=lengths[1]), out, workers=0)
 
 
 def line(start, stop, num):

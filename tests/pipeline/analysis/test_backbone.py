@@ -16,21 +16,17 @@ from pipeline.analysis.response.backbone import backbone_table
 from pipeline.analysis.response.resonance import ModeProblem, mode_family, normal_mode
 from pipeline.specification.problems import SpecError
 
+from .cubes import swept
+
 OMEGA = 2.0 * np.pi
 
 
 @pytest.fixture(scope="module")
 def hardening(tmp_path_factory):
     """x'' + .1 x' + x + .5 x^3 = F cos(w t) at two levels of the force."""
-    spec = (
-        magpend.Spec("sweep", "duffing", "hardening")
-        .with_parameters(preset="hardening")
-        .with_axis("amplitude", values=[0.1, 0.3])
-        .with_axis("frequency_hz", 0.5 / OMEGA, 2.0 / OMEGA, 9)
-        .with_start_random(n=4, x=(-3, 3), v=(-3, 3), seed=0)
-        .with_integration(n_transient=300, n_keep=4)
-    )
-    return magpend.run(spec, tmp_path_factory.mktemp("runs") / "hardening", workers=0)
+    axes = {"amplitude": [0.1, 0.3], "frequency_hz": (0.5 / OMEGA, 2.0 / OMEGA, 9)}
+    out, starts = tmp_path_factory.mktemp("hardening") / "run", {"x": (-3, 3), "v": (-3, 3)}
+    return swept("duffing", out, starts, (300, 4), parameters={"preset": "hardening"}, **axes)
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +41,8 @@ def masses(tmp_path_factory):
         "x1'' = -(2*x1 - x2) - 0.5*x1**3\nx2'' = -(2*x2 - x1)",
         name="masses", quantities={"energy": "x1_dot**2/2 + x2_dot**2/2 + x1**2 + x2**2 - x1*x2 + x1**4/8"},
     )  # fmt: skip
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_start_list(points=[(1.0, 0.5, 0.0, 0.0)])
-        .with_section(of="x1_dot", value=0.0, direction="down")
-        .with_integration(n_transient=0, n_keep=2)
-    )
-    return magpend.run(spec, tmp_path_factory.mktemp("runs") / "masses", workers=0)
+    out = tmp_path_factory.mktemp("masses") / "run"
+    return swept(model, out, [(1.0, 0.5, 0.0, 0.0)], (0, 2), section=("x1_dot", "down"))
 
 
 def curve(ds, i):
@@ -103,13 +94,7 @@ def test_phase_resonance__of_two_linear_masses_is_exact(tmp_path):
         "x1'' = -(2*x1 - x2) - c*(2*x1' - x2') + F*cos(2*pi*f*t)\nx2'' = -(2*x2 - x1) - c*(2*x2' - x1')",
         name="linear", c=0.05, F=0.1, states={name: {"scale": 4.0} for name in ("x1", "x2", "x1_dot", "x2_dot")},
     )  # fmt: skip
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_axis("frequency_hz", 0.5 / OMEGA, 2.5 / OMEGA, 3)
-        .with_start_list(points=[(0.0, 0.0, 0.0, 0.0)])
-        .with_integration(n_transient=200, n_keep=4)
-    )
-    run = magpend.run(spec, tmp_path / "run", workers=0)
+    run = swept(model, tmp_path / "run", [(0.0, 0.0, 0.0, 0.0)], (200, 4), frequency_hz=(0.5 / OMEGA, 2.5 / OMEGA, 3))
 
     def response(omega):
         own = 2.0 + 0.1j * omega - omega**2
@@ -187,13 +172,7 @@ def test_normal_mode__of_a_pendulum_softens_towards_its_upper_rest(tmp_path):
     model = magpend.model(
         "th'' = -sin(th) - c*th'", name="swing", states={"th": {"unit": "rad", "on_circle": True}}, c=0.1
     )
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_start_list(points=[(1.0, 0.0), (3.1, 0.0)])
-        .with_section(of="th_dot", value=0.0, direction="down")
-        .with_integration(n_transient=0, n_keep=2)
-    )
-    run = magpend.run(spec, tmp_path / "run", workers=0)
+    run = swept(model, tmp_path / "run", [(1.0, 0.0), (3.1, 0.0)], (0, 2), section=("th_dot", "down"))
     ds = run.backbone(undamped={"c": 0.0}, low=0.06)
     (one,) = (curve(ds, i) for i in range(ds.sizes["curve"]))
     amplitude = one["section"].sel(state="th").values

@@ -19,6 +19,19 @@ from pipeline.analysis.branches.equilibrium_curves import EquilibriumCurve
 from pipeline.analysis.branches.problems import Family
 from tests.core.flows import model_of
 
+FIRST, SECOND = "(p - (x^2 + y^2)/2 + 3*(z^2 + w^2)/10)", "(q - 2*(x^2 + y^2)/5 + 7*(z^2 + w^2)/10)"
+OSCILLATORS = {
+    "x": f"{FIRST}*x - 2*y",
+    "y": f"{FIRST}*y + 2*x",
+    "z": f"{SECOND}*z - 73*w/100",
+    "w": f"{SECOND}*w + 73*z/100",
+}
+"""Normal form of a double Hopf point at p = q = 0."""
+
+GROWTH = "(p + q*(x^2 + y^2) + 3*(x^2 + y^2)^2)"
+BAUTIN = {"x": f"{GROWTH}*x - (17/10 + (x^2 + y^2)/2)*y", "y": f"{GROWTH}*y + (17/10 + (x^2 + y^2)/2)*x"}
+"""Normal form of a generalised Hopf point at p = q = 0."""
+
 SHIFT = 0.4
 """Place of the equilibria of interest, in each state."""
 
@@ -126,12 +139,7 @@ def test_bogdanov_takens():
 
 def test_generalised_hopf():
     """z' = (p + i w) z + q z |z|^2 + 3 z |z|^4: with z = sqrt(2) w, lyapunov2 = 4 * 3 / 1.7."""
-    s = "(x^2 + y^2)"
-    rates = {
-        "x": f"(p + q*{s} + 3*{s}^2)*x - (17/10 + {s}/2)*y",
-        "y": f"(p + q*{s} + 3*{s}^2)*y + (17/10 + {s}/2)*x",
-        "z": "-z + x^2 - x*y/3",
-    }
+    rates = {**BAUTIN, "z": "-z + x^2 - x*y/3"}
     model = disguised(rates, {"p": 0.0, "q": 0.0}, "1 + 3*x/10 - y/5 + x*y/4")
     curves = curves_of(model, "hopf", bent([0, 0, 0]), [0.0, -0.5], generations=0)
     np.testing.assert_allclose(on(curves, "hopf")[:, 0], 0.0, atol=1e-10)
@@ -162,14 +170,7 @@ def test_zero_hopf(kind):
 
 def test_double_hopf():
     """Two oscillators: p11 = -.5, p12 = .3, p21 = -.4, p22 = .7; with z = sqrt(2) w the coefficients double."""
-    r, s = "(x^2 + y^2)", "(z^2 + w^2)"
-    rates = {
-        "x": f"(p - {r}/2 + 3*{s}/10)*x - 2*y",
-        "y": f"(p - {r}/2 + 3*{s}/10)*y + 2*x",
-        "z": f"(q - 2*{r}/5 + 7*{s}/10)*z - 73*w/100",
-        "w": f"(q - 2*{r}/5 + 7*{s}/10)*w + 73*z/100",
-    }
-    model = disguised(rates, {"p": 0.0, "q": 0.0})
+    model = disguised(OSCILLATORS, {"p": 0.0, "q": 0.0})
     curves = curves_of(model, "hopf", bent([0, 0, 0, 0]), [0.0, -0.5], omega=2.0, generations=1)
     hopf = [c.values for c in curves if c.kind == "hopf"]
     assert len(hopf) == 2
@@ -402,9 +403,7 @@ def seen(model, of):
 @pytest.mark.slow
 def test_switching__fold_of_cycles():
     """From a generalised Hopf point: p + q r^2 + 3 r^4 has a double root where q^2 = 12 p, q < 0."""
-    s = "(x^2 + y^2)"
-    rates = {"x": f"(p + q*{s} + 3*{s}^2)*x - (17/10 + {s}/2)*y", "y": f"(p + q*{s} + 3*{s}^2)*y + (17/10 + {s}/2)*x"}
-    model = seen(disguised(rates, {"p": 0.0, "q": 0.0}), "y")
+    model = seen(disguised(BAUTIN, {"p": 0.0, "q": 0.0}), "y")
     curves = curves_of(model, "hopf", bent([0, 0]), [0.0, -0.5], ((-0.2, 0.2), (-1.0, 1.0)))
     assert sorted((c.kind, c.family.period) for c in curves) == [("fold", 1), ("hopf", 0)]
     cycles = next(c for c in curves if c.kind == "fold")
@@ -420,14 +419,7 @@ def test_switching__fold_of_cycles():
 @pytest.mark.slow
 def test_switching__tori():
     """From a double Hopf point: the cycle r^2 = 2 p at q = .4 r^2, and the cycle s^2 = -q/.7 at p = -.3 s^2."""
-    r, s = "(x^2 + y^2)", "(z^2 + w^2)"
-    rates = {
-        "x": f"(p - {r}/2 + 3*{s}/10)*x - 2*y",
-        "y": f"(p - {r}/2 + 3*{s}/10)*y + 2*x",
-        "z": f"(q - 2*{r}/5 + 7*{s}/10)*z - 73*w/100",
-        "w": f"(q - 2*{r}/5 + 7*{s}/10)*w + 73*z/100",
-    }
-    model = seen(disguised(rates, {"p": 0.0, "q": 0.0}), "y")
+    model = seen(disguised(OSCILLATORS, {"p": 0.0, "q": 0.0}), "y")
     curves = curves_of(model, "hopf", bent([0, 0, 0, 0]), [0.0, -0.2], ((-0.2, 0.2), (-0.2, 0.2)), omega=2.0)
     tori = [c for c in curves if c.kind == "neimark_sacker"]
     p, q = np.concatenate([c.values[np.abs(c.values).max(axis=1) > 0.02] for c in tori]).T

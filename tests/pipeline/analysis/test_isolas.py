@@ -18,6 +18,8 @@ from pipeline.analysis.response.analysis import response_table
 from pipeline.layout.vocabulary import parameters_of
 from tests.pipeline.analysis.test_response import cycles_run
 
+from .cubes import swept
+
 OMEGA = 2.0 * np.pi
 EPS, XI, LAM, K = 0.05, 0.4, 0.2, 4.0 / 3.0
 """Mass ratio, dampings and stiffness; the model and eps, lam and k are those of Starosvetsky and Gendelman, J. Sound
@@ -29,13 +31,8 @@ def sink(tmp_path_factory):
         "x'' = -eps*xi*x' - x - eps*c + eps*A*cos(2*pi*f*t)\ny'' = c\nc = lam*(x' - y') + k*(x - y)**3",
         name="sink", eps=EPS, xi=XI, lam=LAM, k=K, A=0.75,
     )  # fmt: skip
-    spec = (
-        magpend.Spec("sweep", model, "sink")
-        .with_axis("frequency_hz", 0.85 / OMEGA, 1.1 / OMEGA, 6)
-        .with_start_list(points=[(0.0, 0.0, 0.0, 0.0)])
-        .with_integration(n_transient=400, n_keep=4)
-    )
-    return magpend.run(spec, tmp_path_factory.mktemp("runs") / "sink", workers=0)
+    out = tmp_path_factory.mktemp("sink") / "run"
+    return swept(model, out, [(0.0, 0.0, 0.0, 0.0)], (400, 4), frequency_hz=(0.85 / OMEGA, 1.1 / OMEGA, 6))
 
 
 @pytest.fixture(scope="module")
@@ -209,14 +206,9 @@ def test_response__names_the_isola(run):
 def test_index_sums__per_row_of_a_run(tmp_path):
     """A hardening spring agrees; a softening one, from which cells escape, decides nothing."""
     model = magpend.model("x'' = -0.1*x' - x - b*x**3 + 0.3*cos(2*pi*f*t)", name="spring", b=1.0)
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_axis("b", values=[-0.3, 1.0])
-        .with_axis("frequency_hz", 1.05 / OMEGA, 2.0 / OMEGA, 4)
-        .with_start_random(n=4, x=(-3, 3), x_dot=(-3, 3), seed=0)
-        .with_integration(n_transient=300, n_keep=4)
-    )
-    ds = magpend.run(spec, tmp_path / "run", workers=0).branches(parameter="frequency_hz", isolas=2)
+    axes = {"b": [-0.3, 1.0], "frequency_hz": (1.05 / OMEGA, 2.0 / OMEGA, 4)}
+    run = swept(model, tmp_path / "run", {"x": (-3, 3), "x_dot": (-3, 3)}, (300, 4), **axes)
+    ds = run.branches(parameter="frequency_hz", isolas=2)
     words = [VERDICTS[code] for code in ds["index_verdict"].values[:, 0]]
     assert ds["searched_b"].values.tolist() == [-0.3, -0.3, 1.0, 1.0]
     assert words == ["diverged", "diverged", "agrees", "agrees"]
@@ -239,13 +231,7 @@ def test_index_sums__on_a_circle(tmp_path):
     """A pendulum hangs or stands: two orbits, whose indices add up to the Euler characteristic of a cylinder, 0."""
     states = {"th": {"unit": "rad", "on_circle": True}}
     model = magpend.model("th'' = -0.5*th' - sin(th) + 0.1*cos(2*pi*f*t)", name="pendulum", states=states)
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_axis("frequency_hz", 0.3, 0.5, 3)
-        .with_start_list(points=[(0.1, 0.0)])
-        .with_integration(n_transient=100, n_keep=4)
-    )
-    ds = magpend.run(spec, tmp_path / "run", workers=0).branches(isolas=2)
+    ds = swept(model, tmp_path / "run", [(0.1, 0.0)], (100, 4), frequency_hz=(0.3, 0.5, 3)).branches(isolas=2)
     assert ds["n_orbits"].values[:, 0].tolist() == [2, 2]
     assert ds["index_sum"].values[:, 0].tolist() == [0, 0]
     assert (ds["index_verdict"] == VERDICTS.index("agrees")).all()

@@ -16,6 +16,8 @@ from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.plots.response import read_points
 from pipeline.specification.problems import SpecError
 
+from .cubes import swept
+
 OMEGA = 2.0 * np.pi
 
 
@@ -26,14 +28,8 @@ def hardening(tmp_path_factory):
         "x'' = -0.1*x' - x - b*x**3 + F*cos(2*pi*f*t)",
         name="hardening", b=1.0, F=0.3, quantities={"energy": "x_dot**2/2 + x**2/2 + b*x**4/4"},
     )  # fmt: skip
-    spec = (
-        magpend.Spec("sweep", model, "hardening")
-        .with_axis("F", values=[0.1, 0.3])
-        .with_axis("frequency_hz", 0.5 / OMEGA, 2.0 / OMEGA, 9)
-        .with_start_random(n=4, x=(-3, 3), x_dot=(-3, 3), seed=0)
-        .with_integration(n_transient=300, n_keep=4)
-    )
-    return magpend.run(spec, tmp_path_factory.mktemp("runs") / "hardening", workers=0)
+    out, starts = tmp_path_factory.mktemp("hardening") / "run", {"x": (-3, 3), "x_dot": (-3, 3)}
+    return swept(model, out, starts, (300, 4), F=[0.1, 0.3], frequency_hz=(0.5 / OMEGA, 2.0 / OMEGA, 9))
 
 
 @pytest.fixture(scope="module")
@@ -110,15 +106,9 @@ def test_duffing__has_the_folds_and_the_landings_of_an_independent_integration(r
 
 @pytest.mark.slow
 def test_duffing__has_a_response_without_a_bifurcation_to_a_force_called_amplitude(tmp_path):
-    spec = (
-        magpend.Spec("sweep", "duffing")
-        .with_parameters(preset="hardening")
-        .with_axis("amplitude", values=[0.01, 0.02])
-        .with_axis("frequency_hz", 0.1, 0.13, 3)
-        .with_start_list(points=[(0.0, 0.0)])
-        .with_integration(n_transient=100, n_keep=4)
-    )
-    ds = magpend.run(spec, tmp_path / "run", workers=0).response(parameter="frequency_hz")
+    axes = {"amplitude": [0.01, 0.02], "frequency_hz": (0.1, 0.13, 3)}
+    run = swept("duffing", tmp_path / "run", [(0.0, 0.0)], (100, 4), parameters={"preset": "hardening"}, **axes)
+    ds = run.response(parameter="frequency_hz")
     assert (ds.sizes["bifurcation"], ds.sizes["branch"]) == (0, 2)
     largest = ds["amplitude"].sel(channel="x").max("point")
     np.testing.assert_allclose(largest / ds["parameter_amplitude"], largest[0] / 0.01, rtol=1e-2)
@@ -230,14 +220,7 @@ def cycles_run(folder):
     model = magpend.model(
         "x' = x*g - 2*y\ny' = y*g + 2*x\ng = mu + x**2 + y**2 - (x**2 + y**2)**2", name="cycles", mu=0.1
     )
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_axis("mu", -0.3, 0.2, 6)
-        .with_start_list(points=[(1.0, 0.0)])
-        .with_section(of="y", value=0.0, direction="up")
-        .with_integration(n_transient=200, n_keep=4)
-    )
-    return magpend.run(spec, folder / "run", workers=0)
+    return swept(model, folder / "run", [(1.0, 0.0)], (200, 4), section=("y", "up"), mu=(-0.3, 0.2, 6))
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import magpend
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, explore
@@ -19,6 +18,8 @@ from pipeline.specification.problems import SpecError
 from tests.core.flows import model_of
 from tests.pipeline.analysis.test_bands import write_draws
 from tests.pipeline.bautin import SWEEP, TRUTH
+
+from .cubes import swept
 
 OMEGA = 2.0 * np.pi
 
@@ -113,14 +114,9 @@ def test_maps():
 @pytest.fixture(scope="module")
 def hardening(tmp_path_factory):
     """x'' + d x' + k x + c x^3 = F cos(w t) along its frequency: two folds."""
-    spec = (
-        magpend.Spec("sweep", "duffing", "hardening")
-        .with_parameters(preset="hardening")
-        .with_axis("frequency_hz", 0.5 / OMEGA, 2.0 / OMEGA, 9)
-        .with_start_random(n=4, x=(-3, 3), v=(-3, 3), seed=0)
-        .with_integration(n_transient=300, n_keep=4)
-    )
-    return magpend.run(spec, tmp_path_factory.mktemp("runs") / "hardening", workers=0)
+    out, starts = tmp_path_factory.mktemp("hardening") / "run", {"x": (-3, 3), "v": (-3, 3)}
+    band = (0.5 / OMEGA, 2.0 / OMEGA, 9)
+    return swept("duffing", out, starts, (300, 4), parameters={"preset": "hardening"}, frequency_hz=band)
 
 
 @pytest.fixture(scope="module")
@@ -167,14 +163,8 @@ def test_words_of_the_drive(folds):
 @pytest.mark.slow
 def test_doubling_with_the_drive(tmp_path):
     """Along the amplitude the drive's frequency is a parameter: 2 = damping + 2 linear + 2 cubic + frequency."""
-    spec = (
-        magpend.Spec("sweep", "duffing", "cascade")
-        .with_parameters(preset="twin-well", omega=1.2, overrides={"damping": 0.3})
-        .with_axis("amplitude", values=[0.25, 0.275])
-        .with_start_list(points=[(1.2, 0.0)])
-        .with_integration(n_transient=300, n_keep=8)
-    )
-    run = magpend.run(spec, tmp_path / "cascade", workers=0)
+    given = {"preset": "twin-well", "omega": 1.2, "overrides": {"damping": 0.3}}
+    run = swept("duffing", tmp_path / "run", [(1.2, 0.0)], (300, 8), parameters=given, amplitude=[0.25, 0.275])
     found = run.sensitivities(low=0.24, high=0.29, max_period=2, deviation={"frequency_hz": 1e-3})
     by = {str(n): found["elasticity"].sel(parameter=n).values for n in found["parameter"].values}
     assert "period_doubling" in [found["kind"].attrs["flag_meanings"].split()[k] for k in found["kind"].values]
@@ -193,14 +183,9 @@ def test_doubling_with_the_drive(tmp_path):
 @pytest.mark.slow
 def test_pitchfork_of_orbits(tmp_path):
     """Along the amplitude of the symmetric oscillator: the same sums."""
-    spec = (
-        magpend.Spec("sweep", "duffing", "symmetric")
-        .with_parameters(preset="hardening", omega=1.0, overrides={"damping": 0.1})
-        .with_axis("amplitude", values=[3.3, 3.4])
-        .with_start_list(points=[(0.0, 0.0)])
-        .with_integration(n_transient=300, n_keep=4)
-    )
-    found = magpend.run(spec, tmp_path / "symmetric", workers=0).sensitivities(low=3.3, high=3.6, max_period=1)
+    given = {"preset": "hardening", "omega": 1.0, "overrides": {"damping": 0.1}}
+    run = swept("duffing", tmp_path / "run", [(0.0, 0.0)], (300, 4), parameters=given, amplitude=[3.3, 3.4])
+    found = run.sensitivities(low=3.3, high=3.6, max_period=1)
     at = found["kind"].values.tolist().index(found["kind"].attrs["flag_meanings"].split().index("pitchfork"))
     by = {str(n): float(found["elasticity"].sel(parameter=n)[at]) for n in found["parameter"].values}
     assert by["cubic"] == pytest.approx(-0.5, rel=1e-7)

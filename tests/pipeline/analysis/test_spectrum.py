@@ -14,6 +14,8 @@ from pipeline.analysis.spectrum.analysis import LINES, spectrum_table
 from pipeline.analysis.spectrum.estimate import ALL, frequencies_of
 from pipeline.specification.problems import SpecError
 
+from .cubes import swept
+
 TURN = 2.0 * np.pi
 
 
@@ -175,13 +177,8 @@ def test_spectrum__of_a_torus_has_the_frequencies_of_its_uncoupled_oscillators(t
         w=TURN * f2,
         quantities={"both": "x + z + 0.2*x*z"},
     )
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_parameters(frequency_hz=f)
-        .with_start_list(points=[(0.9, 0.0, 0.1, 0.0), (0.0, 1.2, 0.0, 0.3)])
-        .with_integration(n_transient=300, n_keep=128)
-    )
-    run = magpend.run(spec, tmp_path / "run", workers=0)
+    starts = [(0.9, 0.0, 0.1, 0.0), (0.0, 1.2, 0.0, 0.3)]
+    run = swept(model, tmp_path / "run", starts, (300, 128), parameters={"frequency_hz": f})
     found = run.spectrum(channel="both", scaling="spectrum", segment=200)
     assert spectrum_table(found).rows[0]["kind"] == "torus"
     one = found.isel(spectrum=0)
@@ -227,14 +224,7 @@ def test_spectrum__of_a_flow_is_in_hertz(tmp_path):
     model = magpend.model(
         "x' = x*g - 2*y\ny' = y*g + 2*x\ng = mu + x**2 + y**2 - (x**2 + y**2)**2", name="cycles", mu=0.1
     )
-    spec = (
-        magpend.Spec("sweep", model)
-        .with_axis("mu", values=[-0.4, 0.1, 0.2])
-        .with_start_list(points=[(1.0, 0.0)])
-        .with_section(of="y", value=0.0, direction="up")
-        .with_integration(n_transient=200, n_keep=4)
-    )
-    run = magpend.run(spec, tmp_path / "run", workers=0)
+    run = swept(model, tmp_path / "run", [(1.0, 0.0)], (200, 4), section=("y", "up"), mu=[-0.4, 0.1, 0.2])
     found = run.spectrum()
     assert "order" not in found.coords
     closed = found["orbit_period"].values == 1
@@ -284,13 +274,7 @@ def test_spectrum__wrong_options_are_refused(duffing, options, named):
 @pytest.mark.slow
 def test_spectra__along_omega_stay_in_hertz_and_orders(tmp_path):
     """x'' + .2 x' + x = cos(omega t): one line at omega / 2 pi, of the amplitude in closed form."""
-    spec = (
-        magpend.Spec("sweep", "x'' = cos(omega*t) - 0.2*x' - x")
-        .with_axis("omega", values=[0.5, 1.0, 2.0])
-        .with_start_list(points=[(0.0, 0.0)])
-        .with_integration(n_transient=200, n_keep=4)
-    )
-    run = magpend.run(spec, tmp_path / "run", workers=0)
+    run = swept("x'' = cos(omega*t) - 0.2*x' - x", tmp_path / "run", [(0.0, 0.0)], (200, 4), omega=[0.5, 1.0, 2.0])
     omega = np.array([0.5, 1.0, 2.0])
     found = run.spectrum(channel="x_dot")
     np.testing.assert_allclose(found["frequency_hz"][:, 0], omega / TURN, rtol=1e-12)

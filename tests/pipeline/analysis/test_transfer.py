@@ -18,14 +18,19 @@ def double_well(x: np.ndarray) -> np.ndarray:
     return x + 0.25 * (x - x**3)
 
 
+def pairs_along(x: np.ndarray) -> Pairs:
+    """Pairs of successive states of paths (step, start, state), a unit for each."""
+    n_steps, n_starts = len(x) - 1, x.shape[1]
+    before, after = (own.swapaxes(0, 1).reshape(n_starts * n_steps, -1) for own in (x[:-1], x[1:]))
+    return Pairs(before, after, np.repeat(np.arange(n_starts), n_steps))
+
+
 def noisy_pairs(n_starts: int, n_steps: int) -> Pairs:
     rng = np.random.default_rng(0)
     paths = [rng.uniform(-1.7, 1.7, n_starts)]
     for _ in range(n_steps):
         paths.append(double_well(paths[-1]) + SIGMA * rng.standard_normal(n_starts))
-    x = np.stack(paths, axis=1)
-    unit = np.repeat(np.arange(n_starts), n_steps)
-    return Pairs(x[:, :-1].reshape(-1, 1), x[:, 1:].reshape(-1, 1), unit)
+    return pairs_along(np.array(paths)[..., None])
 
 
 @pytest.fixture(scope="module")
@@ -102,8 +107,7 @@ def test_transfer__committors_in_the_plane_by_simulation() -> None:
     paths = [(rng.uniform(-1.8, 1.8, 12_000), rng.uniform(-1.0, 1.0, 12_000))]
     for _ in range(25):
         paths.append(noisy_whirl(rng, *paths[-1]))
-    states = np.moveaxis(np.array(paths), 2, 0)  # cell, step, state
-    pairs = Pairs(states[:, :-1].reshape(-1, 2), states[:, 1:].reshape(-1, 2), np.repeat(np.arange(12_000), 25))
+    pairs = pairs_along(np.array(paths).transpose(0, 2, 1))
     found = _point(pairs, ["x", "y"], [False, False], TransferOptions(bins=30, resamples=10))
     own = np.repeat([0, 1], found["n_points"])
     place, width = found["place"], found["width"]
@@ -136,9 +140,7 @@ def test_transfer__two_wells_without_noise_are_closed() -> None:
     paths = [x]
     for _ in range(8):
         paths.append(double_well(paths[-1]))
-    y = np.stack(paths, axis=1)
-    pairs = Pairs(y[:, :-1].reshape(-1, 1), y[:, 1:].reshape(-1, 1), np.repeat(np.arange(60_000), 8))
-    found = _point(pairs, ["x"], [False], TransferOptions(bins=200, resamples=5))
+    found = _point(pairs_along(np.array(paths)[..., None]), ["x"], [False], TransferOptions(bins=200, resamples=5))
     assert found["n_closed"] == 2
     assert found["escape_rate"] == pytest.approx([0.0, 0.0], abs=1e-12)
     assert (found["escape_rate_high"] > 0.0).all()
