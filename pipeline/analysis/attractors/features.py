@@ -27,6 +27,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
+from pipeline.analysis.flown import flown
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
@@ -259,19 +260,8 @@ def follow_points(found: Features, parameters: Parameters, frequency: float) -> 
         return
     ends = found.points
     if mirror.half_period:
-        half = Drive(np.array([1.0 / frequency]))
-        followed = sample(
-            parameters.model.system,
-            np.tile(parameters.pack(), (len(ends), 1)),
-            ends,
-            [np.array([0.5 / frequency])],
-            piece=np.zeros(len(ends), np.int64),
-            drives=[half],
-            rtol=PORTRAIT_RTOL,
-            atol=PORTRAIT_RTOL,
-            limits_first_step=False,
-        )
-        ends = followed.states[:, 0]
+        drive, half = Drive(np.array([1.0 / frequency])), np.array([0.5 / frequency])
+        ends = flown(parameters, ends, half, drive, limits_first_step=False).states[:, 0]
     found.image = ends * np.array(mirror.signs)
 
 

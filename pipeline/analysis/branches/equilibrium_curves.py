@@ -32,18 +32,9 @@ from functools import partial
 import numpy as np
 
 from magpend_core.pointwise import jacobian_at, rates_at
+from pipeline.analysis.branches import center_manifold
 from pipeline.analysis.branches.arclength import Point
-from pipeline.analysis.branches.center_manifold import (
-    Rest,
-    bogdanov_takens,
-    cusp,
-    degenerate_pitchfork,
-    double_hopf,
-    lyapunov,
-    null_vectors,
-    solved,
-    zero_hopf,
-)
+from pipeline.analysis.branches.center_manifold import Rest, lyapunov, null_vectors, solved
 from pipeline.analysis.branches.codimension_two import (
     BT,
     CUSP,
@@ -224,7 +215,7 @@ class EquilibriumDetector(Detector):
             product = float(left @ right)
             tests = {BT: product, ZERO_HOPF: _pairs(others)}
             if kind == PITCHFORK:  # by symmetry B(q, q) has no part along p
-                tests[DEGENERATE] = cusp(rest)["c"] * product
+                tests[DEGENERATE] = center_manifold.cusp(rest)["c"] * product
             else:
                 tests[CUSP] = float(rest.second(right, right).real @ left)
         return (right, left), tests
@@ -248,27 +239,28 @@ class EquilibriumDetector(Detector):
         """Return a located point with its coefficients; None if what meets is a neutral saddle."""
         point, rest, is_hopf = one.point, self._rest(one.point), self.problem.kind == HOPF
         if one.kind == CUSP:
-            found = partial(cusp, rest)
+            found = partial(center_manifold.cusp, rest)
         elif one.kind == DEGENERATE:
             right, left = null_vectors(rest.matrix)
             if abs(left @ right) < NO_PRODUCT:
                 return None
-            found = partial(degenerate_pitchfork, rest)
+            found = partial(center_manifold.degenerate_pitchfork, rest)
         elif one.kind == BT:
-            found = partial(bogdanov_takens, rest)
+            found = partial(center_manifold.bogdanov_takens, rest)
         elif one.kind == GENERALISED_HOPF:
             return replace(one, coefficients={"lyapunov2": lyapunov(rest, _omega(point), 5)[1]})
         else:
             values = self._others(point) if is_hopf else np.linalg.eigvals(point.value.monodromy)
             upper = values[values.imag > 0.0]
             if one.kind == ZERO_HOPF and is_hopf:
-                found = partial(zero_hopf, rest, _omega(point))
+                found = partial(center_manifold.zero_hopf, rest, _omega(point))
             elif not len(upper) or np.abs(upper.real).min() > 1e-6 * np.abs(upper).max():
                 return None
             else:
                 omega = _nearest_pair(upper)
                 pairs = sorted((_omega(point), omega)) if is_hopf else [omega]
-                found = partial(double_hopf if is_hopf else zero_hopf, rest, *pairs)
+                form = center_manifold.double_hopf if is_hopf else center_manifold.zero_hopf
+                found = partial(form, rest, *pairs)
         return replace(one, coefficients=found())
 
 

@@ -20,7 +20,6 @@ from itertools import product
 import numpy as np
 
 from magpend_core.models.sectioned import of_flow
-from magpend_core.sampling import sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.attractors.extension.clouds import is_stationary
@@ -29,8 +28,9 @@ from pipeline.analysis.attractors.finding.equilibria import equilibria_near
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
 from pipeline.analysis.branches.deflation import search_orbits
+from pipeline.analysis.flown import flown
 from pipeline.analysis.sets import nearest_distances
-from pipeline.analysis.tolerances import PORTRAIT_RTOL, RECURRENCE
+from pipeline.analysis.tolerances import RECURRENCE
 from pipeline.products.reporting import report
 from pipeline.products.resilience import EdgeOptions
 
@@ -238,14 +238,7 @@ class Tracking:
         """Take the saddle that a parting pair passes between two sections as its edge state, if it is one."""
         assert self._there.point.parameters is not None
         parameters = of_flow(self._there.point.parameters)
-        states = sample(
-            parameters.model.system,
-            parameters.pack()[None],
-            state[None],
-            [np.linspace(0.0, seconds, INSTANTS)],
-            rtol=PORTRAIT_RTOL,
-            atol=PORTRAIT_RTOL,
-        ).states[0]
+        states = flown(parameters, state[None], np.linspace(0.0, seconds, INSTANTS)).states[0]
         speed = self._geometry.distance(states[1:], states[:-1])
         slow = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
         for one in equilibria_near(self._there.point, states[slow], self._geometry) if len(slow) else ():

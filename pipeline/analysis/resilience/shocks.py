@@ -28,9 +28,9 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
+from pipeline.analysis.flown import flown
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.together import run_together
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, samples_per_period
 from pipeline.products.reporting import report
 from pipeline.products.resilience import ResilienceOptions
@@ -250,15 +250,9 @@ class ShockSearch:
         """Return the rays of the smallest shocks that are not neighbours of a smaller one."""
         kept: list[int] = []
         for row in np.argsort(rays.high, kind="stable").tolist():
-            near = [
-                k
-                for k in kept
-                if rays.base[k] == rays.base[row] and np.linalg.norm(rays.unit[k] - rays.unit[row]) < 4.0 * self._angle
-            ]
-            if not near:
+            beside = np.linalg.norm(rays.unit[kept] - rays.unit[row], axis=1) < 4.0 * self._angle
+            if not (beside & (rays.base[kept] == rays.base[row])).any() and len(kept) < MOST_DESCENTS:
                 kept.append(row)
-            if len(kept) == MOST_DESCENTS:
-                break
         return rays.take(np.array(kept))
 
     @property
@@ -276,9 +270,7 @@ class ShockSearch:
             if not len(going):
                 return
             asked = [self._near(rays, int(row), float(angle[row])) for row in going]
-            label, code = yield from self._ask(
-                np.concatenate([base for base, _ in asked]), np.concatenate([shock for _, shock in asked])
-            )
+            label, code = yield from self._ask(*(np.concatenate(part) for part in zip(*asked, strict=True)))
             ends = np.cumsum([len(base) for base, _ in asked])
             for row, (base, shock), end in zip(going.tolist(), asked, ends.tolist(), strict=True):
                 own = slice(end - len(base), end)
@@ -387,23 +379,11 @@ def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases
 
 def _sampled(parameters: Parameters, points: np.ndarray, period: float, n_phases: int) -> Bases:
     """Integrate from section points, and return the states at equally spaced phases of the next period."""
-    phase = np.arange(n_phases) / n_phases
-    n = len(points)
-    states = points[:, None]
+    phase, n = np.arange(n_phases) / n_phases, len(points)
+    states = points
     if n_phases > 1:
-        found = sample(
-            parameters.model.system,
-            np.tile(parameters.pack(), (n, 1)),
-            points,
-            [phase * period],
-            piece=np.zeros(n, np.int64),
-            drives=[Drive(np.array([period]))],
-            rtol=PORTRAIT_RTOL,
-            atol=PORTRAIT_RTOL,
-        )
-        states = found.states
-    at_section = np.tile(phase == 0.0, n)
-    return Bases(states.reshape(-1, points.shape[1]), np.tile(phase, n), at_section)
+        states = flown(parameters, points, phase * period, Drive(np.array([period]))).states
+    return Bases(states.reshape(-1, points.shape[1]), np.tile(phase, n), np.tile(phase == 0.0, n))
 
 
 def labels_after(there: Destinations, states: np.ndarray, phase: np.ndarray) -> np.ndarray:

@@ -11,13 +11,13 @@ import xarray as xr
 from magpend_core.models.model import Model, Parameters, Quantity, State
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
-from magpend_core.sampling import Drive, sample
+from magpend_core.sampling import Drive
 from magpend_core.status import Status
 from pipeline.analysis.attractors.portraits import mean_return
+from pipeline.analysis.flown import flown
 from pipeline.analysis.ragged import dims_of, places_of_rows, points_of_rows
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import (
     BOUNDED_SET,
     FREQUENCY_DIM,
@@ -146,16 +146,7 @@ def sampled(motion: Motion, rate: float, n_periods: int, n_samples: int, place: 
     times = np.arange(n_periods * n_samples) / (rate * n_samples)
     # for a flow intervals only bound the steps
     drive = Drive(np.full(n_periods + 1, 1.0 / rate))
-    found = sample(
-        flow.model.system,
-        flow.pack()[None],
-        motion.state[None],
-        [times],
-        drives=[drive],
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
-        limits_first_step=False,
-    )
+    found = flown(flow, motion.state[None], times, drive, limits_first_step=False)
     if found.status[0] != Status.BOUNDED:
         return None
     n_states = len(flow.model.states)

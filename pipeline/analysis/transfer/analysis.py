@@ -50,21 +50,8 @@ from pipeline.analysis.ragged import N_POINTS, ROW_SIZE, SAMPLE, SET, rows_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import listed
 from pipeline.analysis.tabular import Row, Words, aligned, number, points_of, with_interval
-from pipeline.analysis.transfer.ulam import (
-    OUTSIDE,
-    Chain,
-    Grid,
-    chain_of,
-    closed_classes,
-    committors,
-    conditioned,
-    lasting,
-    leading_eigenvalue,
-    memberships,
-    passage_times,
-    slow_eigenvalues,
-    stationary,
-)
+from pipeline.analysis.transfer import ulam
+from pipeline.analysis.transfer.ulam import Chain, Grid
 from pipeline.layout.vocabulary import letter, model_of
 from pipeline.products.product import Table
 from pipeline.products.transfer import TransferOptions
@@ -159,25 +146,25 @@ class Sets:
 def sets_of_chain(chain: Chain, options: TransferOptions) -> Sets:
     """Find the closed sets of a chain, or, if there are not two of them, its almost invariant sets."""
     n, p = len(chain.boxes), chain.p
-    last = lasting(p)
+    last = ulam.lasting(p)
     density, values = np.zeros(n), np.zeros(0, complex)
     if not len(last):
         return Sets(np.full(n, -1), [], density, 0, values, last)
-    stays = conditioned(p[last][:, last])
-    classes = sorted(closed_classes(stays), key=len, reverse=True)
+    stays = ulam.conditioned(p[last][:, last])
+    classes = sorted(ulam.closed_classes(stays), key=len, reverse=True)
     for own in classes:
-        density[last[own]] = stationary(stays[own][:, own])
+        density[last[own]] = ulam.stationary(stays[own][:, own])
     closed = [last[own] for own in classes]
     if len(closed) > 1:
         cores = closed
     else:
         only = classes[0]
-        values, vectors = slow_eigenvalues(stays[only][:, only], min(max(MODES, options.sets), len(only)))
+        values, vectors = ulam.slow_eigenvalues(stays[only][:, only], min(max(MODES, options.sets), len(only)))
         k = min(options.sets, len(values))
-        belongs = memberships(values[:k], vectors[:, :k]).argmax(axis=1) if k > 1 else np.zeros(len(only), int)
+        belongs = ulam.memberships(values[:k], vectors[:, :k]).argmax(axis=1) if k > 1 else np.zeros(len(only), int)
         parts = [closed[0][belongs == j] for j in range(k)]
         cores = [_core(part, density, options.core) for part in parts if density[part].sum() > 0.0]
-    reached = committors(p, cores)
+    reached = ulam.committors(p, cores)
     by_share = np.argsort(-reached.mean(axis=0), kind="stable")
     others = np.concatenate([last[:0], *(cores[k] for k in by_share[MOST_SETS:])])
     order = sorted(by_share[:MOST_SETS].tolist(), key=lambda k: float(chain.boxes[cores[k]].mean()))
@@ -203,14 +190,14 @@ def numbers_of(p: Any, sets: Sets) -> dict[str, np.ndarray]:
         own = np.flatnonzero(sets.of_box == k)
         if len(own):  # not always on a coarser grid
             inner = p[own][:, own]
-            rate = leading_eigenvalue(inner)
+            rate = ulam.leading_eigenvalue(inner)
             escape_rate[k] = max(-np.log(rate), 0.0) if rate > 0.0 else np.inf
             kept[k] = _mean(inner.sum(axis=1), sets.density[own])
-        steps = passage_times(p, core) if len(core) else np.full(len(sets.density), np.nan)
+        steps = ulam.passage_times(p, core) if len(core) else np.full(len(sets.density), np.nan)
         for j, other in enumerate(sets.cores):
             if j != k:
                 passage[j, k] = _mean(steps[other], sets.density[other])
-    committor = committors(p, [*sets.cores, sets.others])[:, :n]
+    committor = ulam.committors(p, [*sets.cores, sets.others])[:, :n]
     return {"kept": kept, "escape_rate": escape_rate, "passage": passage, "committor": committor}
 
 
@@ -255,7 +242,7 @@ def intervals_of(
     drawn: dict[str, list[np.ndarray]] = {name: [] for name in _WITH_ENDS}
     for _ in range(options.resamples):
         weights = np.bincount(rng.choice(there, len(there)), minlength=n_units)[unit].astype(np.float64)
-        found = numbers_of(chain_of(*boxes, weights).p, sets)
+        found = numbers_of(ulam.chain_of(*boxes, weights).p, sets)
         for name, rows in drawn.items():
             rows.append(found[name])
     tail = 50.0 * (1.0 - options.confidence)
@@ -290,12 +277,12 @@ def _point(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: 
         return _variables(empty, nothing, {}, np.zeros((0, len(names))), 0) | {"width": unsized}
     grid = grid_of(pairs, names, angles, options)
     boxes = grid.box_of(pairs.before), grid.box_of(pairs.after)
-    chain = chain_of(*boxes)
+    chain = ulam.chain_of(*boxes)
     sets = sets_of_chain(chain, options)
     found = numbers_of(chain.p, sets) | intervals_of(boxes, pairs.unit, chain, sets, options)
     coarse = coarsened(chain, grid, sets)
     found |= {f"{name}_coarse": coarse[name] for name in _WITH_ENDS}
-    n_pairs = int((boxes[0] != OUTSIDE).sum())
+    n_pairs = int((boxes[0] != ulam.OUTSIDE).sum())
     variables = _variables(chain, sets, found, grid.centres_of(chain.boxes), n_pairs)
     return variables | {"width": (grid.high - grid.low) / grid.bins}
 
