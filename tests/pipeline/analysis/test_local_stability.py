@@ -80,21 +80,6 @@ def test_resilience__local_stability_of_a_rest_in_scales(computed):
 
 
 @pytest.mark.slow
-def test_resilience__local_stability_of_an_orbit(computed):
-    """A forced linear oscillator, x'' + .2 x' + 2 x = cos t: exponentials of a matrix."""
-    parameters = {"overrides": {"damping": 0.2, "linear": 2.0, "cubic": 0.0, "amplitude": 1.0}}
-    starts = {"kind": "grid", "x": line(-2.0, 2.0, 3), "v": line(-2.0, 2.0, 3)}
-    spec = sweep("duffing", starts, frequency_hz=1.0 / (2.0 * np.pi), closes=1e-6, parameters=parameters)
-    one = AnalysedRun.of(computed(spec)).derive("resilience", **FEW).isel(set=0)
-    matrix = np.array([[0.0, 1.0], [-2.0, -0.2]])
-    sizes = sizes_of(matrix, np.arange(200) * 2.0 * np.pi / 64)
-    assert float(one["reactivity"]) == pytest.approx(growth(matrix), rel=1e-9)
-    assert float(one["amplification"]) == pytest.approx(sizes.max(), rel=1e-7)
-    assert float(one["amplification_time"]) == pytest.approx(np.argmax(sizes) * 2.0 * np.pi / 64)
-    assert float(one["return_time"]) == pytest.approx(10.0, rel=1e-6)
-
-
-@pytest.mark.slow
 def test_resilience__local_stability_of_a_map(computed):
     """A linear map: powers of a matrix."""
     model = {**table("linear_map", {"x": "0.5*x + 4*y", "y": "0.75*y"}), "kind": "map"}

@@ -22,6 +22,7 @@ from tests.core.cells import scipy_end
 from tests.core.flows import table
 
 from .cubes import WELLS, line, sweep
+from .test_local_stability import growth, sizes_of
 
 UNIT_HZ = 0.15915494309189535
 WELL_VALUES = {"damping": 0.15, "linear": -1.0, "cubic": 1.0, "amplitude": 0.2}
@@ -177,22 +178,21 @@ def test_resilience__basin_stability_and_table(found, wells):
 # ---- one attractor -----------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def linear(duffing):
-    """x'' + .2 x' + 2 x = cos t: one orbit, which attracts all states."""
-    return duffing(damping=0.2, linear=2.0, cubic=0.0, amplitude=1.0, num=5)
-
-
 @pytest.mark.slow
-def test_resilience__of_a_linear_oscillator(linear):
-    """No shock leads away; arrivals follow the matrix exponential (validation.md, 1)."""
+def test_resilience__of_a_linear_oscillator(duffing):
+    """x'' + .2 x' + 2 x = cos t: one orbit, which attracts all states.
+
+    No shock leads away; arrivals and growth follow the matrix exponential (validation.md, 1).
+    """
+    linear = duffing(damping=0.2, linear=2.0, cubic=0.0, amplitude=1.0, num=5)
     one = linear.derive("resilience", within=7, largest=3.0).isel(set=0)
     assert float(one["shock_low"]) == 3.0
     assert np.isinf(one["shock_high"])
     assert int(one["shock_to"]) == UNDECIDED
     assert int(one["distance_n_below"]) > 1000
     away = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 5)] * 2), -1).reshape(-1, 2) - [0.9615384615, 0.1923076923]
-    return_map = expm(2.0 * np.pi * np.array([[0.0, 1.0], [-2.0, -0.2]]))
+    matrix = np.array([[0.0, 1.0], [-2.0, -0.2]])
+    return_map = expm(2.0 * np.pi * matrix)
     inside, step = [], away.T
     for _ in range(60):
         inside.append(np.abs(step).max(axis=0) <= 0.01)
@@ -205,6 +205,11 @@ def test_resilience__of_a_linear_oscillator(linear):
     assert float(one["longest_time"]) == entered.max()
     assert float(one["arrived"]) == pytest.approx((entered <= 7).mean())
     assert 0.0 < float(one["arrived_low"]) < float(one["arrived"]) < float(one["arrived_high"]) < 1.0
+    sizes = sizes_of(matrix, np.arange(200) * 2.0 * np.pi / 64)
+    assert float(one["reactivity"]) == pytest.approx(growth(matrix), rel=1e-9)
+    assert float(one["amplification"]) == pytest.approx(sizes.max(), rel=1e-7)
+    assert float(one["amplification_time"]) == pytest.approx(np.argmax(sizes) * 2.0 * np.pi / 64)
+    assert float(one["return_time"]) == pytest.approx(10.0, rel=1e-6)
 
 
 # ---- magnets -----------------------------------------------------------------------------------
