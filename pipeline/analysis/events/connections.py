@@ -47,13 +47,13 @@ from pipeline.analysis.events.transients import (
 )
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
-RETURNS, PER_RETURN = 16, 64
+RETURNS, PER_RETURN = 64, 64
 """Returns of each trajectory on which passages of an equilibrium are looked for, and states of each."""
 
 RADIUS = 0.2
 """Distance within which a trajectory passes an equilibrium, as a share of the set's extent."""
 
-BESIDE = 0.01
+BESIDE = 0.05
 """Largest clearance of the nearest passages on each side of the stable manifold of an equilibrium that counts as in the
 set, as a share of the radius.
 """
@@ -68,7 +68,7 @@ clearance by their squares, so that the second one shows the error of the first.
 FOLLOWED = 5
 """Values between two of the parameter at which an equilibrium is followed."""
 
-HALVINGS = 24
+HALVINGS = 16
 """Bisections for the value at which a trajectory from the equilibrium begins to leave."""
 
 DOUBLINGS = 40
@@ -147,21 +147,21 @@ def rests_in(along: SectionMap, value: float, own: Sample) -> list[Rest]:
         if all(geometry.distance(state, place) > SAME for place in places):
             places.append(state)
     rests = [one for one in (rest_at(along, value, place) for place in places) if one is not None]
-    sides = [_sides(states, rest, step, RADIUS * extent, along) for rest in rests]
-    return [
-        replace(
-            rest,
-            told=f"of {len(a)} passages near it, the nearest ones are {a[a > 0.0].min():.1e} and {-a[a < 0.0].max():.1e} "
-            "of their distance beside its stable manifold, one on each side",
-        )
-        for rest, a in zip(rests, sides, strict=True)
-        if max(a[a > 0.0].min(initial=np.inf), (-a[a < 0.0]).min(initial=np.inf)) <= BESIDE
-    ]
+    radius = RADIUS * extent
+    sides = [_sides(states, rest, step, radius, along) for rest in rests]
+    contained = []
+    for rest, a in zip(rests, sides, strict=True):
+        nearest = [float(side.min(initial=np.inf)) for side in (a[a > 0.0], -a[a < 0.0])]
+        if max(nearest) <= BESIDE * radius:
+            told = (
+                f"of {len(a)} passages within {radius:.3g}, the nearest ones are {nearest[0]:.1e} and {nearest[1]:.1e}"
+            )
+            contained.append(replace(rest, told=f"{told} beside its stable manifold, one on each side"))
+    return contained
 
 
 def _sides(states: np.ndarray, rest: Rest, step: float, radius: float, along: SectionMap) -> np.ndarray:
-    """Return the clearances from the stable manifold of an equilibrium with which trajectories come within a radius, in
-    units of it.
+    """Return the clearances from the stable manifold of an equilibrium with which trajectories come within a radius.
 
     The coordinate along the unstable direction at the closest approach is divided by its growth since then.
     """
@@ -175,7 +175,7 @@ def _sides(states: np.ndarray, rest: Rest, step: float, radius: float, along: Se
     closest = np.lexsort((away[lane, time], number))[np.flatnonzero(begins)]
     gone = step * (time[closest] - time[begins])
     across = offset[lane[closest], time[closest]] @ rest.covector
-    return np.asarray(across * np.exp(-rest.rate * gone) / radius)
+    return np.asarray(across * np.exp(-rest.rate * gone))
 
 
 # ---- the trajectories that leave an equilibrium ------------------------------------------------
@@ -303,7 +303,7 @@ def _is_aimed(edge: Edge, paths: np.ndarray, low: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """Contact of a trajectory that leaves an equilibrium in a chaotic set with a saddle orbit, where the set is lost."""
+    """Contact of a trajectory that leaves an equilibrium in a chaotic set with a saddle orbit: there it is lost."""
 
     rest: Rest
     saddle: Saddle
@@ -313,7 +313,9 @@ class Connection:
     means: list[float]  # mean lifetimes there [sections]
 
 
-def connection_of(along: SectionMap, own: Sample, values: tuple[float, float, float], effort: Effort) -> Connection | str:
+def connection_of(
+    along: SectionMap, own: Sample, values: tuple[float, float, float], effort: Effort
+) -> Connection | str:
     """Find the first contact of the unstable manifold of an equilibrium in a set with a saddle orbit, with proof that
     the set is lost there.
 
@@ -344,16 +346,21 @@ def connection_of(along: SectionMap, own: Sample, values: tuple[float, float, fl
         edge = _edge(Leaving(exact, rest, seen, sign * steps), own, beyond, effort)
         contact = contact_of(edge, beyond) if edge is not None else None
         if edge is not None and contact is not None:
-            touching.append((edge, contact))
+            touching.append((edge, _with_tolerance(edge, contact)))
     if not touching:
         return f"the unstable manifolds of equilibria in it, {'; '.join(map(str, rests))}, meet no unstable orbit"
     edge, contact = min(touching, key=lambda one: abs(one[1].value - seen))
     return _lost(along, own, edge, contact, far, effort)
 
 
-def _lost(
-    along: SectionMap, own: Sample, edge: Edge, contact: Contact, far: float, effort: Effort
-) -> Connection | str:
+def _with_tolerance(edge: Edge, contact: Contact) -> Contact:
+    """Add to the error of a contact what a larger tolerance of the integration changes."""
+    rough = replace(edge.along, rtol=10.0 * edge.along.rtol)
+    found = replace(edge, along=rough, leaving=replace(edge.leaving, along=rough)).least(contact.value)
+    return replace(contact, error=contact.error + 2.0 * abs(found.least / contact.slope))
+
+
+def _lost(along: SectionMap, own: Sample, edge: Edge, contact: Contact, far: float, effort: Effort) -> Connection | str:
     """Check that a set lives up to a contact and contains the equilibrium there, and that it is lost beyond."""
     value = contact.value - contact.span * float(np.sign(far - contact.value))
     saddle, rest = edge.saddle(value), edge.leaving.rest_at(value)

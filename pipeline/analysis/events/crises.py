@@ -168,9 +168,7 @@ class Crises:
         }
         return _judged(scene, *met, beyond, others)
 
-    def _connected(
-        self, along: SectionMap, effort: Effort, sample: Sample, values: tuple[float, float]
-    ) -> Crisis:
+    def _connected(self, along: SectionMap, effort: Effort, sample: Sample, values: tuple[float, float]) -> Crisis:
         """Judge whether a set is lost where the unstable manifold of an equilibrium in it meets an unstable orbit."""
         scene, ds = self.scene, self.scene.located
         if not scene.base.model.autonomous or along.family.system.section is None:
@@ -183,16 +181,14 @@ class Crises:
         state = ", ".join(f"{x:.6g}" for x in found.saddle.points[0])
         listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(found.values, found.means, strict=True))
         told = (
-            f"the set contains the saddle equilibrium at {found.rest}: {found.rest.told}; a trajectory that leaves the "
-            f"equilibrium meets the stable manifold of the unstable orbit of period {found.saddle.period} at ({state}): "
-            f"the clearance is 0 at {at(ds, contact.value)}, by lines from both sides at "
-            f"{at(ds, contact.living, contact.beyond)}; no trajectory leaves the set at {at(ds, found.lives)}, and mean "
-            f"lifetimes beyond grow towards it: {listed}"
+            f"the set contains the saddle equilibrium at {found.rest}: {found.rest.told}; a trajectory that leaves it "
+            f"meets the stable manifold of the unstable orbit of period {found.saddle.period} at ({state}): the "
+            f"clearance is 0 at {at(ds, contact.value)}, by lines from both sides at "
+            f"{at(ds, contact.living, contact.beyond)}; no trajectory leaves the set at {at(ds, found.lives)}, and "
+            f"mean lifetimes beyond grow towards it: {listed}"
         )
         error = max(contact.error, 1e-9 * scene.scale)
-        return Crisis(
-            BOUNDARY, told, contact.value, error, period=found.saddle.period, bands=(sample.n_bands, 0)
-        )
+        return Crisis(BOUNDARY, told, contact.value, error, period=found.saddle.period, bands=(sample.n_bands, 0))
 
     def _transient(self, attractor: int, place: int, way: int) -> Crisis:
         """Judge by lifetimes alone whether a chaotic set is lost between a place and the next one."""
