@@ -69,10 +69,9 @@ FOLLOWED = 5
 """Values between two of the parameter at which an equilibrium is followed."""
 
 HALVINGS = 16
-"""Bisections for the value at which a trajectory from the equilibrium begins to leave."""
-
-DOUBLINGS = 40
-"""Largest number of doublings of the distance from there at which its clearance is looked at."""
+"""Bisections for the value at which a trajectory from the equilibrium begins to leave, and doublings of the distance
+from there at which its clearance is looked at.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,10 +285,10 @@ def _is_aimed(edge: Edge, paths: np.ndarray, low: float) -> bool:
     edge.time = closest % step + step * int(np.append(-1, np.flatnonzero(is_far))[-1] + 1)
     edge.side = -float(np.sign(edge.least(edge.value, paths).least))
     high, living = edge.value, np.nan
-    for number in range(DOUBLINGS):
+    for number in range(HALVINGS + 1):
         x = high + (low - high) * 2.0**number
         least = edge.least(x).least
-        if not np.isfinite(least) and (np.isfinite(living) or number > DOUBLINGS // 2):
+        if np.isfinite(living) and not least > 0.0:
             break
         living = x if least > 0.0 else living
         if least >= SHARES[False] * edge.near * edge.size:
