@@ -325,7 +325,7 @@ def connection_of(
     own
         Trajectories on the set at the last value at which it was seen.
     values
-        This value, the next one, and the last one of the axis beyond, up to which lifetimes may be taken.
+        This value, the next one, and a far one beyond, up to which lifetimes may be taken.
     effort
         Trajectories of the set and their length.
 
@@ -380,8 +380,8 @@ def _lost(along: SectionMap, own: Sample, edge: Edge, contact: Contact, far: flo
         return f"{told} trajectories leave the set before"
     values, means = _lifetimes(place, contact.value, far)
     if len(values) < FEWEST_LIFETIMES or not (np.diff(means) > 0.0).all():
-        listed = ", ".join(f"{mean:.4g}" for mean in means)
-        return f"{told} the mean lifetimes beyond, {listed}, do not show that the set is lost there"
+        listed = ", ".join(f"{mean:.4g} at {x:.6g}" for x, mean in zip(values, means, strict=True)) or "none measured"
+        return f"{told} lifetimes beyond ({listed}) do not show that the set is lost there"
     _, until = place.stays(values[0])
     if (until <= (SETTLE + place.length) // 2).mean() < ALL:
         return f"{told} beyond, the trajectories of the set stay near it or come back"

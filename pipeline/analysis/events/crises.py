@@ -38,7 +38,7 @@ from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transie
 from pipeline.analysis.ragged import points_of_rows, rows_at
 from pipeline.analysis.sets import nearest_distances
 from pipeline.layout.vocabulary import KINDS as SETS
-from pipeline.layout.vocabulary import letter
+from pipeline.layout.vocabulary import letter, parameter_name
 
 OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 12, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
@@ -173,7 +173,10 @@ class Crises:
         scene, ds = self.scene, self.scene.located
         if not scene.base.model.autonomous or along.family.system.section is None:
             return Crisis("", "")
-        far = float(scene.along[-1 if values[1] > values[0] else 0])
+        far = values[0] + 2.0 * scene.scale * float(np.sign(values[1] - values[0]))
+        parameter = scene.base.model.parameter(parameter_name(scene.axis))
+        while parameter.problem(far):
+            far = 0.5 * (far + values[1])
         found = connection_of(along, sample, (*values, far), effort)
         if isinstance(found, str):
             return Crisis("", found)
