@@ -37,14 +37,7 @@ from pipeline.analysis.events.contact import (
     last_stays,
     sample_of,
 )
-from pipeline.analysis.events.transients import (
-    ALL,
-    FEWEST_ESCAPES,
-    FEWEST_LIFETIMES,
-    FIRST_RATIO,
-    MOST_LIFETIMES,
-    Place,
-)
+from pipeline.analysis.events.transients import ALL, FEWEST_ESCAPES, FEWEST_LIFETIMES, Place
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
 RETURNS, PER_RETURN = 64, 64
@@ -72,6 +65,9 @@ HALVINGS = 16
 """Bisections for the value at which a trajectory from the equilibrium begins to leave, and doublings of the distance
 from there at which its clearance is looked at.
 """
+
+RATIO, MOST_LIFETIMES = 0.8, 24
+"""Ratio and number of the distances beyond a contact at which lifetimes are taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,8 +388,8 @@ def _lifetimes(place: Place, contact: float, far: float) -> tuple[list[float], l
     """Return values from a far one to a contact, and the mean lifetimes there, as far as they can be measured."""
     values: list[float] = []
     means: list[float] = []
-    for k in range(2 * MOST_LIFETIMES):
-        value = contact + (far - contact) * FIRST_RATIO**k
+    for k in range(MOST_LIFETIMES):
+        value = contact + (far - contact) * RATIO**k
         mean, n = place.lifetime(value)
         if n >= FEWEST_ESCAPES and mean >= SETTLE:
             values, means = [*values, value], [*means, mean]
