@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 
 import magpend
+from magpend_core.crossing import Crossing
 from pipeline.analysis.branches.starting_orbits import family_of
-from pipeline.analysis.events.connections import Leaving, Rest, _sides, rest_at
-from pipeline.analysis.events.contact import SectionMap
+from pipeline.analysis.events.connections import Leaving, Rest, _sides, connection_of, rest_at, rests_in
+from pipeline.analysis.events.contact import Effort, Sample, SectionMap, sample_of
 from pipeline.analysis.sets import Geometry
+from tests.pipeline.analysis.test_events import lorenz_connection
 
 LORENZ = magpend.load_model("lorenz")
 
 
+EFFORT = Effort(128, 256, 3, 12, 1, is_flow=True)
+
+
 def lorenz_map():
-    family = family_of(LORENZ.system, 0, 1.0, LORENZ.load(rho=28.0).pack(), "rho", 1.0)
+    """The map of the section z = 23 along rho."""
+    system, packed, frequency = Crossing("z", 23.0, "down", 60.0).applied(LORENZ.load(rho=28.0).pack(), LORENZ.system)
+    family = family_of(system, 1, float(frequency), packed, "rho", 6.0)
     return SectionMap(family, Geometry.of(LORENZ), 1e-9)
 
 
@@ -47,3 +54,29 @@ def test_sides__of_a_linear_saddle():
     along = SectionMap(lorenz_map().family, Geometry((False, False), (1.0, 1.0)), 1e-9)
     assert _sides(states, rest, 1e-3, 0.5, along) == pytest.approx(4.0 * x, rel=5e-3)
     assert len(_sides(states + 9.0, rest, 1e-3, 0.5, along)) == 0
+
+
+@pytest.mark.slow
+def test_rests_in__only_a_set_that_contains_one():
+    along = lorenz_map()
+    own = sample_of(along, 28.0, np.array([6.0, 5.0, 23.0]), EFFORT)
+    (rest,) = rests_in(along, 28.0, own)
+    assert rest.state == pytest.approx(np.zeros(3), abs=1e-9)
+    # trajectories that spiral about the cycle of x > 0 do not pass the origin
+    near = Sample(np.array([[6.1, 4.9, 23.0], [6.11, 4.9, 23.0]]), own.points, 1)
+    assert rests_in(along, 24.06, near) == []
+
+
+@pytest.mark.slow
+def test_connection_of__on_another_section():
+    along = lorenz_map()
+    own = sample_of(along, 26.0, np.array([6.0, 5.0, 23.0]), EFFORT)
+    found = connection_of(along, own, (26.0, 24.0, 16.0), EFFORT)
+    assert abs(found.contact.value - lorenz_connection()) < found.contact.error + 1e-9 < 3e-9
+    assert found.saddle.period == 1
+    assert (np.diff(found.means) > 0.0).all()
+    assert 24.0579 < found.lives < 24.5
+    # the set lives on
+    assert "meet no unstable orbit" in connection_of(along, own, (26.0, 25.0, 16.0), EFFORT)
+    # lifetimes that are too long show no loss
+    assert "do not show" in connection_of(along, own, (26.0, 24.0, 23.9), EFFORT)
