@@ -111,6 +111,8 @@ def motion_of(along: SectionMap, value: float, own: Sample) -> tuple[np.ndarray,
         rows.parameters[:1], rows.frequency_hz[:1], rows.states[:1], RETURNS, system=along.family.system
     ).times
     seconds = float(times.sum())
+    if not np.isfinite(seconds):
+        return np.zeros((0, 0, rows.states.shape[1])), seconds
     grid = np.linspace(0.0, seconds, RETURNS * PER_RETURN)
     found = sample(
         along.family.system,

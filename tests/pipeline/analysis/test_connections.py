@@ -8,6 +8,7 @@ import pytest
 import magpend
 from magpend_core.crossing import Crossing
 from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.events import connections
 from pipeline.analysis.events.connections import Leaving, Rest, _sides, connection_of, rest_at, rests_in
 from pipeline.analysis.events.contact import Effort, Sample, SectionMap, sample_of
 from pipeline.analysis.sets import Geometry
@@ -57,14 +58,16 @@ def test_sides__of_a_linear_saddle():
 
 
 @pytest.mark.slow
-def test_rests_in__only_a_set_that_contains_one():
+def test_rests_in__only_a_set_that_contains_one(monkeypatch):
     along = lorenz_map()
     own = sample_of(along, 28.0, np.array([6.0, 5.0, 23.0]), EFFORT)
     (rest,) = rests_in(along, 28.0, own)
     assert rest.state == pytest.approx(np.zeros(3), abs=1e-9)
-    # trajectories that spiral about the cycle of x > 0 do not pass the origin
-    near = Sample(np.array([[6.1, 4.9, 23.0], [6.11, 4.9, 23.0]]), own.points, 1)
-    assert rests_in(along, 24.06, near) == []
+    # one trajectory, for one return, passes the origin on one side at most
+    monkeypatch.setattr(connections, "RETURNS", 1)
+    assert not any(rests_in(along, 28.0, Sample(one[None], own.points, 1)) for one in own.starts[:32])
+    # and one that ends passes nothing
+    assert rests_in(along, 5.0, own) == []
 
 
 @pytest.mark.slow
