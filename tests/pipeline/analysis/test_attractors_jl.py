@@ -130,7 +130,10 @@ def test_magnets__third_one_weaker(computed):
     assert found["n_sets"].values.tolist() == [2, 2, 3, 3]
     # at a rest a direction swings by l**2 + .2 l + k = 0, k > .01: all disturbances shrink by exp(-.1 t)
     assert found["return_time"].values == pytest.approx(np.full(10, 10.0))
-    assert found["basin_stability"].values[7:] == pytest.approx(np.full(3, 1.0 / 3.0), abs=0.05)
+    # with three equal magnets two basins are mirror images, also on the square grid
+    shares = np.sort(found["basin_stability"].values[7:])
+    assert np.diff(shares).min() <= 2.1 / 441
+    assert shares.sum() == pytest.approx(1.0)
 
 
 # ---- maps --------------------------------------------------------------------------------------
