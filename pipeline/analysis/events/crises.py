@@ -51,6 +51,9 @@ SURE = 4.0
 GROWN, STRAY = 0.1, 1e-3
 """Distance from a set, as a share of its size, beyond which points are outside; share of points that may lie there."""
 
+JOINED = 0.5
+"""Least share of the points outside that lie on another set, if the two merge: a merged set may be larger than both."""
+
 RETURNING, LOST = 0.5, 0.02
 """Shares of trajectories that leave and pass the orbit again: at least, of a set that lives on; at most, of a lost one.
 """
@@ -304,6 +307,6 @@ def _kind(
         here = along.paths(2.0 * contact.value - value, points[-effort.lanes :], effort.length)[:, SETTLE:]
         here = here.reshape(-1, geometry.n_states)
         away = nearest_distances(outside, here[np.isfinite(here).all(axis=1)], geometry)
-        if (away > GROWN * size).mean() <= STRAY:
+        if (away <= GROWN * size).mean() >= JOINED:
             return TWINS, number, (m, after)
     return INTERIOR, -1, (m, after)
