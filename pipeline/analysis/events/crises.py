@@ -39,7 +39,7 @@ from pipeline.analysis.sets import nearest_distances
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter
 
-OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 12, 1, is_flow=True)
+OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
 
 OF_BANDS = 12
