@@ -542,12 +542,24 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
     for near in NEAR:
         approach.near = near
         h = _span(approach, x, beyond)
-        found = None if h is None else _confirmed_at(approach, x, h, best)
+        if h is None:
+            continue
+        found = _confirmed_at(approach, x, h, best)
         if found is not None:
-            closer = [_confirmed_at(approach, x, h * share, best) for share in CLOSER if approach.effort.is_flow]
-            least = min([found, *(one for one in closer if one is not None)], key=lambda one: one.error)
-            return replace(least, span=found.span)
+            return _closer(approach, found, h) if approach.effort.is_flow else found
     return None
+
+
+def _closer(approach: Approach, found: Contact, h: float) -> Contact:
+    """Take the lines of a flow again nearer to where they lead; return those with the least error."""
+    last = least = found
+    for share in CLOSER:
+        x = 0.5 * (last.living + last.beyond)
+        best = approach.least(x)
+        closer = _confirmed_at(approach, x - best.least / last.slope, h * share, best)
+        last = closer or last
+        least = min(least, last, key=lambda one: one.error)
+    return replace(least, span=found.span)
 
 
 def _confirmed_at(approach: Approach, value: float, h: float, best: Clearance) -> Contact | None:
