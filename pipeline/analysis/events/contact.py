@@ -546,17 +546,18 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
             continue
         found = _confirmed_at(approach, x, h, best)
         if found is not None:
-            return _closer(approach, found, h) if approach.effort.is_flow else found
+            return _closer(approach, found, x, h) if approach.effort.is_flow else found
     return None
 
 
-def _closer(approach: Approach, found: Contact, h: float) -> Contact:
+def _closer(approach: Approach, found: Contact, zero: float, h: float) -> Contact:
     """Take the lines of a flow again nearer to where they lead; return those with the least error."""
     last = least = found
     for share in CLOSER:
         x = 0.5 * (last.living + last.beyond)
         best = approach.least(x)
-        closer = _confirmed_at(approach, x - best.least / last.slope, h * share, best)
+        zero = min(zero, x - best.least / last.slope, key=lambda one: abs(one - x))
+        closer = _confirmed_at(approach, zero, h * share, best)
         last = closer or last
         least = min(least, last, key=lambda one: one.error)
     return replace(least, span=found.span)

@@ -279,8 +279,8 @@ def tangency(force, duration, values, *fold):
 MERGING = {
     # x'' + x' - 10 x + 100 x**3 = F cos(3.5 t): Grebogi, Ott, Romeiras and Yorke, Phys. Rev. A 36, 1987, 5365
     "wells": (
-        magpend.model("x'' = F*cos(3.5*t) - x' + 10*x - 100*x**3", name="wells", F=0.8),
-        {}, "F", [0.848, 0.8505], {"x": (-0.4, 0.4), "x_dot": (-0.4, 0.4)},
+        magpend.model("x'' = F*cos(omega*t) - x' + 10*x - 100*x**3", name="wells", F=0.8),
+        {"omega": 3.5}, "F", [0.848, 0.8505], {"x": (-0.4, 0.4), "x_dot": (-0.4, 0.4)},
         lambda t, x, v, p: p * np.cos(3.5 * t) - v + 10.0 * x - 100.0 * x**3,
         2.0 * np.pi / 3.5, [0.84925, 0.849256], (0.03872, 0.16509), 3, 0.44132, 30,
     ),
