@@ -544,26 +544,24 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         h = _span(approach, x, beyond)
         if h is None:
             continue
-        found = _confirmed_at(approach, x, h, best)
+        found = _confirmed_at(approach, x, best, h)
         if found is not None:
-            return _closer(approach, found, x, h) if approach.effort.is_flow else found
+            return _closer(approach, found, (x, best), h) if approach.effort.is_flow else found
     return None
 
 
-def _closer(approach: Approach, found: Contact, zero: float, h: float) -> Contact:
+def _closer(approach: Approach, found: Contact, zero: tuple[float, Clearance], h: float) -> Contact:
     """Take the lines of a flow again nearer to where they lead; return those with the least error."""
-    last = least = found
+    span = found.span
     for share in CLOSER:
-        x = 0.5 * (last.living + last.beyond)
-        best = approach.least(x)
-        zero = min(zero, x - best.least / last.slope, key=lambda one: abs(one - x))
-        closer = _confirmed_at(approach, zero, h * share, best)
-        last = closer or last
-        least = min(least, last, key=lambda one: one.error)
-    return replace(least, span=found.span)
+        x = 0.5 * (found.living + found.beyond)
+        x -= approach.least(x).least / found.slope
+        closer = [_confirmed_at(approach, *one, h * share) for one in (zero, (x, approach.least(x)))]
+        found = min([found, *(one for one in closer if one is not None)], key=lambda one: one.error)
+    return replace(found, span=span)
 
 
-def _confirmed_at(approach: Approach, value: float, h: float, best: Clearance) -> Contact | None:
+def _confirmed_at(approach: Approach, value: float, best: Clearance, h: float) -> Contact | None:
     values = value + h * np.array(SPREAD)
     least = np.array([approach.least(float(one)).least for one in values])
     return _confirmed(value, best, values, least, approach.effort.is_flow)
