@@ -24,6 +24,11 @@ WIDTH = 1e-8
 SHORT = 1e-4
 """Length of a step that is not made shorter where a test function nearly vanishes [arclength]."""
 
+HIDDEN = 1e-8
+"""Least change of the parameter between two folds in one step for which the step is made shorter, in its scale: less is
+rounding.
+"""
+
 CERTAIN = 1e-4
 """Distance of all multipliers from the unit circle, or of all scaled eigenvalues from the imaginary axis, above which
 their number outside is certain: where two meet, each errs by the root of the error of the matrix."""
@@ -158,6 +163,8 @@ class Watch:
         long = step > 100.0 * self.settings.shortest_step
         if long and not _explains(kinds, n_unstable(b) - n_unstable(a)):
             return False
+        if long and turns_twice(a, b):
+            return False
         if step > SHORT and BRANCHING not in kinds and self._turned_back(a, b, step):
             return False
         located = []
@@ -185,6 +192,21 @@ class Watch:
         before, here, there = (_branching_test(point) for point in (self._last, a, b))
         ahead = here + (here - before) * step / float(np.linalg.norm(a.u - self._last.u))
         return here * ahead < 0.0 < here * there
+
+
+def turns_twice(a: Point, b: Point) -> bool:
+    """Return whether the parameter turns back and forth between two points, by the cubic through both: two folds, at
+    whose far sides all test functions have the same signs.
+    """
+    d = b.u - a.u
+    chord, (first, last) = float(d[-1]), float(np.linalg.norm(d)) * np.array([a.tangent[-1], b.tangent[-1]])
+    bend = first + last - 2.0 * chord  # the slope is a parabola, with this curvature
+    if first * last <= 0.0 or bend * first <= 0.0:
+        return False
+    lowest = (2.0 * first + last - 3.0 * chord) / (3.0 * bend)
+    slope = first - 3.0 * bend * lowest**2
+    half_width = np.sqrt(max(-slope / (3.0 * bend), 0.0))
+    return bool(0.0 < lowest < 1.0 and 4.0 * abs(bend) * half_width**3 > HIDDEN)
 
 
 def _explains(kinds: list[str], change: int) -> bool:

@@ -454,8 +454,8 @@ class Approach:
         paths = self.paths(value, length)
         until = _until(*self._sided(value, paths)[:3], paths)
         if self.effort.is_flow:  # of a lost set, most trajectories leave far from the orbit, and none comes back
-            near = stays(paths, self.sample.points, AROUND * self.size, self.along.geometry)
-            last = last_stays(near)
+            near = _are_near(paths, self.sample.points, AROUND * self.size, self.along.geometry)
+            last = _last(near)
             gone = last <= paths.shape[1] - AWAY * length
             self.is_lost |= bool(gone.mean() > 0.5 and have_come_back(near, AWAY * length).mean() <= BACK_AGAIN)
             until = np.where(gone, last, paths.shape[1]) if self.is_lost else until
@@ -477,15 +477,18 @@ class Approach:
         return float(again[left].mean()) if left.sum() >= LEAST else np.nan
 
 
-def stays(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
-    """Return whether section points of trajectories are within a distance of a set, (trajectory, time)."""
+def last_stays(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
+    """Return the number of sections up to the last one of each trajectory within a distance of a set; 0 if none is."""
+    return _last(_are_near(paths, points, radius, geometry))
+
+
+def _are_near(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
     is_near, lives = np.zeros(paths.shape[:2], bool), np.isfinite(paths).all(axis=2)
     is_near[lives] = nearest_distances(paths[lives], points, geometry) <= radius
     return is_near
 
 
-def last_stays(is_near: np.ndarray) -> np.ndarray:
-    """Return the number of sections up to the last one of each trajectory near a set; 0 if none is."""
+def _last(is_near: np.ndarray) -> np.ndarray:
     return np.where(is_near.any(axis=1), is_near.shape[1] - np.argmax(is_near[:, ::-1], axis=1), 0)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.analysis.branches.deflation import search_orbits, starts_around
 from pipeline.analysis.events.cascades import Born
+from pipeline.analysis.events.connections import connection_of
 from pipeline.analysis.events.contact import (
     SETTLE,
     Approach,
@@ -37,7 +38,7 @@ from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transie
 from pipeline.analysis.ragged import points_of_rows, rows_at
 from pipeline.analysis.sets import nearest_distances
 from pipeline.layout.vocabulary import KINDS as SETS
-from pipeline.layout.vocabulary import letter
+from pipeline.layout.vocabulary import letter, parameter_name
 
 OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
@@ -179,13 +180,39 @@ class Crises:
             return Crisis("", "its trajectories end")
         met = self._met(along, effort, sample, (seen, beyond), self._orbits(along, sample, seen, effort))
         if isinstance(met, str):
-            return Crisis("", met)
+            connected = self._connected(along, effort, sample, (seen, beyond))
+            return replace(connected, why=f"{met}; {connected.why}") if not connected.what else connected
         others = {
             int(scene.attractors["attractor"].values[k]): points[k]
             for k in rows_at(scene.attractors)[(int(scene.order[place]),)]
             if k != row and SETS[int(scene.attractors["kind"].values[k])] == "chaotic_set"
         }
         return _judged(scene, *met, beyond, others)
+
+    def _connected(self, along: SectionMap, effort: Effort, sample: Sample, values: tuple[float, float]) -> Crisis:
+        """Judge whether a set is lost where the unstable manifold of an equilibrium in it meets an unstable orbit."""
+        scene, ds = self.scene, self.scene.located
+        if not scene.base.model.autonomous or along.family.system.section is None:
+            return Crisis("", "")
+        far = values[0] + 2.0 * scene.scale * float(np.sign(values[1] - values[0]))
+        parameter = scene.base.model.parameter(parameter_name(scene.axis))
+        while parameter.problem(far):
+            far = 0.5 * (far + values[1])
+        found = connection_of(along, sample, (*values, far), effort)
+        if isinstance(found, str):
+            return Crisis("", found)
+        contact = found.contact
+        state = ", ".join(f"{x:.6g}" for x in found.saddle.points[0])
+        listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(found.values, found.means, strict=True))
+        told = (
+            f"the set contains the saddle equilibrium at {found.rest}: {found.rest.told}; a trajectory that leaves it "
+            f"meets the stable manifold of the unstable orbit of period {found.saddle.period} at ({state}): the "
+            f"clearance is 0 at {at(ds, contact.value)}, by lines from both sides at "
+            f"{at(ds, contact.living, contact.beyond)}; no trajectory leaves the set at {at(ds, found.lives)}, and "
+            f"mean lifetimes beyond grow towards it: {listed}"
+        )
+        error = max(contact.error, 1e-9 * scene.scale)
+        return Crisis(BOUNDARY, told, contact.value, error, period=found.saddle.period, bands=(sample.n_bands, 0))
 
     def _transient(self, attractor: int, place: int, way: int) -> Crisis:
         """Judge by lifetimes alone whether a chaotic set is lost between a place and the next one."""

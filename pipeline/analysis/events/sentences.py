@@ -195,12 +195,15 @@ def _reason(row: Row, doublings: list[float]) -> str:
 
 
 def _crisis(row: Row) -> str:
-    """Name a crisis, the orbit that is met, and how lifetimes grow."""
+    """Name a crisis, the orbit that is met, and how lifetimes grow, or what meets it if they tell no power."""
     name = {BANDS: "merging of bands", TWINS: "merging of attractors"}.get(row["what"], plain(row["what"]))
     who = "the set beyond" if row["lives_beyond"] else "it"
     twin = f" together with {letter(row['twin'])}" if row["twin"] >= 0 else ""
+    orbit = f"the unstable orbit of period {row['met_period']}"
+    if np.isnan(row["exponent"]):
+        return f"{name}, {who} meets {orbit} along the unstable manifold of an equilibrium"
     times = _power(row, "lifetimes" if row["what"] == BOUNDARY else "lifetimes of its parts")
-    return f"{name}, {who} meets the unstable orbit of period {row['met_period']}{twin}; {times}"
+    return f"{name}, {who} meets {orbit}{twin}; {times}"
 
 
 def _power(row: Row, times: str) -> str:

@@ -23,7 +23,6 @@ from pipeline.analysis.events.contact import (
     Sample,
     SectionMap,
     last_stays,
-    stays,
 )
 
 LONGEST_SPAN = 8.0
@@ -130,7 +129,7 @@ class Place:
     def stays(self, value: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the section points of trajectories at a value, and when each one was last near the set."""
         paths = self.along.paths(value, self.starts, SETTLE + self.length)
-        return paths, last_stays(stays(paths, self.points, AROUND * self.size, self.along.geometry))
+        return paths, last_stays(paths, self.points, AROUND * self.size, self.along.geometry)
 
     def lifetime(self, value: float) -> tuple[float, int]:
         """Return the mean lifetime of trajectories at a parameter value [sections], and how many of them left.

@@ -16,7 +16,6 @@ from pipeline.analysis.events.contact import (
     contact_of,
     count_bands,
     have_come_back,
-    last_stays,
     passages,
     sample_of,
 )
@@ -317,7 +316,6 @@ def test_have_come_back__after_a_long_stay_elsewhere():
     near = np.array([[1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 0, 1], [1, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0]], bool)
     assert have_come_back(near, 3).tolist() == [False, True, False, False]
     assert not have_come_back(near, 4).any()
-    assert last_stays(near).tolist() == [6, 6, 2, 0]
 
 
 @pytest.mark.slow

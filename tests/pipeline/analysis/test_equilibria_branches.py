@@ -56,6 +56,17 @@ def test_equilibria__folds_of_a_cubic():
     assert branch.ends == ("bound", "bound")
 
 
+@pytest.mark.parametrize("x", [0.5, 0.505, 0.51])
+def test_equilibria__both_folds_in_one_step(x):
+    """m = x^3 - 3 c^2 x: folds at x = -c and c, much nearer to each other than the longest step."""
+    c = 0.002
+    model = model_of({"x": "m + 3*c^2*x - x^3"}, {"m": 0.0, "c": c})
+    (branch,), _ = branches_of(model, "m", (-1.0, 1.0), [x], x**3 - 3.0 * c**2 * x, step=0.02)
+    folds = sorted((branch.family.values(b.point.u)[0], branch.family.state(b.point.u)[0]) for b in branch.bifurcations)
+    assert [m for m, _ in folds] == pytest.approx([-2.0 * c**3, 2.0 * c**3], abs=2e-10)
+    assert [x for _, x in folds] == pytest.approx([c, -c], abs=2e-6)
+
+
 @pytest.mark.slow
 def test_equilibria__lorenz():
     """Subcritical Hopf point at sigma (sigma + beta + 3)/(sigma - beta - 1) = 470/19."""
