@@ -15,7 +15,7 @@ and by time modulo the number of bands. The number of states does not matter, bu
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import lcm
 
@@ -49,9 +49,10 @@ LEAST = 32
 FEW = 32
 """Trajectories that are looked at first."""
 
-AROUND, AWAY = 0.1, 1.0 / 16.0
-"""Distance from a set, as a share of its size, beyond which a trajectory is away from it; and the share of the time, at
-its end, in which a trajectory that has left is away.
+AROUND, AWAY, BACK_AGAIN = 0.1, 1.0 / 16.0, 0.02
+"""Distance from a set, as a share of its size, beyond which a trajectory is away from it; the share of the time, at
+its end, in which a trajectory that has left is away; and the largest share of trajectories that come back after this
+time, if a set is lost: those of sets that merge stay long in one of them, and come back.
 """
 
 SUBSAMPLE = 8
@@ -85,6 +86,10 @@ JUMP = 0.01
 SPREAD, SHARES = (-1.0, -0.8, -0.6, -0.4, 0.4, 0.6, 0.8, 1.0), (0.5, 0.25)
 """Values on both sides of the zero at which the clearance is taken, in units of the largest distance; and the clearance
 there as a share of the distance of passages: of maps, and of flows, for which it counts less how few pass."""
+
+CLOSER = (0.25, 0.0625)
+"""Shares of the distance of the values at which lines of flows are taken, too: far away the clearance need not be a
+straight line. Those with the least error count."""
 
 CURVED = 0.2
 """Largest distance of the zero from those of the lines on each side, as a share of the distance of their values."""
@@ -356,13 +361,17 @@ class Approach:
 
     def begin(self, paths: np.ndarray) -> bool:
         """Find the sides on which the living set passes; return whether it keeps to one side in each class."""
-        for some in (paths[:FEW], paths):  # few show that most orbits lie inside of the set
-            found, _ = self.passages(self.value, some)
-            sides = {key: (np.sign(np.median(a)), a) for key, (a, _, _) in found.items() if len(a) >= LEAST}
-            self.sides = {key: float(side) for key, (side, _) in sides.items()}
-            if any((side * a).min() <= 0.0 for side, a in sides.values()):
-                return False
-        return bool(self.sides)
+        for near in NEAR[:2]:  # another part of the set may lie on the other side of the manifold, but further away
+            self.near = near
+            if all(self._keeps_to_one_side(some) for some in (paths[:FEW], paths)):
+                return bool(self.sides)
+        return False
+
+    def _keeps_to_one_side(self, paths: np.ndarray) -> bool:
+        found, _ = self.passages(self.value, paths)
+        sides = {key: (np.sign(np.median(a)), a) for key, (a, _, _) in found.items() if len(a) >= LEAST}
+        self.sides = {key: float(side) for key, (side, _) in sides.items()}
+        return all((side * a).min() > 0.0 for side, a in sides.values())
 
     def least(self, value: float, paths: np.ndarray | None = None) -> Clearance:
         """Compute the least clearance at a parameter value."""
@@ -445,9 +454,10 @@ class Approach:
         paths = self.paths(value, length)
         until = _until(*self._sided(value, paths)[:3], paths)
         if self.effort.is_flow:  # of a lost set, most trajectories leave far from the orbit, and none comes back
-            last = last_stays(paths, self.sample.points, AROUND * self.size, self.along.geometry)
+            near = _are_near(paths, self.sample.points, AROUND * self.size, self.along.geometry)
+            last = _last(near)
             gone = last <= paths.shape[1] - AWAY * length
-            self.is_lost |= bool(gone.mean() > 0.5)
+            self.is_lost |= bool(gone.mean() > 0.5 and have_come_back(near, AWAY * length).mean() <= BACK_AGAIN)
             until = np.where(gone, last, paths.shape[1]) if self.is_lost else until
         left = until < paths.shape[1]
         settled = until >= SETTLE
@@ -469,9 +479,22 @@ class Approach:
 
 def last_stays(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
     """Return the number of sections up to the last one of each trajectory within a distance of a set; 0 if none is."""
+    return _last(_are_near(paths, points, radius, geometry))
+
+
+def _are_near(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
     is_near, lives = np.zeros(paths.shape[:2], bool), np.isfinite(paths).all(axis=2)
     is_near[lives] = nearest_distances(paths[lives], points, geometry) <= radius
-    return np.where(is_near.any(axis=1), paths.shape[1] - np.argmax(is_near[:, ::-1], axis=1), 0)
+    return is_near
+
+
+def _last(is_near: np.ndarray) -> np.ndarray:
+    return np.where(is_near.any(axis=1), is_near.shape[1] - np.argmax(is_near[:, ::-1], axis=1), 0)
+
+
+def have_come_back(is_near: np.ndarray, away: float) -> np.ndarray:
+    """Return whether trajectories come near a set again after more than `away` sections elsewhere."""
+    return np.array([(np.diff(np.flatnonzero(one)) > away).any() for one in is_near])
 
 
 def _until(a: np.ndarray, lane: np.ndarray, at: np.ndarray, paths: np.ndarray) -> np.ndarray:
@@ -524,12 +547,27 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         h = _span(approach, x, beyond)
         if h is None:
             continue
-        values = x + h * np.array(SPREAD)
-        least = np.array([approach.least(float(one)).least for one in values])
-        found = _confirmed(x, best, values, least, approach.effort.is_flow)
+        found = _confirmed_at(approach, x, best, h)
         if found is not None:
-            return found
+            return _closer(approach, found, (x, best), h) if approach.effort.is_flow else found
     return None
+
+
+def _closer(approach: Approach, found: Contact, zero: tuple[float, Clearance], h: float) -> Contact:
+    """Take the lines of a flow again nearer to where they lead; return those with the least error."""
+    span = found.span
+    for share in CLOSER:
+        x = 0.5 * (found.living + found.beyond)
+        x -= approach.least(x).least / found.slope
+        closer = [_confirmed_at(approach, *one, h * share) for one in (zero, (x, approach.least(x)))]
+        found = min([found, *(one for one in closer if one is not None)], key=lambda one: one.error)
+    return replace(found, span=span)
+
+
+def _confirmed_at(approach: Approach, value: float, best: Clearance, h: float) -> Contact | None:
+    values = value + h * np.array(SPREAD)
+    least = np.array([approach.least(float(one)).least for one in values])
+    return _confirmed(value, best, values, least, approach.effort.is_flow)
 
 
 def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_flow: bool) -> Contact | None:
@@ -565,7 +603,7 @@ def _span(approach: Approach, value: float, beyond: float) -> float | None:
     share = SHARES[approach.effort.is_flow]
     reach = approach.near * approach.size
     h = min(abs(beyond - value), abs(value - approach.value)) * float(np.sign(beyond - value))
-    for _ in range(MOST_STEPS_TO_ROOT[0]):
+    for _ in range(MOST_STEPS_TO_ROOT[approach.effort.is_flow]):
         found = approach.least(value - h).least
         if found <= share * reach:
             return h

@@ -40,7 +40,7 @@ from pipeline.analysis.sets import nearest_distances
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter, parameter_name
 
-OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 12, 1, is_flow=True)
+OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
 
 OF_BANDS = 12
@@ -51,6 +51,10 @@ SURE = 4.0
 
 GROWN, STRAY = 0.1, 1e-3
 """Distance from a set, as a share of its size, beyond which points are outside; share of points that may lie there."""
+
+JOINED = 0.5
+"""Least share of the points outside that lie on another set, if the two merge: a merged set may be larger than both.
+The largest share of the set itself that lies on the other one."""
 
 RETURNING, LOST = 0.5, 0.02
 """Shares of trajectories that leave and pass the orbit again: at least, of a set that lives on; at most, of a lost one.
@@ -86,6 +90,7 @@ class Crises:
         if not tries[0].what:
             heirs = [i for i in one.to if self._row(i, place + way) is not None][:2]
             tries += [replace(self.at(i, place + way, -way), lives_beyond=True) for i in heirs]
+            tries += [self._joined(one.stretch.attractor, place, way)]
         found = next((crisis for crisis in tries if crisis.what), None)
         if found is None:
             found = self._transient(one.stretch.attractor, place, way)
@@ -103,13 +108,29 @@ class Crises:
             self.known[key] = self._crisis(*key)
         return self.known[key]
 
+    def _joined(self, attractor: int, place: int, way: int) -> Crisis:
+        """Return the crisis in which another set at a place merges with this one as the parameter goes on."""
+        ids = self.scene.attractors["attractor"].values
+        for row in rows_at(self.scene.attractors)[(int(self.scene.order[place]),)]:
+            other = self.scene.names.get((place, int(ids[row])), int(ids[row]))
+            crisis = self.at(other, place, way) if other != attractor else Crisis("", "")
+            if crisis.what == TWINS and self.scene.names.get((place, crisis.twin), crisis.twin) == attractor:
+                return replace(crisis, twin=other)
+        return Crisis("", "")
+
     def split(self, stretches: Sequence[Stretch]) -> list[Stretch]:
         """Divide the stretches of chaotic sets where a crisis changes the size of a set or the number of its bands."""
         found = []
         for one in stretches:
             parts = [one]
             for place in self._changes(one) if SETS[one.kind] == "chaotic_set" else ():
-                if not (self.at(one.attractor, place, 1).what or self.at(one.attractor, place + 1, -1).what):
+                tries = (
+                    (self.at, place, 1),
+                    (self.at, place + 1, -1),
+                    (self._joined, place, 1),
+                    (self._joined, place + 1, -1),
+                )
+                if not any(crisis(one.attractor, k, way).what for crisis, k, way in tries):
                     continue
                 left, right = self._row(one.attractor, place), self._row(one.attractor, place + 1)
                 last = parts.pop()
@@ -330,7 +351,8 @@ def _kind(
     for number, points in others.items():
         here = along.paths(2.0 * contact.value - value, points[-effort.lanes :], effort.length)[:, SETTLE:]
         here = here.reshape(-1, geometry.n_states)
-        away = nearest_distances(outside, here[np.isfinite(here).all(axis=1)], geometry)
-        if (away > GROWN * size).mean() <= STRAY:
+        here = here[np.isfinite(here).all(axis=1)]
+        same, joined = (nearest_distances(x, here, geometry) <= GROWN * size for x in (old, outside))
+        if same.mean() < JOINED <= joined.mean():
             return TWINS, number, (m, after)
     return INTERIOR, -1, (m, after)

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve, minimize_scalar
 
 import magpend
 from pipeline.analysis.branches.starting_orbits import family_of
-from pipeline.analysis.events.contact import Approach, Effort, SectionMap, contact_of, count_bands, passages, sample_of
+from pipeline.analysis.events.contact import (
+    Approach,
+    Effort,
+    SectionMap,
+    contact_of,
+    count_bands,
+    have_come_back,
+    passages,
+    sample_of,
+)
 from pipeline.analysis.events.crises import OF_MAP
 from pipeline.analysis.events.transients import fit_lifetimes
 from pipeline.analysis.sets import Geometry
@@ -217,6 +227,95 @@ def test_contact_of__boundary_crisis_of_ueda():
     found = contact_of(approach, 13.45)
     assert found is not None
     assert abs(found.value - tangency_of_ueda()) <= found.error < 0.01
+
+
+def ends(force, states, span):
+    """States of oscillators after a time."""
+
+    def rate(t, u):
+        x, v = u.reshape(2, -1)
+        return np.concatenate([v, force(t, x, v)])
+
+    found = solve_ivp(rate, (0.0, span), np.asarray(states).T.ravel(), method="DOP853", rtol=1e-12, atol=1e-12)
+    return found.y[:, -1].reshape(2, -1).T
+
+
+def away(states, point):
+    """Distances from a point but for whole turns, which only the pendulum makes."""
+    distance = states - point
+    distance[:, 0] -= 2.0 * np.pi * np.round(distance[:, 0] / (2.0 * np.pi))
+    return distance
+
+
+def low_of_fold(force, duration, guess, period, phase, n):
+    """Coordinate along a saddle orbit's unstable direction at a fold of its unstable manifold, and its multipliers.
+
+    A point of the unstable manifold at a phase t lies 1e-6 b**t from the orbit, with b its unstable multiplier. Near
+    `phase` the manifold has a fold: n sections later the coordinate of the left eigenvector has a minimum there.
+    """
+    saddle, moves = np.array(guess), 1e-5 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    for _ in range(5):
+        there = away(ends(force, saddle + moves, period * duration), saddle)
+        matrix = np.stack([there[1] - there[2], there[3] - there[4]], axis=-1) / 2e-5
+        saddle = saddle - np.linalg.solve(matrix - np.eye(2), there[0])
+    multipliers, right = np.linalg.eig(matrix)
+    k = int(np.abs(multipliers).argmax())
+    size = np.linalg.norm(right[:, k]) * np.sign(right[0, k])
+    for width in (4e-4, 4e-5, 4e-6):
+        t = phase + width * np.linspace(-1.0, 1.0, 9)
+        starts = saddle + 1e-6 * multipliers[k] ** t[:, None] * right[:, k] / size
+        a = away(ends(force, starts, n * duration), saddle) @ np.linalg.inv(right)[k] * size
+        phase = t[a.argmin()]
+    return a.min(), np.sort(np.abs(multipliers))
+
+
+def tangency(force, duration, values, *fold):
+    """Parameter value at which the unstable manifold of a saddle orbit touches its stable one, and its multipliers."""
+    (a, _), (b, multipliers) = (low_of_fold(lambda *u, p=p: force(*u, p), duration, *fold) for p in values)
+    return values[0] + (values[1] - values[0]) * a / (a - b), multipliers
+
+
+MERGING = {
+    # x'' + x' - 10 x + 100 x**3 = F cos(3.5 t): Grebogi, Ott, Romeiras and Yorke, Phys. Rev. A 36, 1987, 5365
+    "wells": (
+        magpend.model("x'' = F*cos(omega*t) - x' + 10*x - 100*x**3", name="wells", F=0.8),
+        {"omega": 3.5}, "F", [0.848, 0.8505], {"x": (-0.4, 0.4), "x_dot": (-0.4, 0.4)},
+        lambda t, x, v, p: p * np.cos(3.5 * t) - v + 10.0 * x - 100.0 * x**3,
+        2.0 * np.pi / 3.5, [0.84925, 0.849256], (0.03872, 0.16509), 3, 0.44132, 30,
+    ),
+    # th'' + .22 th' + sin th = A cos t: two sets that turn over in opposite directions
+    "pendulum": (
+        magpend.load_model("driven-pendulum"),
+        {"overrides": {"d": 0.22}, "frequency_hz": 0.5 / np.pi},
+        "A", [2.645, 2.6475], {"th": (-3.0, 3.0), "w": (-2.0, 2.0)},
+        lambda t, x, v, p: p * np.cos(t) - 0.22 * v - np.sin(x),
+        2.0 * np.pi, [2.64639, 2.6464], (2.9213, -0.166), 6, 0.70923, 42,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MERGING)
+def test_events__twins_of_a_flow_merge(name, tmp_path):
+    """Mirror images meet an orbit between them at the tangency of its manifolds, and stay as long as theory says."""
+    model, fixed, parameter, values, starts, *known = MERGING[name]
+    spec = magpend.Spec("sweep", model).with_parameters(**fixed).with_axis(parameter, values=values)
+    spec = spec.with_start_random(n=16, seed=0, **starts).with_integration(n_transient=4000, n_keep=100)
+    found, table = decided(magpend.run(spec, tmp_path / "run", workers=0))
+    assert len(found) == 1, table["evidence"].tolist()
+    ((what, period, value, error, exponent, exponent_error),) = found
+    assert (what, period) == ("attractor_merging", known[4])
+    contact, (small, large) = tangency(*known)
+    assert abs(value - contact) <= error < 1e-5
+    # ln b2 / ln(b1 b2)**2 at a homoclinic tangency
+    assert abs(exponent - np.log(small) / (2.0 * np.log(small * large))) <= 3.0 * exponent_error < 0.3
+
+
+def test_have_come_back__after_a_long_stay_elsewhere():
+    """Of four trajectories the second comes back after three sections elsewhere, and the third leaves for good."""
+    near = np.array([[1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 0, 1], [1, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0]], bool)
+    assert have_come_back(near, 3).tolist() == [False, True, False, False]
+    assert not have_come_back(near, 4).any()
 
 
 @pytest.mark.slow
