@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -28,6 +29,10 @@ _ERRORS = {
 """Variables with the width of an interval of frequencies, and those with the frequency."""
 
 
+_TOLD = re.compile(rf"\b{FREQUENCY} = ([-+.,e\d ]*\d)(?: ± ([-+.e\d]*\d))?")
+"""Values of the frequency in a text, with an error."""
+
+
 def rate_attribute(word: str) -> dict[str, str]:
     """Return the dataset attribute that names the word; `in_own_words` reads it."""
     return {} if word == FREQUENCY else {RATE: word}
@@ -41,9 +46,9 @@ def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:
 def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset with the drive's rate in the word of its specification, for tables and figures.
 
-    All variables in Hz are converted and rounded to 15 digits, unless their names end in ``_hz``; the dim and the
-    coordinate ``frequency`` are named like the word, and so are attributes whose value is this name. Others are
-    returned unchanged.
+    All variables in Hz are converted and rounded to 15 digits, unless their names end in ``_hz``, and so are values of
+    the frequency in the texts of ``evidence``. The dim and the coordinate ``frequency`` are named like the word, and so
+    are attributes whose value is this name. Others are returned unchanged.
     """
     word = str(ds.attrs.get(RATE, FREQUENCY))
     if word == FREQUENCY:
@@ -61,6 +66,9 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
             found[name] = (variable.dims, _rounded(values), about)
         elif rate.inverse and name in _FLIPPED:
             found[name] = (variable.dims, 1 - variable.values, variable.attrs)
+        elif name == "evidence" and variable.dtype.kind in "OU":
+            texts = np.array([_told(text, rate) for text in variable.values.tolist()])
+            found[name] = (variable.dims, texts, variable.attrs)
     if "elasticity" in ds:
         found |= _sensitivities(ds, rate)
     coordinates = {name: value for name, value in found.items() if name in ds.coords}
@@ -71,6 +79,17 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
         return shown
     shown = shown.rename({FREQUENCY_DIM: rate.column})
     return shown.sortby(rate.column) if rate.inverse and rate.column in shown.dims else shown
+
+
+def _told(text: str, rate: Rate) -> str:
+    """Return a text with the values of the frequency in it as those of its rate."""
+
+    def converted(found: re.Match[str]) -> str:
+        values = np.array([float(x) for x in found[1].split(", ")])
+        error = f" ± {float(found[2]) * rate.slope(values[-1]):.0e}" if found[2] else ""
+        return f"{rate.column} = {', '.join(f'{x:.10g}' for x in rate.given(values))}{error}"
+
+    return _TOLD.sub(converted, text)
 
 
 def _sensitivities(ds: xr.Dataset, rate: Rate) -> dict[Any, Any]:

@@ -116,7 +116,7 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         rate = found[last].rate if last < len(found) else rate
         told = f"by {n} further values it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
         if (kinds[first:last] != BOUNDED_SET).any() or last - first > MOST_OPEN:
-            listed = _listed(between[first:last], found[first:last])
+            listed = _listed(ds, between[first:last], found[first:last])
             return Born("", f"whether the torus breaks up is open: {told}; between, it is {listed}")
         if first < last:
             break
@@ -124,12 +124,12 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
     return Born(BREAKUP, told, float(0.5 * (torus + chaos)), float(0.5 * abs(chaos - torus)))
 
 
-def _listed(values: np.ndarray, found: list[_Found]) -> str:
+def _listed(ds: xr.Dataset, values: np.ndarray, found: list[_Found]) -> str:
     """Write the values by the kind of the set there."""
     parts = []
     for kind, word in WORDS.items():
-        own = [f"{x:.10g}" for x, one in zip(values, found, strict=True) if one.kind == kind]
-        parts += [f"{word} at {', '.join(own)}"] if own else []
+        own = [float(x) for x, one in zip(values, found, strict=True) if one.kind == kind]
+        parts += [f"{word} at {at(ds, *own)}"] if own else []
     return "; ".join(parts)
 
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import xarray as xr
 
 from pipeline.analysis.branches.deflation import search_orbits, starts_around
 from pipeline.analysis.events.cascades import Born
@@ -203,13 +204,12 @@ class Crises:
             return Crisis("", found)
         contact = found.contact
         state = ", ".join(f"{x:.6g}" for x in found.saddle.points[0])
-        listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(found.values, found.means, strict=True))
         told = (
             f"the set contains the saddle equilibrium at {found.rest}: {found.rest.told}; a trajectory that leaves it "
             f"meets the stable manifold of the unstable orbit of period {found.saddle.period} at ({state}): the "
             f"clearance is 0 at {at(ds, contact.value)}, by lines from both sides at "
-            f"{at(ds, contact.living, contact.beyond)}; no trajectory leaves the set at {at(ds, found.lives)}, and "
-            f"mean lifetimes beyond grow towards it: {listed}"
+            f"{at(ds, contact.living, contact.beyond)}; no trajectory leaves the set at {at(ds, found.lives)}; "
+            f"beyond, {_lifetimes(ds, found.values, found.means)} grow towards it"
         )
         error = max(contact.error, 1e-9 * scene.scale)
         return Crisis(BOUNDARY, told, contact.value, error, period=found.saddle.period, bands=(sample.n_bands, 0))
@@ -229,7 +229,7 @@ class Crises:
         if isinstance(found, str):
             return Crisis("", found)
         exponent, error = found.free_exponent
-        why = f"beyond, its trajectories leave for good: {_law(found, exponent, error)}"
+        why = f"beyond, its trajectories leave for good: {_law(scene.located, found, exponent, error)}"
         return Crisis(TRANSIENT, why, found.value, found.value_error, exponent=exponent, exponent_error=error)
 
     def _row(self, attractor: int, place: int) -> int | None:
@@ -304,7 +304,7 @@ def _judged(
     times = lifetimes_of(approach, contact, beyond)
     if times is None:
         return Crisis("", f"{told}; too few trajectories leave beyond it for lifetimes")
-    told += f"; {_law(times, times.exponent, times.exponent_error)}"
+    told += f"; {_law(scene.located, times, times.exponent, times.exponent_error)}"
     far = max(abs(times.values[0] - contact.value), 1e-300)
     if abs(times.value - contact.value) > SURE * times.value_error + contact.error or times.value_error > 0.25 * far:
         return Crisis("", f"{told}: they do not agree with the clearance")
@@ -318,12 +318,15 @@ def _judged(
     return replace(found, exponent=times.exponent, exponent_error=times.exponent_error)
 
 
-def _law(times: Lifetimes, exponent: float, error: float) -> str:
-    listed = ", ".join(f"{mean:.4g} at {x:.10g}" for x, mean in zip(times.values, times.means, strict=True))
+def _law(ds: xr.Dataset, times: Lifetimes, exponent: float, error: float) -> str:
     return (
-        f"mean lifetimes {listed} grow with the power -{exponent:.3f} ± {error:.3f} of the distance from "
-        f"{times.value:.10g} ± {times.value_error:.0e}"
+        f"{_lifetimes(ds, times.values, times.means)} grow with the power -{exponent:.3f} ± {error:.3f} of the "
+        f"distance from {at(ds, times.value)} ± {times.value_error:.0e}"
     )
+
+
+def _lifetimes(ds: xr.Dataset, values: Sequence[float], means: Sequence[float]) -> str:
+    return f"mean lifetimes {', '.join(f'{mean:.4g}' for mean in means)} at {at(ds, *values)}"
 
 
 def _kind(

@@ -6,6 +6,7 @@ from math import pi
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.text import Text
 from scipy.integrate import solve_ivp
 
@@ -60,6 +61,20 @@ def test_tables__have_the_word_of_the_specification(runs):
 def test_widths__are_scaled_by_the_derivative(word):
     rate, width = RATES[word], 1e-6
     assert rate.slope(0.2) * width == pytest.approx(abs(rate.given(0.2 + width) - rate.given(0.2)), rel=1e-5)
+
+
+def test_evidence__has_the_word_of_the_specification(runs):
+    """All numbers of the frequency in a text, with an error, and no others."""
+    ds = xr.Dataset(
+        {"evidence": ("event", ["2 of 3 at frequency_hz = 0.25, -5e-1; 3 turn", "from frequency_hz = 0.2 ± 1e-03."])}
+    )
+    model = runs["omega"].cube().attrs["model"]
+    omega, period = (
+        in_own_words(ds.assign_attrs(drive_rate=word, model=model))["evidence"].values.tolist()
+        for word in ("omega", "period")
+    )
+    assert omega == ["2 of 3 at omega = 1.570796327, -3.141592654; 3 turn", "from omega = 1.256637061 ± 6e-03."]
+    assert period[1] == "from drive_period = 5 ± 2e-02."
 
 
 def test_options__take_values_in_the_word_that_they_name(runs):
