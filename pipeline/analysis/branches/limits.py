@@ -217,17 +217,19 @@ def fit_law(
     first = int(turns[-1]) + 1 if len(turns) else 0
     if len(values) - first < WINDOWS[-1][1]:
         return None
-    fits = []
+    fits, further = [], np.nan
     for floor, (_, least) in zip(floors, WINDOWS, strict=True):
         chosen = seconds >= floor
         chosen[-least:] = True
         chosen[:first] = False
         away = np.abs(values - values[-1])[chosen]
         fits.append(_fit(law, away, seconds[chosen]))
+        if len(fits) == 1:  # with the next order, of eigenvalues that vary with the parameter
+            further = _fit(lambda d: np.vstack([law(d), d * np.log(d)]), away, seconds[chosen])[0]
         if np.log1p(away.max() / fits[0][0]) < LEAST_RANGE:
             return None
     (gap, gap_error, slope, slope_error, rest), (other_gap, _, other_slope, _, _) = fits
-    error = float(np.hypot(gap_error, gap - other_gap))
+    error = float(np.linalg.norm([gap_error, gap - other_gap, gap - further]))
     return float(values[-1] + way * gap), error, slope, float(np.hypot(slope_error, slope - other_slope)), rest
 
 

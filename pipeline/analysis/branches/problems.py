@@ -33,6 +33,12 @@ from 1e-4 to 1e-7 the differences by the frequency agree to 1e-8.
 ONE_SIDED_STEP = 1e-7
 """Step of one-sided differences of an orbit by a parameter: its slope needs seven digits for Newton's method."""
 
+STEEP, STEEPEST, SHORTER = 1e2, 10.0, 1e-2
+"""Norm of a scaled monodromy matrix above which the map bends over less than this step; the largest change of a state
+per unit of the parameter for which the step is then taken along the branch, where the orbit's image moves no more than
+its start; and the share of the step that is taken else.
+"""
+
 STATE_STEP = 1e-6
 """Step of central differences of the monodromy matrix, in units of the system's scales."""
 
@@ -211,6 +217,7 @@ class OrbitProblem(FamilyProblem):
     family: Family
     _known: _Segments | None = field(default=None, init=False, repr=False)
     _tries: int = field(default=0, init=False, repr=False)
+    _beside: np.ndarray | None = field(default=None, init=False, repr=False)  # step to the other orbit, if steep
 
     def rows(self, u: np.ndarray) -> Rows:
         """Return the trajectories to integrate: the orbit, whole or period by period, also at a slightly changed
@@ -219,7 +226,7 @@ class OrbitProblem(FamilyProblem):
         step = np.zeros(self.size)
         step[-1] = ONE_SIDED_STEP
         if self._known is None:
-            return self.family.rows(np.stack([u, u + step]))
+            return self.family.rows(np.stack([u, u + (step if self._beside is None else self._beside)]))
         points = self._known.at(u)
         own = np.column_stack([points, np.full(len(points), u[-1])])
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
@@ -234,12 +241,16 @@ class OrbitProblem(FamilyProblem):
     def _of_whole(self, u: np.ndarray, ends: Ends) -> Value | None:
         n = self.size - 1
         last = [self.family.mismatch(u, image) for image in ends.images[:, -1]]
-        slope = _wrapped(last[1] - last[0], self.family) / ONE_SIDED_STEP
-        matrix = self.family.scaled(ends.monodromy[0]) - np.eye(n)
-        derivative = np.column_stack([matrix, slope])
+        monodromy, change = self.family.scaled(ends.monodromy[0]), _wrapped(last[1] - last[0], self.family)
+        if self._beside is None:
+            slope = change / ONE_SIDED_STEP
+        else:
+            slope = (change - monodromy @ self._beside[:-1]) / self._beside[-1]
+        derivative = np.column_stack([monodromy - np.eye(n), slope])
         found = Value(last[0], derivative, ends.images[0], ends.monodromy[0], float(ends.times[0].sum()))
         if self.family.period == 1 or not found.is_finite or self._tries == MOST_TRIES:
             self._tries = 0
+            self._beside = _steep_step(monodromy, derivative) if self.family.period == 1 else None
             return found
         points = np.concatenate([u[None, :n], ends.images[0, :-1] / np.asarray(self.system.scales)])
         self._known = _Segments(u, points, np.zeros((len(points), n, n + 1)))
@@ -280,6 +291,16 @@ class OrbitProblem(FamilyProblem):
         if not found.is_finite or gap > WIDEST_GAP or self._tries >= MOST_TRIES:
             self._known, self._tries = None, MOST_TRIES  # as a whole, this once
         return None
+
+
+def _steep_step(monodromy: np.ndarray, derivative: np.ndarray) -> np.ndarray | None:
+    """Return the step to the orbit that gives the slope by the parameter next, if the monodromy matrix is large."""
+    if not (np.isfinite(derivative).all() and np.linalg.norm(monodromy) > STEEP):
+        return None
+    tangent = np.linalg.svd(derivative)[2][-1]
+    if np.abs(tangent).max() > STEEPEST * abs(tangent[-1]):
+        return np.append(np.zeros(len(monodromy)), SHORTER * ONE_SIDED_STEP)
+    return np.asarray(ONE_SIDED_STEP * tangent / tangent[-1])
 
 
 def _is_joined(gap: float, residual: float) -> bool:

@@ -189,13 +189,32 @@ def test_explore__unstable_cycle_of_lorenz():
     (row,) = [row for row in table_of(ds) if row["type"] == "homoclinic"]
     known = lorenz_loop(13.5, 14.5)
     assert known == pytest.approx(13.926, abs=1e-3)
-    assert abs(row["rho"] - known) < row["bracket"] < 2e-4
+    assert abs(row["rho"] - known) < row["bracket"] < 2e-5
+    # the multiplier exceeds 1e4: steps do not crawl, as they do where the slope by the parameter is wrong
+    assert int(ds["parameter"].notnull().sum()) < 300
     assert row["saddle_quantity"] == pytest.approx(
         0.5 * (-11.0 + np.sqrt(121.0 + 40.0 * (known - 1.0))) - 8.0 / 3.0, abs=1e-3
     )
     assert (row["unstable_above"], row["unstable_below"]) == ("1", "none")
     assert np.nanmax(ds["limit_slope_expected"].values) == pytest.approx(3.0 / 8.0)
     assert any("saddle quantity 4.4" in line and "an unstable cycle" in line for line in branches_table(ds).lines)
+
+
+def test_explore__cycles_that_come_to_touch_the_section():
+    """Towards Hopf's point the same cycles shrink about z = rho - 1, until their lowest point is on z = 10."""
+    ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 15.9, 24.0, level=10.0, rho=15.9959022)
+    ends = str(ds["first_end"].attrs["flag_meanings"]).split()
+    assert "tangent" in {ends[int(ds[name][0])] for name in ("first_end", "last_end")}
+    assert int(ds["parameter"].notnull().sum()) < 2000
+    last = int(np.nanargmax(ds["parameter"].values[0]))
+    rho, state = float(ds["parameter"][0, last]), ds["section"].values[0, last, 0]
+
+    def rates(_, u):
+        return [10.0 * (u[1] - u[0]), u[0] * (rho - u[2]) - u[1], u[0] * u[1] - 8.0 / 3.0 * u[2]]
+
+    found = solve_ivp(rates, (0.0, float(ds["period_s"][0, last])), state, "DOP853", rtol=1e-11, max_step=1e-3)
+    assert found.y[:, -1] == pytest.approx(state, abs=1e-6)
+    assert found.y[2].min() == pytest.approx(10.0, abs=1e-4)
 
 
 CIRCLE = table(
