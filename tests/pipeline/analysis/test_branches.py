@@ -593,4 +593,5 @@ def test_explore__doubled_branch_that_turns_at_once():
     ((doubling,), (fold,)) = parent.bifurcations, child.bifurcations
     assert (doubling.kind, doubling.criticality) == ("period_doubling", "subcritical")
     assert fold.kind == "fold"
-    assert fold.point.u[-1] == pytest.approx(-(a**2) / (4.0 * b), abs=1e-9)
+    # a residual of 1e-10 is 1.6e-8 of e at the small amplitude of the fold
+    assert fold.point.u[-1] == pytest.approx(-(a**2) / (4.0 * b), abs=1e-8)
