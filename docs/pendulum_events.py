@@ -30,7 +30,7 @@ Row = dict[str, Any]
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "events_2_3hz": {"stable": True, "max_period": 24},
-    "events_0p1_2hz": {"stable": True, "max_period": 12, "orbits": True},
+    "events_0p1_2hz": {"stable": True, "max_period": 28, "orbits": True},
 }
 """Options of the analysis by run."""
 

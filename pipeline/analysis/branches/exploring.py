@@ -49,6 +49,9 @@ CLEAR = 2
 AMPLITUDES = (0.02, 0.05, 0.1)
 """Amplitudes of the first cycle that are tried, in units of the scales."""
 
+CERTAIN_SIDE = 1e-8
+"""Least distance of a point from a bifurcation, by the parameter in its scale, that shows on which side it lies."""
+
 SAME_LEVEL = 1e-9
 """Two sections this close are one [scales of the state that crosses]."""
 
@@ -216,10 +219,13 @@ def _half_orbit(branch: Branch, which: int) -> Start:
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
-    """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies."""
-    reach = min(4, len(child.points))  # a branch that leaves the interval soon is short
-    inner = child.points[reach - 1 if end == 0 else -reach]
-    return _side_criticality(at, 1 if inner.u[-1] > at.point.u[-1] else -1)
+    """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies: at the
+    first point that is certainly away, as it may soon turn.
+    """
+    near = child.points[:4] if end == 0 else child.points[:-5:-1]
+    away = [point.u[-1] - at.point.u[-1] for point in near]
+    sure = [x for x in away if abs(x) > CERTAIN_SIDE] or away[-1:]
+    return _side_criticality(at, 1 if sure[0] > 0.0 else -1)
 
 
 def _switch(branches: list[Branch], scope: Scope, what: str) -> None:

@@ -582,3 +582,16 @@ def test_explore__brute_force_agrees(right_family):
     assert {i for i, _ in chosen} == {0, 1}
     assert n > 15
     assert set(np.unique(ds["side"].values[:, 0])) == {Side.RIGHT}
+
+
+def test_explore__doubled_branch_that_turns_at_once():
+    """Of x' = -(1 + e) x - a x^3 + b x^5, orbits +-x at e = b x^4 - a x^2: subcritical, with a fold at -a^2/(4 b)."""
+    a, b = 0.03, 1500.0
+    model = model_of({"x": "-(1 + e)*x - a*x^3 + b*x^5"}, {"e": 0.0, "a": a, "b": b}, kind="map")
+    family = Family(model.system, 1, 1.0, model.load().pack(), ("e",), (1.0,))
+    parent, child, *_ = explore([Start(family, np.array([0.0]), -0.3)], Scope(-0.5, 0.3, 2))
+    ((doubling,), (fold,)) = parent.bifurcations, child.bifurcations
+    assert (doubling.kind, doubling.criticality) == ("period_doubling", "subcritical")
+    assert fold.kind == "fold"
+    # a residual of 1e-10 is 1.6e-8 of e at the small amplitude of the fold
+    assert fold.point.u[-1] == pytest.approx(-(a**2) / (4.0 * b), abs=1e-8)
