@@ -11,7 +11,8 @@ from scipy.optimize import fsolve
 from scipy.spatial.distance import cdist
 
 from pipeline.analysis.ragged import dense
-from pipeline.analysis.resilience.shocks import Asked, Bases, Settings, Shocked, ShockSearch, search_together
+from pipeline.analysis.resilience.shocks import Asked, Bases, search_together
+from pipeline.products.resilience import ResilienceOptions
 from pipeline.runs.derive import AnalysedRun
 from tests.core.flows import table
 
@@ -247,10 +248,7 @@ def test_thomas__shocks_equal_by_symmetry(computed):
     sizes = []
     for state in 1.5 * np.eye(3):
         own = int(there.follow(state[None]).label[0])
-        asked = Asked(
-            ShockSearch(own, 1, 3, Settings(6.0, 64, "euclidean", 1e-6, 256, 0)).run(),
-            Bases(state[None], np.zeros(1), np.ones(1, bool)),
-            np.arange(3),
-        )
-        sizes.append(search_together({"it": asked}, Shocked(there), np.ones(3), "")["it"].high)
+        bases = Bases(state[None], np.zeros(1), np.ones(1, bool))
+        asked = Asked.of(own, bases, np.arange(3), ResilienceOptions(largest=6.0))
+        sizes.append(search_together({"it": asked}, there)["it"].high)
     assert sizes == pytest.approx(np.full(3, sizes[0]), abs=1e-4)
