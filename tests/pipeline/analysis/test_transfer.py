@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 import magpend
-from pipeline.analysis.transfer.analysis import Pairs, _point, transfer_table
+from pipeline.analysis.transfer.analysis import Pairs, Sets, _point, numbers_of, transfer_table
 from pipeline.analysis.transfer.ulam import Grid, chain_of, closed_classes, committors, passage_times, stationary
 from pipeline.products.transfer import TransferOptions
 
@@ -176,6 +176,21 @@ def test_chain__gambler_on_paper() -> None:
     assert np.isinf(passage_times(p, ends[1])[:6]).all()  # each of them can end at 0
     loop = chain_of(np.array([0, 0, 1, 2]), np.array([0, 1, 2, 0])).p
     assert stationary(loop) == pytest.approx([0.5, 0.25, 0.25])
+
+
+def test_numbers_of__passages_are_weighed_by_the_measure_of_the_core() -> None:
+    # a walk on 0 ... 6 that turns back at its ends: from i to 6 it takes 36 - i**2 steps, and the ends have half the
+    # measure of other places
+    before, after = np.repeat(np.arange(7), 2), np.array([1, 1, 0, 2, 1, 3, 2, 4, 3, 5, 4, 6, 5, 5])
+    p = chain_of(before, after).p
+    density = stationary(p)
+    assert density == pytest.approx(np.array([1, 2, 2, 2, 2, 2, 1]) / 12.0)
+    cores = [np.array([0, 1]), np.array([6])]
+    halves, none = np.array([0, 0, 0, 0, 1, 1, 1]), np.zeros(0, int)
+    found = numbers_of(p, Sets(halves, cores, density, 0, np.zeros(0), none))
+    assert found["passage"][0, 1] == pytest.approx((36.0 + 2.0 * 35.0) / 3.0)
+    assert found["passage"][1, 0] == pytest.approx(25.0)
+    assert found["kept"] == pytest.approx([6.0 / 7.0, 4.0 / 5.0])
 
 
 def test_grid__angles_turn_and_bounds_count() -> None:
