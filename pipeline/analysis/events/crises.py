@@ -54,8 +54,8 @@ GROWN, STRAY = 0.1, 1e-3
 """Distance from a set, as a share of its size, beyond which points are outside; share of points that may lie there."""
 
 JOINED = 0.5
-"""Least share of the points outside that lie on another set, if the two merge: a merged set may be larger than both.
-The largest share of the set itself that lies on the other one."""
+"""Least share of the points outside that lie on another set, if the two merge, as a merged set may be larger than both;
+and the largest share of the set itself that lies on the other one."""
 
 RETURNING, LOST = 0.5, 0.02
 """Shares of trajectories that leave and pass the orbit again: at least, of a set that lives on; at most, of a lost one.
@@ -95,7 +95,7 @@ class Crises:
         found = next((crisis for crisis in tries if crisis.what), None)
         if found is None:
             found = self._transient(one.stretch.attractor, place, way)
-            tried = "; ".join(dict.fromkeys([why, *(x.why for x in tries), found.why]))
+            tried = "; ".join(filter(None, dict.fromkeys([why, *(x.why for x in tries), found.why])))
             if not found.what:
                 return replace(one, fate=replace(one.fate, why=tried))
             found = replace(found, why=tried)
@@ -182,7 +182,8 @@ class Crises:
         met = self._met(along, effort, sample, (seen, beyond), self._orbits(along, sample, seen, effort))
         if isinstance(met, str):
             connected = self._connected(along, effort, sample, (seen, beyond))
-            return replace(connected, why=f"{met}; {connected.why}") if not connected.what else connected
+            told = "; ".join(filter(None, (met, connected.why)))
+            return connected if connected.what else replace(connected, why=told)
         others = {
             int(scene.attractors["attractor"].values[k]): points[k]
             for k in rows_at(scene.attractors)[(int(scene.order[place]),)]
