@@ -61,7 +61,7 @@ def test_events__locking_between_a_torus_and_chaos(tmp_path):
     assert rows["what"].tolist() == ["not_decided"] * 2
     for text in rows["evidence"]:
         assert "whether the torus breaks up is open" in text
-        parts = dict(re.findall(r"(locked|chaotic) at ([\d., ]+)(?:;|$)", text))
+        parts = dict(re.findall(r"(locked|chaotic) at a = ([\d., ]+)(?:;|$)", text))
         told = {word: np.array(part.split(", "), float) for word, part in parts.items()}
         assert len(told["locked"]) > 5
         assert (largest_exponents(told["locked"]) < -2e-3).all()
