@@ -535,7 +535,7 @@ def _multipliers(ds: xr.Dataset, branch: int, z: np.ndarray, x: np.ndarray) -> x
 
 
 def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
-    """Mark the multipliers on the unit circle at bifurcations, and return legend entries for these bifurcations."""
+    """Mark on the unit circle the multipliers that reach it at bifurcations, and return their legend entries."""
     critical = (ds["critical_real"] + 1j * ds["critical_imag"]).values[here]
     look: dict[str, Any] = {
         "markerfacecolor": "none",

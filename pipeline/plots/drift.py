@@ -91,7 +91,7 @@ def _ramp() -> ListedColormap:
 
 
 def _colours(part: xr.Dataset, swept: list[str]) -> list[str]:
-    """Return the colour of each value of the swept number."""
+    """Return the colour of each value of the swept parameter."""
     if not swept:
         return [style.BLUE]
     values = part[swept[0]].values.astype(float)

@@ -135,7 +135,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
-    version=3,
+    version=4,
 )
 
 BANDS = Analysis(

@@ -122,7 +122,7 @@ def _closed_near(family: Family, state: np.ndarray, period: int) -> tuple[np.nda
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """Equilibria of a box at one parameter point, with a flag: is their number proved?"""
+    """All equilibria that were found in a box at one parameter point, and whether their number is proved."""
 
     family: Family  # of period 1, with the parameter's value among its parameters
     value: float

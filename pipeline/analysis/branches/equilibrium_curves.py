@@ -256,6 +256,10 @@ class EquilibriumDetector(Detector):
                 found = partial(center_manifold.zero_hopf, rest, _omega(point))
             elif not len(upper) or np.abs(upper.real).min() > 1e-6 * np.abs(upper).max():
                 return None
+            elif (
+                self.problem.kind == PITCHFORK
+            ):  # by symmetry the quadratic terms are 0, to which coefficients are ratios
+                return one
             else:
                 omega = _nearest_pair(upper)
                 pairs = sorted((_omega(point), omega)) if is_hopf else [omega]

@@ -132,7 +132,7 @@ def follow_homoclinic(
 def _laid_anew(
     problem: HomoclinicProblem, here: Point, settings: Settings
 ) -> Steps[tuple[HomoclinicProblem, Point] | None]:
-    """Lay the nodes of an orbit anew, and keep the direction of the curve."""
+    """Distribute the nodes of an orbit anew, and carry the curve's direction over to them."""
     laid = lay_nodes(loop_of(problem, here.u), CUTS[0])
     if laid is None:
         return None

@@ -93,7 +93,7 @@ def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
 
 
 def towards(branch: Branch, end: int) -> list[Point]:
-    """Return the points of a branch in order to its first (0) or last (1) end."""
+    """Return the points of a branch in the order that leads to its first (0) or last (1) end."""
     return list(branch.points) if end else [opposite(p) for p in reversed(branch.points)]
 
 
@@ -137,7 +137,7 @@ def limit_of(branch: Branch, points: Sequence[Point]) -> Limit | str:
 
 
 def last_orbit(family: Family, end: Point) -> np.ndarray:
-    """Return states at equal intervals of time on the last orbit of a branch of a flow, shape (instant, state)."""
+    """Return states of a flow's last orbit on a branch, at equal intervals of time, shape (time, state)."""
     rows, seconds = family.rows(end.u[None]), end.value.seconds
     times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
     packed = rows.parameters[:1]

@@ -295,7 +295,7 @@ class Crises:
 def _judged(
     scene: Scene, approach: Approach, contact: Contact, beyond: float, others: Mapping[int, np.ndarray]
 ) -> Crisis:
-    """Name the crisis at a contact, if lifetimes agree and the trajectories that leave show its kind."""
+    """Return the crisis at a contact, without a name if lifetimes disagree with the contact or no kind is seen."""
     ds, period = scene.located, approach.first.period
     state = ", ".join(f"{x:.6g}" for x in approach.first.points[0])
     told = (

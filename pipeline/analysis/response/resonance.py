@@ -138,7 +138,7 @@ class ModeProblem(FamilyProblem):
         return Value(residual, derivative, ends.images[0], monodromy, 1.0 / frequency)
 
     def distance(self, u: Array) -> float:
-        """Return the scaled distance of the orbit's point from the equilibrium."""
+        """Return how far the orbit's section point is from the equilibrium, in units of the states' scales."""
         return float(np.linalg.norm(self.family.mismatch(np.append(self.equilibrium, 1.0), self.family.state(u))))
 
     def orbit(self, u: Array) -> Orbit:

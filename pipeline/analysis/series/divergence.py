@@ -50,7 +50,7 @@ FLOOR = 1e-9
 
 @dataclass(frozen=True)
 class Divergence:
-    """The mean logarithm of the distances of neighbours over time, and what follows for the largest exponent."""
+    """Mean logarithm of the distance between neighbours over time, and the largest exponent that is fitted to it."""
 
     time: Floats  # [s]
     curve: Floats  # mean log distance, of random pairs 0

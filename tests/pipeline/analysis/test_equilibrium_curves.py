@@ -81,7 +81,7 @@ def curves_of(model, kind, state, values, bounds=((-1.0, 1.0), (-1.0, 1.0)), ome
     return continue_curves([(0, family, kind, start)], bounds, generations=generations)
 
 
-def only(curves, kind):
+def only_at_origin(curves, kind):
     """Return the one located point of a kind, which lies at the origin, as a row of the table."""
     (row,) = [row for row in curves_table(curves_dataset(curves, "p", "q")).rows if row["type"] == kind]
     np.testing.assert_allclose([row["p"], row["q"]], 0.0, atol=1e-8)
@@ -103,7 +103,7 @@ def test_cusp():
     p, q = on(curves, "fold").T
     assert len(p) > 20
     np.testing.assert_allclose(27.0 * 1.3 * p**2, 4.0 * q**3, atol=1e-9)
-    row = only(curves, "cusp")
+    row = only_at_origin(curves, "cusp")
     assert row["c"] == pytest.approx(-1.3, abs=1e-9)
 
 
@@ -132,7 +132,7 @@ def test_bogdanov_takens():
     assert q.min() < -0.9
     assert q.max() < 1e-8
     assert "bogdanov_takens" in next(c for c in curves if c.kind == "hopf").ends
-    row = only(curves, "bogdanov_takens")
+    row = only_at_origin(curves, "bogdanov_takens")
     np.testing.assert_allclose([row["a"], row["b"]], [1.4, -0.7], atol=1e-9)
 
 
@@ -142,7 +142,7 @@ def test_generalised_hopf():
     model = disguised(rates, {"p": 0.0, "q": 0.0}, "1 + 3*x/10 - y/5 + x*y/4")
     curves = curves_of(model, "hopf", bent([0, 0, 0]), [0.0, -0.5], generations=0)
     np.testing.assert_allclose(on(curves, "hopf")[:, 0], 0.0, atol=1e-10)
-    row = only(curves, "generalised_hopf")
+    row = only_at_origin(curves, "generalised_hopf")
     assert row["lyapunov2"] == pytest.approx(12.0 / 1.7, abs=1e-8)
 
 
@@ -161,7 +161,7 @@ def test_zero_hopf(kind):
     curves = curves_of(model, kind, bent([x, 0, 0]), values, generations=1)
     assert sorted(c.kind for c in curves if not c.family.period) == ["fold", "hopf"]
     np.testing.assert_allclose(on(curves, "fold")[:, 0], 0.0, atol=1e-9)
-    row = only(curves, "zero_hopf")
+    row = only_at_origin(curves, "zero_hopf")
     np.testing.assert_allclose([row["s"], row["theta"], row["e"]], [-1.0, -0.75, 0.9], atol=1e-8)
 
 
@@ -174,7 +174,7 @@ def test_double_hopf():
     assert sorted(np.abs(values).max(axis=0).argmin() for values in hopf) == [0, 1]
     for values in hopf:
         np.testing.assert_allclose(np.abs(values).min(axis=1), 0.0, atol=1e-10)
-    row = only(curves, "double_hopf")
+    row = only_at_origin(curves, "double_hopf")
     found = [row[name] for name in ("p11", "p22", "theta", "delta")]
     np.testing.assert_allclose(found, [1.4, -1.0, -0.4 / -0.5, 0.3 / 0.7], atol=1e-8)
 
@@ -203,18 +203,18 @@ def test_branch_points__double_zero():
     p, q = on(curves, "hopf").T
     np.testing.assert_allclose(q, 0.0, atol=1e-9)
     assert p.min() < -0.9
-    only(curves, "bogdanov_takens")
+    only_at_origin(curves, "bogdanov_takens")
 
 
 def test_branch_points__without_a_quadratic_or_cubic_term():
     """x' = p x + q x^2 - 1.3 x^3 has a cusp; x' = p x + q x^3 - .6 x^5, where folds with q^2 = -2.4 p begin."""
     model = disguised({"x": "p*x + q*x^2 - 13*x^3/10", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
     curves = curves_of(model, "transcritical", bent([0, 0]), [0.0, -0.5], generations=0)
-    row = only(curves, "cusp")
+    row = only_at_origin(curves, "cusp")
     assert row["c"] == pytest.approx(-1.3, abs=1e-8)
     model = disguised({"x": "p*x + q*x^3 - 3*x^5/5", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
     curves = curves_of(model, "pitchfork", bent([0, 0]), [0.0, -0.5], generations=1)
-    row = only(curves, "degenerate_pitchfork")
+    row = only_at_origin(curves, "degenerate_pitchfork")
     assert row["quintic"] == pytest.approx(-0.6, abs=1e-7)
     p, q = on(curves, "fold").T
     np.testing.assert_allclose(q**2, -2.4 * p, atol=1e-8)
@@ -222,10 +222,11 @@ def test_branch_points__without_a_quadratic_or_cubic_term():
 
 
 def test_branch_points__zero_hopf():
-    """A pitchfork at p = 0 with a pair (q + 1.3 i): at the origin."""
+    """A pitchfork at p = 0 with a pair (q + 1.3 i): at the origin, without a fold's coefficients."""
     rates = {"x": "p*x - x^3 + x*(y^2 + z^2)", "y": "(q + x^2)*y - 13*z/10", "z": "(q + x^2)*z + 13*y/10"}
     model = disguised(rates, {"p": 0.0, "q": 0.0})
-    only(curves_of(model, "pitchfork", bent([0, 0, 0]), [0.0, -0.5], generations=0), "zero_hopf")
+    row = only_at_origin(curves_of(model, "pitchfork", bent([0, 0, 0]), [0.0, -0.5], generations=0), "zero_hopf")
+    assert not {"s", "theta", "e"} & row.keys()
 
 
 def test_branch_points__unfolded_by_the_second_parameter():
