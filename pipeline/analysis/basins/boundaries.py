@@ -8,7 +8,8 @@ difference from a similar region, not from a finer grid.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -30,8 +31,8 @@ from pipeline.analysis.basins.labels import (
     tiles_per_side,
 )
 
-LN_2 = float(np.log(2.0))
-"""Boundary basin entropy above which the boundary must be fractal."""
+ABOVE_LN_2 = float(np.log(2.0)) * (1.0 + 1e-12)
+"""Boundary basin entropy above which the boundary must be fractal: ln 2, with the rounding of a mean."""
 
 Scaling = Literal["perturbation", "boxes", "entropy"]
 
@@ -66,20 +67,24 @@ def basin_entropy(
 ) -> xr.Dataset:
     """Compute the basin entropy and the boundary basin entropy of a grid of labels, with bootstrap errors.
 
-    The grid is cut into boxes. The entropy of a box is the entropy of its labels,
-    ``S_i = sum_j p_ij ln(1/p_ij)``. The basin entropy is the mean over all boxes, and the boundary basin
-    entropy the mean over boxes with two labels or more (Daza, Wagemakers, Georgeot, Guéry-Odelin and
-    Sanjuán, Sci. Rep. 6, 31416, 2016). If the boundary basin entropy exceeds ln 2 the boundary is fractal,
-    since a smooth boundary separates two basins in nearly every box. The converse does not hold: two
-    labels never exceed ln 2.
+    The entropy of a box is the entropy of its labels, ``S_i = sum_j p_ij ln(1/p_ij)``. The basin entropy is the
+    mean over boxes, and the boundary basin entropy the mean over boxes with two labels or more (Daza, Wagemakers,
+    Georgeot, Guéry-Odelin and Sanjuán, Sci. Rep. 6, 31416, 2016). If the boundary basin entropy exceeds ln 2 the
+    boundary is fractal, since a smooth boundary separates two basins in nearly every box. The converse does not
+    hold: two labels never exceed ln 2.
+
+    The basin entropy is the mean over all places of the box in the grid: boxes side by side would miss a straight
+    border that falls between two of them. The boundary basin entropy is that of the boxes side by side from the
+    first cell on, as published values are; if no border crosses these, it is the mean over all places.
+
+    Errors come from a bootstrap of the boxes side by side, for every placement of them; the largest counts.
 
     Parameters
     ----------
     labels
         Outcome per cell of a regular grid, integers, any number of dims.
     box
-        Side of a box [cells], one for all dims or one each. Cells at the far edges that fill no box are
-        left out (`fraction_used`).
+        Side of a box [cells], one for all dims or one each.
     unfinished
         Codes of cells whose outcome is not known. These cells are left out of their box, and a box that
         has no others is left out of the means. With ``()`` all codes count as labels.
@@ -92,8 +97,9 @@ def basin_entropy(
     Returns
     -------
     Dataset
-        `entropy` and `boundary_entropy` [nat], each with `_stderr`, `_low`, `_high`; `n_boxes`,
-        `n_boundary_boxes`, `n_labels`, `fraction_used`, `fraction_unfinished`; `above_ln2`, whether the
+        `entropy` and `boundary_entropy` [nat], each with `_stderr`, `_low`, `_high`; of the boxes side by side from
+        the first cell on `n_boxes`, `n_boundary_boxes`, and `fraction_used`, the part of the cells in them;
+        `n_labels`, `fraction_unfinished`; `above_ln2`, whether the
         boundary entropy exceeds ln 2; `above_ln2_surely`, whether the lower end of its interval does.
         Without a boundary box the boundary entropy is NaN. Errors are NaN with fewer than `FEWEST_DRAWN`
         (boundary) boxes, or squares of boxes, to draw from. Boxes should be small against the basins;
@@ -114,14 +120,15 @@ def basin_entropy(
     if block < 1:
         raise ValueError(f"block is {block}, below 1: give the number of boxes drawn as one, per side")
     boxes = _fill_boxes(grid.codes, sides)
-    used = boxes.n_finished > 0
-    boundary = boxes.n_labels > 1
-    sums = np.stack([_pool(part, block) for part in (boxes.entropy, used, boundary)])
-    value = _entropies(sums.sum(axis=1))
-    weights = bootstrap_weights(sums.shape[1], resamples, seed)
-    errors = np.array(spread(np.array([_entropies(sums @ w) for w in weights]), confidence))
-    errors[:, (sums[1:] > 0).sum(axis=1) < FEWEST_DRAWN] = np.nan
-    stderr, low, high = errors
+    parts = np.stack([boxes.entropy, boxes.n_finished > 0, boxes.n_labels > 1])
+    placements = [parts[(slice(None), *where)] for where in _placements(sides, boxes.entropy.shape)]
+    first, everywhere = _entropies(_totals(placements[0])), _entropies(_totals(parts))
+    value = np.array([everywhere[0], first[1] if np.isfinite(first[1]) else everywhere[1]])
+    errors = np.array([_placement_errors(one, block, resamples, confidence, seed) for one in placements])
+    # fmax skips placements without an error
+    stderr, below, above = np.fmax.reduce(errors, axis=0)
+    low, high = np.maximum(value - below, 0.0), value + above
+    _, n_boxes, n_boundary = _totals(placements[0])
     ds = xr.Dataset()
     long_names = {"entropy": "basin entropy", "boundary_entropy": "boundary basin entropy"}
     for i, (name, long_name) in enumerate(long_names.items()):
@@ -129,13 +136,13 @@ def basin_entropy(
         for end, of in (("stderr", stderr), ("low", low), ("high", high)):
             ds[f"{name}_{end}"] = ((), of[i])
     return ds.assign(
-        n_boxes=int(used.sum()),
-        n_boundary_boxes=int(boundary.sum()),
+        n_boxes=int(n_boxes),
+        n_boundary_boxes=int(n_boundary),
         n_labels=grid.ids.size,
-        fraction_used=float(boxes.n_labels.size * np.prod(sides) / grid.codes.size),
+        fraction_used=float(placements[0][0].size * np.prod(sides) / grid.codes.size),
         fraction_unfinished=grid.fraction_unfinished,
-        above_ln2=bool(value[1] > LN_2),
-        above_ln2_surely=bool(low[1] > LN_2),
+        above_ln2=bool(value[1] > ABOVE_LN_2),
+        above_ln2_surely=bool(low[1] > ABOVE_LN_2),
     ).assign_attrs(
         box=list(sides),
         block=block,
@@ -263,26 +270,58 @@ def box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ..
 
 
 def _fill_boxes(codes: Codes, sides: tuple[int, ...]) -> _Boxes:
-    """Compute the entropy [nat] and count the labels in each box of a grid; unfinished cells are left out.
+    """Compute the entropy [nat] and count the labels in the box at each place of a grid; unfinished cells are left out.
 
-    The cells of each box are sorted, so the work does not grow with the number of labels.
+    The box takes every place at which it lies within the grid: element (i, j, ...) is the box that begins at this cell.
     """
-    n = tuple(size // side for size, side in zip(codes.shape, sides, strict=True))
-    cut = codes[tuple(slice(0, k * side) for k, side in zip(n, sides, strict=True))]
-    pairs = cut.reshape([part for pair in zip(n, sides, strict=True) for part in pair])
-    order = (*range(0, 2 * len(n), 2), *range(1, 2 * len(n), 2))
-    content = np.sort(pairs.transpose(order).reshape(-1, int(np.prod(sides))), axis=1)
-    first = np.ones(content.shape, dtype=np.bool_)
-    first[:, 1:] = content[:, 1:] != content[:, :-1]
-    start = np.flatnonzero(first)
-    run = np.diff(start, append=content.size)
-    known = content.ravel()[start] >= 0
-    index, run = (start // content.shape[1])[known], run[known]
-    n_finished = np.bincount(index, weights=run, minlength=len(content)).astype(np.int64)
-    n_labels = np.bincount(index, minlength=len(content)).astype(np.int64)
-    p = run / n_finished[index]
-    entropy = np.bincount(index, weights=-p * np.log(p), minlength=len(content))
-    return _Boxes(entropy.reshape(n), n_labels.reshape(n), n_finished.reshape(n))
+    shape = tuple(size - side + 1 for size, side in zip(codes.shape, sides, strict=True))
+    n_labels, n_finished, logs = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape)
+    counts = np.arange(1 + int(np.prod(sides)))
+    times_log = counts * np.log(np.maximum(counts, 1))
+    for code in np.unique(codes[codes >= 0]):
+        count = _box_sums(codes == code, sides)
+        n_labels += count > 0
+        n_finished += count
+        logs += times_log[count]
+    # -sum p ln p with p = count/n is ln n - sum(count ln count)/n; a box of one label has exactly 0
+    entropy = np.where(n_labels > 1, (times_log[n_finished] - logs) / np.maximum(n_finished, 1), 0.0)
+    entropy = np.minimum(entropy, np.log(np.maximum(n_labels, 1)))  # equal labels, off by rounding
+    return _Boxes(entropy, n_labels, n_finished)
+
+
+def _box_sums(values: npt.NDArray[np.bool_], sides: tuple[int, ...]) -> Ints:
+    """Count the true cells in the box at each place of a grid."""
+    out = values.astype(np.int64)
+    for axis, side in enumerate(sides):
+        total = np.insert(np.cumsum(out, axis=axis), 0, 0, axis=axis)
+        first, last = ([slice(None)] * out.ndim for _ in range(2))
+        first[axis], last[axis] = slice(None, -side), slice(side, None)
+        out = total[tuple(last)] - total[tuple(first)]
+    return np.asarray(out)
+
+
+def _placements(sides: tuple[int, ...], places: tuple[int, ...]) -> Iterator[tuple[slice, ...]]:
+    """Yield slices that cut boxes side by side out of the boxes at all places, for each cell to begin at."""
+    begins = (range(min(side, n)) for side, n in zip(sides, places, strict=True))
+    for begin in itertools.product(*begins):
+        yield tuple(slice(start, None, side) for start, side in zip(begin, sides, strict=True))
+
+
+def _placement_errors(parts: Floats, block: int, resamples: int, confidence: float, seed: int) -> Floats:
+    """Bootstrap both entropies of boxes side by side; return standard errors, and how far the interval reaches below
+    and above. NaN if there are too few boxes to draw from.
+    """
+    sums = np.stack([_pool(part, block) for part in parts])
+    weights = bootstrap_weights(sums.shape[1], resamples, seed)
+    stderr, low, high = spread(np.array([_entropies(sums @ w) for w in weights]), confidence)
+    value = _entropies(sums.sum(axis=1))
+    errors = np.array([stderr, value - low, high - value])
+    errors[:, (sums[1:] > 0).sum(axis=1) < FEWEST_DRAWN] = np.nan
+    return errors
+
+
+def _totals(parts: Floats) -> Floats:
+    return np.asarray(parts.reshape(len(parts), -1).sum(axis=1))
 
 
 def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
@@ -364,10 +403,12 @@ def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
     for i, e in enumerate(eps):
-        boxes = _fill_boxes(codes, (int(e),) * codes.ndim)
-        tile = tile_numbers(boxes.n_labels.shape, codes.shape, step=int(e))
-        trials[i] = tile_sums(boxes.n_finished > 0, tile, n_tiles)
-        hits[i] = tile_sums(boxes.entropy if method == "entropy" else boxes.n_labels > 1, tile, n_tiles)
+        sides = (int(e),) * codes.ndim
+        boxes = _fill_boxes(codes, sides)
+        first = next(_placements(sides, boxes.entropy.shape))
+        tile = tile_numbers(boxes.entropy[first].shape, codes.shape, step=int(e))
+        trials[i] = tile_sums(boxes.n_finished[first] > 0, tile, n_tiles)
+        hits[i] = tile_sums((boxes.entropy if method == "entropy" else boxes.n_labels > 1)[first], tile, n_tiles)
     return trials, hits
 
 

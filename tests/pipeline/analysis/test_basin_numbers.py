@@ -173,7 +173,8 @@ def test_basin_entropy__on_paper():
     labels[2:4, 1] = 2  # one half and half
     ds = basin_entropy(labels, 2)
     quarter = 0.25 * np.log(4) + 0.75 * np.log(4 / 3)
-    assert ds["entropy"].item() == pytest.approx((quarter + np.log(2)) / 6)
+    # the box has 5 x 4 places: the corner is in one box, the pair in two whole and four half
+    assert ds["entropy"].item() == pytest.approx((quarter + 2 * np.log(2) + 4 * quarter) / 20)
     assert ds["boundary_entropy"].item() == pytest.approx((quarter + np.log(2)) / 2)
     assert (ds["n_boxes"].item(), ds["n_boundary_boxes"].item(), ds["n_labels"].item()) == (6, 2, 3)
     assert ds["fraction_used"].item() == pytest.approx(24 / 30)
@@ -183,13 +184,15 @@ def test_basin_entropy__on_paper():
     ds = basin_entropy(labels, (3, 2, 1))
     # boxes of one plane: a third against two thirds in the middle layer
     mixed = np.log(3) - 2 / 3 * np.log(2)
-    assert ds["entropy"].item() == pytest.approx(mixed / 3)
+    # of the seven places along the first axis two are mixed
+    assert ds["entropy"].item() == pytest.approx(2 * mixed / 7)
     assert ds["boundary_entropy"].item() == pytest.approx(mixed)
     labels = np.zeros((4, 4), dtype=int)
     labels[0, 0], labels[0, 1], labels[2:, 2:] = 1, -1, -1
     ds = basin_entropy(labels, 2)
     third = np.log(3) - 2 / 3 * np.log(2)
-    assert ds["entropy"].item() == pytest.approx(third / 3)
+    # the first box has one of three cells, its lower neighbour none; the box in the last corner has none known
+    assert ds["entropy"].item() == pytest.approx(third / 8)
     assert ds["n_boxes"].item() == 3
     assert ds["fraction_unfinished"].item() == 5 / 16
     assert basin_entropy(labels, 2, unfinished=())["n_labels"].item() == 3
@@ -215,6 +218,25 @@ def test_basin_entropy__on_paper():
     assert not found["above_ln2_surely"]
     many = basin_entropy(np.tile(one, (8, 1)), 5)
     assert many["above_ln2_surely"]
+
+
+@pytest.mark.parametrize("at", [(10, 10), (11, 10), (12, 13)])
+def test_basin_entropy__borders_between_boxes(at):
+    # four basins with straight borders; boxes of 5 side by side see none of them at (10, 10)
+    x = np.arange(20)
+    labels = 2 * (x[:, None] >= at[0]) + (x >= at[1])
+    ds = basin_entropy(labels, 5)
+    boxes = np.lib.stride_tricks.sliding_window_view(labels, (5, 5)).reshape(-1, 25)
+    entropy = [stats.entropy(np.unique(box, return_counts=True)[1]) for box in boxes]
+    assert ds["entropy"].item() == pytest.approx(np.mean(entropy), rel=1e-12)
+    assert ds["entropy_low"] < ds["entropy"] < ds["entropy_high"]
+    assert ds["entropy_stderr"] > 0.0
+    # from the first cell on as published; where those see no border, the mean over all places
+    tiles = labels.reshape(4, 5, 4, 5).transpose(0, 2, 1, 3).reshape(-1, 25)
+    tiled = [stats.entropy(np.unique(box, return_counts=True)[1]) for box in tiles]
+    boundary = np.array(tiled if max(tiled) > 0.0 else entropy)
+    assert ds["boundary_entropy"].item() == pytest.approx(boundary[boundary > 0.0].mean(), rel=1e-12)
+    assert ds["boundary_entropy_low"] < ds["boundary_entropy"] < ds["boundary_entropy_high"]
 
 
 @pytest.mark.slow

@@ -56,8 +56,11 @@ def thirds(n=60):
 
 def test_basins__a_straight_boundary():
     found = basins_of(*labelled([halves()]), box=6).isel(frequency=0)
-    # the boundary halves one column of ten boxes out of a hundred
-    np.testing.assert_allclose(found["basin_entropy"], 0.1 * LN_2)
+    # a box has 55 places across the boundary, which divides it at five of them
+    parts = np.arange(1, 6) / 6
+    mixed = -parts * np.log(parts) - (1 - parts) * np.log(1 - parts)
+    np.testing.assert_allclose(found["basin_entropy"], mixed.sum() / 55)
+    # side by side from the first cell on, the boundary halves one column of boxes
     np.testing.assert_allclose(found["boundary_basin_entropy"], LN_2)
     np.testing.assert_allclose(found["uncertainty_exponent"], 1.0, atol=1e-12)
     np.testing.assert_allclose(found["boundary_dimension"], 1.0, atol=1e-12)
