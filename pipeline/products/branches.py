@@ -180,6 +180,7 @@ ORBITS = Analysis(
     compute="pipeline.analysis.branches.orbit_search:orbits",
     table="pipeline.analysis.branches.orbit_search:orbits_table",
     needs="pipeline.analysis.branches.orbit_search:needs_point",
+    version=2,
 )
 
 

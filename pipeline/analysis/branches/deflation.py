@@ -21,7 +21,8 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import polish_orbits, scaled_distance, section_map, wrap_angles
-from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_ON_BRANCH
+from magpend_core.pointwise import rates_at
+from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_EQUILIBRIUM, SAME_ON_BRANCH
 from pipeline.products.reporting import report
 
 WIDER = 1.5
@@ -53,6 +54,8 @@ class FoundOrbit:
     monodromy: np.ndarray  # (n_states, n_states): derivative of the section map over the period
     n_hits: int  # starts of the first round, in which nothing is deflated, that led to it
     search_round: int  # round in which it was found, from 0
+    seconds: float = float("nan")  # period [s]
+    is_rest: bool = False  # whether it is an equilibrium on the section, which the return map maps to itself
 
     @property
     def period(self) -> int:
@@ -103,7 +106,8 @@ def search_orbits(
     Returns
     -------
     list of FoundOrbit
-        Orbits found, sorted by rising period, then by falling number of hits.
+        Orbits found, sorted by rising period, then by falling number of hits. Equilibria on the section are not among
+        them; the search deflates them, too.
     """
     found: list[FoundOrbit] = []
     generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)
@@ -115,7 +119,7 @@ def search_orbits(
         add_orbits(found, *ends, number, frequency_hz, packed, system)
         if len(found) == n_before:
             break
-    return sorted(found, key=lambda one: (one.period, -one.n_hits))
+    return sorted((one for one in found if not one.is_rest), key=lambda one: (one.period, -one.n_hits))
 
 
 def orbit_near(
@@ -227,8 +231,8 @@ def add_orbits(
     packed: np.ndarray,
     system: System,
 ) -> None:
-    """Refine section points close to orbits, and add new orbits to `found`. Count how often each orbit was hit in the
-    first round, which has the number 0.
+    """Refine section points close to orbits, and add new orbits to `found`, and equilibria on the section as such.
+    Count how often each was hit in the first round, which has the number 0.
     """
     if not len(states):
         return
@@ -238,9 +242,23 @@ def add_orbits(
         points = polished.points[row, : polished.orbit_period[row]]
         place = place_of(found, points, system)
         if place < 0:
-            found.append(FoundOrbit(points, polished.derivative[row], int(number == 0), number))
+            seconds = float(polished.seconds[row])
+            is_rest = stays(points, seconds, packed, system)
+            found.append(FoundOrbit(points, polished.derivative[row], int(number == 0), number, seconds, is_rest))
         elif number == 0:
             found[place] = replace(found[place], n_hits=found[place].n_hits + 1)
+
+
+def stays(points: np.ndarray, seconds: float, packed: np.ndarray, system: System) -> bool:
+    """Return whether a root of a flow's return map is an equilibrium: its rates vanish, or it returns in no time.
+
+    Spirals about an equilibrium on the section cross it for ever, so that the return map has a root there. At the rates
+    of its section points a trajectory gets no further than `SAME_EQUILIBRIUM` in the time of all returns.
+    """
+    if system.section is None:
+        return False
+    way = seconds * np.abs(rates_at(system, points, packed)) / np.asarray(system.scales)
+    return bool(way.max() < SAME_EQUILIBRIUM)
 
 
 def place_of(found: Sequence[FoundOrbit], points: np.ndarray, system: System) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from pipeline.analysis.branches.asked import start_problems
+from pipeline.analysis.branches.asked import has_equilibria, start_problems
 from pipeline.analysis.branches.deflation import (
     FoundOrbit,
     coverage,
@@ -100,6 +100,7 @@ def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, poi
         {
             "section": (("orbit", "phase", "state"), section, {"units": state_units(model)}),
             "orbit_period": column([one.period for one in found], f"least period in {periods_of(model)}"),
+            "period_s": ("orbit", [one.seconds for one in found], {"units": "s", "long_name": "least period"}),
             "n_unstable": column((np.abs(multipliers) > 1.0).sum(axis=1), "multipliers outside the unit circle"),
             "n_hits": column([one.n_hits for one in found], "starts of the first round that led to it"),
             "search_round": column([one.search_round for one in found], "round in which it was found, from 0"),
@@ -121,8 +122,13 @@ def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, poi
 
 def orbits_table(ds: xr.Dataset) -> Table:
     """Return the table of the orbits found, with text lines on whether orbits may be missing."""
-    rows = [_row(ds.isel(orbit=i)) for i in range(ds.sizes["orbit"])]
-    lines = [f"{counted(len(rows), 'orbit')} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]
+    model = model_of(ds)
+    at_rest = has_equilibria(model) and model.crossing is None  # at instants, a flow's fixed points are equilibria
+    rows = [_row(ds.isel(orbit=i), at_rest, model.crossing is not None) for i in range(ds.sizes["orbit"])]
+    found = counted(len(rows), "fixed point" if at_rest else "orbit")
+    lines = [f"{found} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]
+    if at_rest:
+        lines[1:1] = ["at instants a flow's fixed points are its equilibria, of period 0; its orbits need a [section]"]
     lines += [*aligned([_words(row) for row in rows], ""), ""]
     if "start_orbit" in ds.attrs:
         lines.append(_start_line(rows, int(ds.attrs["start_orbit"])))
@@ -150,10 +156,11 @@ def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
     ]
 
 
-def _row(one: xr.Dataset) -> Row:
+def _row(one: xr.Dataset, at_rest: bool, is_crossing: bool) -> Row:
     values = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
     return {
-        "period": int(one["orbit_period"]),
+        "period": 0 if at_rest else int(one["orbit_period"]),
+        **({"period_s": float(one["period_s"])} if is_crossing else {}),
         "n_unstable": int(one["n_unstable"]),
         "multiplier_real": float(values[0].real),
         "multiplier_imag": float(values[0].imag),
@@ -168,6 +175,7 @@ def _words(row: Row) -> Words:
     states = [name for name in row if name not in _COLUMNS]
     return {
         "period": str(row["period"]),
+        **({"seconds": f"{row['period_s']:.6g}"} if "period_s" in row else {}),
         "unstable": str(row["n_unstable"]),
         "multiplier": f"{largest.real:.5g}" + (f"{largest.imag:+.5g}i" if largest.imag else ""),
         **{name: f"{row[name]:.6f}" for name in states},
@@ -176,4 +184,4 @@ def _words(row: Row) -> Words:
     }
 
 
-_COLUMNS = ("period", "n_unstable", "multiplier_real", "multiplier_imag", "n_hits", "index")
+_COLUMNS = ("period", "period_s", "n_unstable", "multiplier_real", "multiplier_imag", "n_hits", "index")

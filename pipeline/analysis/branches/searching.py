@@ -18,7 +18,6 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
-from magpend_core.pointwise import jacobian_at, rates_at
 from pipeline.analysis.branches.deflation import (
     FoundOrbit,
     add_orbits,
@@ -37,9 +36,6 @@ from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, spli
 
 STARTS = (100, 400)
 """Starts per period: of the search, and of a second one where the sum of the indices shows that orbits are missing."""
-
-AT_REST = 1e-6
-"""Rates, in units of the Jacobian's norm, below which a fixed point of the return map of a flow is an equilibrium."""
 
 VERDICTS = ("agrees", "missing", "diverged", "unfinished", "flow")
 """Values of `index_verdict`: whether the indices add up as expected. There is nothing to expect if cells of the run
@@ -99,15 +95,7 @@ class Place:
     def _add(self, near: Sequence[tuple[np.ndarray, int]]) -> None:
         states, periods = np.array([s for s, _ in near]), np.array([p for _, p in near])
         add_orbits(self.found, states, periods, 1, self.family.frequency_hz, self.family.parameters, self.system)
-        self.found = [one for one in self.found if not self._rests(one)]
-
-    def _rests(self, one: FoundOrbit) -> bool:
-        """Return whether an orbit of a flow is an equilibrium on the section, where spirals cross for ever."""
-        if self.system.section is None:
-            return False
-        rates = rates_at(self.system, one.points[:1], self.family.parameters)[0] / np.asarray(self.system.scales)
-        jacobian = self.family.scaled(jacobian_at(self.system, one.points[:1], self.family.parameters)[0])
-        return bool(np.linalg.norm(rates) < AT_REST * np.linalg.norm(jacobian))
+        self.found = [one for one in self.found if not one.is_rest]
 
 
 def places_of(

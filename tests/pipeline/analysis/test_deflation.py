@@ -11,9 +11,12 @@ from pipeline.analysis.branches.deflation import (
     expected_index,
     index_sums,
     search_orbits,
+    stays,
     stretch,
 )
 from tests.core.cells import scipy_end
+from tests.core.flows import HOPF
+from tests.core.test_flows import seen
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.0 / (2.0 * np.pi)
@@ -64,6 +67,29 @@ def test_search_orbits__has_the_edge_orbit(everything):
     turning = next(one for one in everything if one.multipliers[0].real < -1.0)
     assert (turning.index(), turning.index(2)) == (1, -1)
     assert coverage(everything) > 0.95
+
+
+def test_search_orbits__an_equilibrium_on_the_section_is_none():
+    """The normal form of Hopf's bifurcation seen at y = 0: its circle of radius .5 and pi seconds, about the rest."""
+    parameters = seen(HOPF, "y")
+    starts = np.array([[0.45, 0.0], [0.02, 0.0], [-0.03, 0.0], [0.55, 0.0]])
+    one = np.ones(len(starts), int)
+    (cycle,) = search_orbits(starts, one, 1.0 / 50.0, parameters.pack(), parameters.model.system, rounds=2)
+    np.testing.assert_allclose(cycle.points, [[0.5, 0.0]], atol=1e-9)
+    assert cycle.seconds == pytest.approx(np.pi, rel=1e-9)
+    # a circle of radius .01 about a rest that is hardly unstable is one, too
+    parameters = seen(HOPF, "y", mu=1e-4)
+    (cycle,) = search_orbits(0.02 * starts, one, 1.0 / 50.0, parameters.pack(), parameters.model.system, rounds=0)
+    np.testing.assert_allclose(cycle.points, [[1e-2, 0.0]], atol=1e-6)
+
+
+def test_stays__by_rates_and_time():
+    parameters = seen(HOPF, "y")
+    packed, system = parameters.pack(), parameters.model.system
+    assert stays(np.array([[1e-9, 0.0]]), 3.0, packed, system)  # the rates vanish
+    assert stays(np.array([[0.5, 0.0]]), 1e-9, packed, system)  # it returns in no time
+    assert not stays(np.array([[0.5, 0.0]]), 3.0, packed, system)
+    assert not stays(np.zeros((1, 2)), 3.0, packed, DUFFING.system)  # a driven system's rest is an orbit
 
 
 def test_stretch__is_newtons_method_for_the_deflated_function():
