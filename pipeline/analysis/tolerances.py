@@ -90,7 +90,7 @@ RECURRENCE = 0.1
 # ---- equilibria --------------------------------------------------------------------------------
 
 NEAR_REST = 0.1
-"""Distance from a stable equilibrium within which a cell without a return counts as at rest."""
+"""Newton's method starts from every cell without a return whose first step is at most twice this."""
 
 AT_EQUILIBRIUM = 1e-9
 """Distance from an equilibrium, stable or not, within which a cell is at it."""

@@ -66,6 +66,7 @@ IDENTIFIED = Analysis(
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
     by_point=True,
+    version=2,
 )
 
 ATTRACTORS = Analysis(

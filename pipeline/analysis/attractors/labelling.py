@@ -197,7 +197,7 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
     for k in degenerate[:MOST_PROBES]:
         point.equilibria[k] = yield from probe_equilibrium(point.equilibria[k], search.geometry)
     if any(one.approached_within for one in point.equilibria):
-        put_at_rest(point, search.tolerance, search.geometry)
+        put_at_rest(point, search.geometry)
 
 
 def _in_families(point: Point, orbits: Sequence[Orbit], labels: _Labels) -> np.ndarray:

@@ -1,11 +1,11 @@
 """Find the equilibria of flows, and the trajectories (cells) that are at an equilibrium or approach one.
 
 Newton's method on the rates starts from the last states of cells, near or far. A cell belongs to a stable
-equilibrium in three cases: it had no return and stopped near the equilibrium; it lies on it within the
-tolerance of closed cells; or its sections follow the linear flow towards it (`approaching`), since a
+equilibrium in two cases: it lies on it, within the tolerance of closed cells or, without a return, within the error
+of the integration; or its sections or states follow the linear flow towards it (`approaching`), since a
 trajectory crosses the section thousands of times around a slow focus. A cell belongs to any other
-equilibrium only if it lies on it within `AT_EQUILIBRIUM`. Cells without a return far from all equilibria are
-integrated further, up to `WAITS` times as long, until they come near one or return.
+equilibrium only if it lies on it within `AT_EQUILIBRIUM`. Cells without a return are integrated further, up to
+`WAITS` times as long, until they come to rest or return.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ MOST = 64
 ITERATIONS = 100
 """Most Newton steps: near a degenerate equilibrium convergence is only linear."""
 
+NOISE = 0.01
+"""Error of a section, in units of the distance within which a closed cell is on a set."""
+
 RATES = 30.0
 """Rates of a flow per rate of its section, roughly: a section is often given some ten times as long as it needs."""
 
@@ -52,55 +55,66 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
         Geometry of the states.
     """
     for point in points:
-        states, reach = _ends(point, tolerance)
-        rows = np.flatnonzero(np.isfinite(states).all(axis=1))
-        point.equilibria = _found(point, states[rows], reach[rows], geometry)
-        point.at_rest = _settled(point, states, reach, geometry)
+        _come_to_rest(point, tolerance, geometry)
         _label_approaching(point, tolerance, geometry)
 
 
-def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's last state (NaN if none), and the distance within which the cell counts as at an
-    equilibrium.
-    """
-    states = np.full((point.n_cells, point.n_states), np.nan)
-    reach = np.full(point.n_cells, tolerance)
+def _ends(point: Point) -> tuple[np.ndarray, np.ndarray]:
+    """Return each cell's last state (NaN if none), and whether the cell no longer crosses the section."""
+    states, waits = np.full((point.n_cells, point.n_states), np.nan), np.zeros(point.n_cells, bool)
     for block in point.blocks():
         own = block.is_closed | block.is_bounded
         states[block.cells][own] = block.section[own, -1]
         if block.rest is not None:
-            left = block.status == Status.NO_RETURN
-            states[block.cells][left] = _waited(point, block.rest[left])
-            reach[block.cells][left] = NEAR_REST
-    return states, reach
+            left = waits[block.cells] = block.status == Status.NO_RETURN
+            states[block.cells][left] = block.rest[left]
+    return states, waits
 
 
-def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate trajectories that no longer cross the section until they are near an equilibrium; NaN if they cross it
-    again.
+def _come_to_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
+    """Find the equilibria, the cells at them and the last states of all cells; store them in the point.
+
+    Cells that no longer cross the section are integrated until each is shown to come to rest at an equilibrium.
     """
-    states, system = states.copy(), point.integrates
-    far = np.flatnonzero(np.isfinite(states).all(axis=1))
-    for _ in range(WAITS):
-        steps, _, vanishes = newton_steps(system, states[far], point.packed)
-        away = np.abs(steps / np.asarray(system.scales)).max(axis=1, initial=0.0)
-        far = far[~((away <= 0.5 * NEAR_REST) & vanishes)]
-        if not len(far):
+    states, waits = _ends(point)
+    path = _path_to(states)
+    reach = np.where(waits, NEAR_REST, tolerance)
+    for i in range(WAITS + 1):
+        finite = np.isfinite(path[:, -1]).all(axis=1)
+        point.equilibria = _found(point, path[finite, -1], reach[finite], geometry)
+        point.at_rest = _settled(point, path, waits, tolerance, geometry)
+        going = np.flatnonzero(finite & waits & (point.at_rest < 0))
+        if not len(going) or i == WAITS:
             break
-        result = run_branches(
-            np.tile(point.packed, (len(far), 1, 1)),
-            np.full((len(far), 1), point.frequency),
-            states[far],
-            n_transient=0,
-            n_keep=1,
-            rtol=WAIT_RTOL,
-            atol=WAIT_RTOL,
-            system=system,
-        )
-        waits = result.status[:, 0] == Status.NO_RETURN
-        states[far] = np.where(waits[:, None], result.final_state[:, 0], np.nan)
-        far = far[waits]
-    return states
+        path[going] = _waited(point, path[going])
+    point.last_states = path[:, -1]
+
+
+def _path_to(states: np.ndarray) -> np.ndarray:
+    """Return a path (n, 3, state) of which only the last states are known; the earlier ones are NaN."""
+    path = np.full((len(states), 3, states.shape[1]), np.nan)
+    path[:, -1] = states
+    return path
+
+
+def _waited(point: Point, path: np.ndarray) -> np.ndarray:
+    """Integrate trajectories over one more wait for a return; append the new state to each path and drop the first.
+
+    The new state is NaN if the trajectory crosses the section again.
+    """
+    result = run_branches(
+        np.tile(point.packed, (len(path), 1, 1)),
+        np.full((len(path), 1), point.frequency),
+        path[:, -1],
+        n_transient=0,
+        n_keep=1,
+        rtol=WAIT_RTOL,
+        atol=WAIT_RTOL,
+        system=point.integrates,
+    )
+    waits = result.status[:, 0] == Status.NO_RETURN
+    state = np.where(waits[:, None], result.final_state[:, 0], np.nan)
+    return np.concatenate([path[:, 1:], state[:, None]], axis=1)
 
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
@@ -137,21 +151,29 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
     return [kept[i] for i in order]
 
 
-def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> np.ndarray:
-    at_rest = np.full(len(states), -1, np.int64)
-    rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+def _settled(point: Point, path: np.ndarray, waits: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
+    """Return the index of the equilibrium that each cell is at or, without returns, comes to rest at; -1 for none."""
+    at_rest = np.full(len(path), -1, np.int64)
+    rows = np.flatnonzero(np.isfinite(path[:, -1]).all(axis=1))
+    nearest = np.full(len(rows), np.inf)
+    reach = np.where(waits[rows], NOISE * tolerance, tolerance)
     for k, one in enumerate(point.equilibria):
-        away = geometry.distance(states[rows], one.state)
-        at_rest[rows[away <= (reach[rows] if one.is_stable else AT_EQUILIBRIUM)]] = k
+        away = geometry.distance(path[rows, -1], one.state)
+        own = (away <= (reach if one.is_stable else AT_EQUILIBRIUM)) & (away < nearest)
+        at_rest[rows[own]], nearest[own] = k, away[own]
+    rows = np.flatnonzero(waits & (at_rest < 0) & np.isfinite(path).all(axis=(1, 2)))
+    seconds = np.full((len(rows), path.shape[1]), 1.0 / point.frequency)
+    at_rest[rows] = approaching(point, path[rows], seconds, tolerance, geometry)
     return at_rest
 
 
-def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
+def put_at_rest(point: Point, geometry: Geometry) -> None:
     """Mark cells near a degenerate equilibrium as at rest there, if trajectories approach it; changes
     `point.at_rest`.
     """
-    states, _ = _ends(point, tolerance)
+    states = point.last_states
     assert point.at_rest is not None
+    assert states is not None
     for k, one in enumerate(point.equilibria):
         if one.approached_within:
             known = np.flatnonzero(np.isfinite(states).all(axis=1) & (point.at_rest < 0))
@@ -180,7 +202,7 @@ def approaching(
     section, seconds
         Sections (n, k, state) and times between them (n, k) [s], see `Equilibrium.is_approached`.
     tolerance
-        Scaled distance within which a closed cell is on a set; sections err by a hundredth of it.
+        Scaled distance within which a closed cell is on a set; sections err by the share `NOISE` of it.
     geometry
         Geometry of the states.
     """
@@ -188,21 +210,28 @@ def approaching(
     for k, one in enumerate(point.equilibria):
         rows = np.flatnonzero(found < 0)
         if one.is_stable and len(rows):
-            near = one.is_approached(section[rows], seconds[rows], 0.01 * tolerance, geometry)
+            near = one.is_approached(section[rows], seconds[rows], NOISE * tolerance, geometry)
             found[rows[near]] = k
     return found
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Find the stable equilibrium at which a trajectory ends that no longer crosses the section. Return its index, and
-    add it if it is new.
+    """Find the stable equilibrium at which a trajectory comes to rest that no longer crosses the section. Return its
+    index, and add it if it is new.
     """
-    if not np.isfinite(state).all():
-        return None
-    state = _waited(point, state[None])[0]
-    for one in equilibria_near(point, state[None], geometry) if np.isfinite(state).all() else ():
-        if one.is_stable and geometry.distance(one.state, state) <= NEAR_REST:
-            return number_of(one, point, geometry)
+    path = _path_to(state[None])
+    seconds = np.full(path.shape[:2], 1.0 / point.frequency)
+    for i in range(WAITS + 1):
+        if not np.isfinite(path[0, -1]).all():
+            return None
+        for one in equilibria_near(point, path[:, -1], geometry):
+            if one.is_stable and (
+                geometry.distance(one.state, path[0, -1]) <= NOISE * SAME_EQUILIBRIUM
+                or one.is_approached(path, seconds, NOISE * SAME_EQUILIBRIUM, geometry)[0]
+            ):
+                return number_of(one, point, geometry)
+        if i < WAITS:
+            path = _waited(point, path)
     return None
 
 

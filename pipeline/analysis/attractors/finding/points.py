@@ -111,6 +111,8 @@ class Point:
     # (cell,): index of the equilibrium that each cell is at, -1 for none. Cells at rest count as neither closed nor
     # bounded.
     at_rest: np.ndarray | None = None
+    # (cell, state): last state of each cell, of cells without a return after the wait; NaN if it returned or failed
+    last_states: np.ndarray | None = None
     # limit cycles that cells are on, for a flow sampled at equal times; see `limit_cycles.tell_cycles`
     cycles: list[Cycle] = field(default_factory=list)
     # (cell,): index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
