@@ -70,7 +70,10 @@ def spectrum(
     window: Window = None,
     taper: Annotated[str, typer.Option(help="Window of each segment, by its name in scipy.signal.")] = "hann",
     nperseg: Annotated[
-        int | None, typer.Option(min=4, help="Samples of a segment; by default a sixteenth of the longest piece.")
+        int | None,
+        typer.Option(
+            min=4, help="Samples of a segment; by default a sixteenth of all, and more for a slow motion."
+        ),
     ] = None,
     scaling: Annotated[
         Literal["density", "spectrum"], typer.Option(help="Power per hertz, or power; as in scipy.signal.welch.")
@@ -84,7 +87,8 @@ def spectrum(
 ) -> None:
     """Measure the spectrum of a recording, as scipy.signal.welch does; orders count from the drive's measured edges.
 
-    Segments overlap by half, and those of all pieces are averaged.
+    Segments overlap by half, and those of all pieces are averaged. Gaps that interpolation can fill are filled; the
+    notes say how many, and warn of segments that are too short for the slowest motion.
     """
     from pipeline.analysis.spectrum.analysis import spectrum_table
     from pipeline.rig.recordings.figure import spectrum_of_recording
@@ -97,6 +101,8 @@ def spectrum(
             _read(file, mapping, window), channel, window=taper, nperseg=nperseg, scaling=scaling
         )
         tell(spectrum_table(found), csv, as_json)
+        if as_json or csv:
+            console.note(*found.attrs["notes"].splitlines())
         if out is not None:
             from pipeline.plots.spectrum import plot_spectrum
 

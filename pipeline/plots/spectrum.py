@@ -14,7 +14,7 @@ from scipy.signal import find_peaks
 
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.spectrum.analysis import AVERAGE, LINES, NONE, axes_of
-from pipeline.analysis.spectrum.estimate import power_unit
+from pipeline.analysis.spectrum.estimate import Settings, power_unit
 from pipeline.layout.vocabulary import ATTRACTS, KINDS, STABILITIES, TORUS, letter
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
@@ -165,6 +165,9 @@ def _evidence(one: xr.Dataset, column: str) -> list[str]:
     if "estimate" in one and int(one["estimate"]) == LINES:
         return []
     told = [_resolution(one, column)]
+    if "n_interpolated" in one:  # of a series; orders of a run are cut where the user says
+        told += [f"{int(n)} samples interpolated"] if (n := one["n_interpolated"]) else []
+        told += [f"{float(kept):.0%} of the variance in the bins"] if (kept := one["kept"]) < Settings.kept else []
     if "kind" in one and int(one["kind"]) == TORUS:
         second = float(one["second_hz"])
         told.insert(0, f"$f_2$ = {second:.6g} Hz" if np.isfinite(second) else "no second frequency decided")

@@ -76,6 +76,7 @@ SERIES = Analysis(
     The motion of one attractor or one cell is sampled like a recording, and analysed as recordings analyse does. A
     result that the length of the series forbids is not decided, and the table says why.""",
     SeriesOptions,
+    version=2,
     compute=f"{_SERIES}:series",
     table=f"{_SERIES}:series_table",
     needs=f"{_MOTIONS}:needs_motion",

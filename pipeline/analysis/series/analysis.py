@@ -6,12 +6,14 @@ and no name of its motion.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy import stats
 
+from magpend_core.models.model import Model
 from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
 from pipeline.analysis.intervals import binomial_interval, half_width
 from pipeline.analysis.run import OpenRun
@@ -36,7 +38,7 @@ from pipeline.analysis.spectrum.estimate import pieces_of, spectrum_of
 from pipeline.analysis.spectrum.motions import channels_of, clock_of, motions_of, sampled
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain
 from pipeline.layout.conventions import shown_unit
-from pipeline.layout.vocabulary import told_by
+from pipeline.layout.vocabulary import model_of, told_by
 from pipeline.products.product import Table
 from pipeline.products.spectrum import SeriesOptions
 
@@ -51,6 +53,9 @@ DRIFT = 0.002
 
 LEAST_DRIFT = 0.1
 """Least range of level or size over the stretches that counts as drift, relative to the standard deviation."""
+
+FEWEST_SAMPLES = 6.0
+"""Samples to an oscillation below which maxima, delays and the paths of neighbours are not seen."""
 
 ORDERLY, DISORDERLY = 0.15, 0.85
 """Results of the 0-1 test up to which a motion is regular, and from which on it is not."""
@@ -97,9 +102,11 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
     Raises
     ------
     ValueError
-        If there is no such channel, samples are not even, or no piece has 200 samples.
+        If there is no such channel, samples are not even, no piece has 200 samples, or the model is a map.
     """
     channel, pieces, rate = pieces_of(ds, channel)
+    if "model" in ds.attrs:
+        refuse_map(model_of(ds), channel)
     pieces = [piece for piece in pieces if len(piece) >= SHORTEST]
     if not pieces:
         raise ValueError(f"channel {channel!r} has no {SHORTEST} samples in a row.")
@@ -109,6 +116,16 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
     about = {"title": "series", "channel": channel, "unit": shown_unit(ds[channel].attrs, "1"), "seed": seed}
     power = spectrum_of(ds, channel).isel(spectrum=0).reset_coords()[["power", "frequency_hz"]]
     return xr.merge([_measured(series, seed), power]).assign_attrs({**told_by(ds.attrs), **about})
+
+
+def refuse_map(model: Model, channel: str) -> None:
+    """Raise ValueError if the model is a map: its series has one value per iterate and no course between them."""
+    if model.is_map:
+        raise ValueError(
+            f"channel {channel!r} has one value per iterate of the map {model.name}, and delay, maxima and neighbours "
+            "of a series are those of a motion that is sampled in between. Of a run of the map, analyse chaos measures "
+            "exponents and the 0-1 test, and analyse dimension measures dimensions."
+        )
 
 
 def _measured(series: Series, seed: int) -> xr.Dataset:
@@ -125,11 +142,13 @@ def _measured(series: Series, seed: int) -> xr.Dataset:
     parted = divergence(embedding, period, returns.in_cycle > 0)
     longest = max(coarse.pieces(), key=len)
     noise = against_noise(longest, delay, embedding.dimension, period, np.random.default_rng(seed))
-    drift = _drift(coarse)
+    drift, leaps = _drift(coarse), _leaps(series)
+    returns = replace(returns, reason=leaps) if returns.reason and leaps else returns
+    parted = replace(parted, reason=leaps) if parted.reason and leaps else parted
     sums = correlation_sums(embedding, parted.grows)
     own = recurrence(embedding)
     results = [
-        _delay_result(series, rough, has_minimum),
+        _delay_result(series, rough, has_minimum, leaps),
         _dimension_result(embedding, false),
         *_period_results(returns),
         _exponent_result(parted, noise, drift),
@@ -191,9 +210,9 @@ def _delay_of(series: Series) -> tuple[int, Floats, bool]:
     return max(1, int(np.argmax(information < information[0] / np.e))), information, False
 
 
-def _delay_result(series: Series, delay: int, decided: bool) -> Result:
+def _delay_result(series: Series, delay: int, decided: bool, leaps: str) -> Result:
     if not decided:
-        return Result("delay", "s", reason="mutual information has no minimum")
+        return Result("delay", "s", reason=leaps or "mutual information has no minimum")
     parts = np.array_split(series.values, 4)
     lags = [first_minimum(mutual_information(Series.of([part], series.step), 3 * delay)) for part in parts]
     found = np.array([lag for lag in lags if lag is not None] + [delay]) * series.step
@@ -215,12 +234,14 @@ def _dimension_result(embedding: Embedding, false: Floats) -> Result:
 
 def _period_results(returns: Returns) -> list[Result]:
     if returns.reason:
-        return [Result(name, "s", reason=returns.reason) for name in ("period", "period_scatter")]
+        units = {"period": "s", "period_scatter": "s", "cycle": "maxima"}
+        return [Result(name, unit, reason=returns.reason) for name, unit in units.items()]
     n, cycle = len(returns.time), returns.in_cycle
     mean, low, high, scatter = (max(cycle, 1) * x for x in (returns.mean, returns.low, returns.high, returns.scatter))
     ends = (scatter * np.sqrt((n - 1) / stats.chi2.ppf(q, n - 1)) for q in (0.975, 0.025))
     found = [Result("period", "s", mean, low, high), Result("period_scatter", "s", scatter, *ends)]
-    return [*found, Result("cycle", "maxima", cycle, cycle, cycle)] if cycle else found
+    reason = "" if cycle else "maxima do not repeat"
+    return [*found, _unless(reason, Result("cycle", "maxima", cycle, cycle, cycle))]
 
 
 def _exponent_result(parted: Divergence, noise: tuple[float, Floats], drift: str) -> Result:
@@ -282,6 +303,21 @@ def _drift(series: Series) -> str:
         if relative > LEAST_DRIFT and stats.kendalltau(np.arange(len(parts)), values).pvalue < DRIFT:
             return f"not stationary: its {name} drifts by {relative:.0%}"
     return ""
+
+
+def _leaps(series: Series) -> str:
+    """Return why a series has no course between its samples: too few to an oscillation; else an empty text.
+
+    For a sine of n samples to a period, half of the mean squared difference of neighbours is var (1 - cos(2 pi / n)).
+    """
+    steps = np.concatenate([np.diff(piece) for piece in series.pieces()])
+    angle = np.arccos(max(1.0 - 0.5 * float(np.mean(steps**2)) / float(series.values.var()), -1.0))
+    if angle * FEWEST_SAMPLES <= 2.0 * np.pi:
+        return ""
+    n = 2.0 * np.pi / angle
+    return (
+        f"{n:.1f} samples to an oscillation, fewer than {FEWEST_SAMPLES:g}: one value per iterate or return, or noise"
+    )
 
 
 def _motion(returns: Returns, results: dict[str, Result], parted: Divergence, drift: str) -> tuple[str, str]:

@@ -253,7 +253,7 @@ def spectrum_table(ds: xr.Dataset) -> Table:
         lines.append(_words(one, head))
     unit = str(ds.attrs["unit"])
     heading = f"spectrum of {ds.attrs['channel']}" + ("" if unit == "1" else f" [{unit}]")
-    return Table(rows, [heading, *aligned(lines)])
+    return Table(rows, [heading, *aligned(lines), *str(ds.attrs.get("notes", "")).splitlines()])
 
 
 def _words(one: xr.Dataset, head: Row) -> Words:

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy import optimize, signal
 
+from pipeline.analysis.spectrum.gaps import Filled, filled
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
 
 UNEVEN = 0.01
 """Largest deviation of a sampling interval from their median, as a share of it, at which a series counts as even."""
-
-SEGMENTS = 16
-"""Segments without overlap into which a series is divided by default."""
 
 LOBE = 4
 """Half width of a line in bins, of the window by which lines are told apart (Blackman-Harris, side lobes at -92 dB)."""
@@ -29,6 +28,17 @@ ALL = 0.99
 """Share of the power in combinations of two frequencies from which on a motion is said to have these two."""
 
 Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers by which the length of segments is chosen."""
+
+    segments: int = 16
+    """Segments without overlap into which a series is divided: more smooth the noise, fewer resolve closer lines."""
+    kept: float = 0.9
+    """Share of the variance that the bins hold at least: where they hold less, segments are too short for the slowest
+    motion, and are lengthened up to the longest stretch."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +56,10 @@ class Averaged:
         """Return the power in the first bins, whatever the scaling: the integral of the density."""
         width = self.resolution_hz * (1.0 if scaling == "density" else 1.0 / self.bandwidth_hz)
         return float(self.power[:n_bins].sum() * width)
+
+    def kept(self, scaling: str) -> float:
+        """Return the share of the variance that lies in the bins."""
+        return self.power_below(len(self.power), scaling) / self.variance if self.variance else np.nan
 
 
 def averaged(pieces: Sequence[Array], rate_hz: float, *, window: str, nperseg: int, scaling: str) -> Averaged:
@@ -138,14 +152,16 @@ def spectrum_of(
     Parameters
     ----------
     ds
-        Evenly sampled variables over ``time`` [s], perhaps in several pieces, see `magpend.read_recording`. Stretches
-        with missing samples divide a piece.
+        Evenly sampled variables over ``time`` [s], perhaps in several pieces, see `magpend.read_recording`. Gaps and
+        missing samples divide it into stretches. Short gaps are interpolated: those for which interpolation meets the
+        known samples.
     channel
         Variable; by default the first.
     window, scaling
         As in `scipy.signal.welch`.
     nperseg
-        Samples of a segment; by default a sixteenth of the longest piece.
+        Samples of a segment; by default a sixteenth of all samples, and more where these segments hold less than 90 %
+        of the variance, up to the longest stretch.
     drive_hz
         Frequency of the drive, for orders [Hz]; by default the attribute ``frequency_hz``, if there is one.
 
@@ -154,23 +170,26 @@ def spectrum_of(
     Dataset
         Over ``spectrum`` (one) and ``bin``: ``power`` in unit^2/Hz or unit^2, with the coordinates ``frequency_hz``
         and, with a drive, ``order``. ``n_averages``, ``resolution_hz``, ``bandwidth_hz`` (the window's equivalent noise
-        bandwidth), ``variance``, and ``kept``, the share of it in the bins.
+        bandwidth), ``variance``, ``kept``, the share of it in the bins, and ``n_interpolated`` samples. The attribute
+        ``notes`` says in words what was interpolated or left out, and warns of segments that are too short.
 
     Raises
     ------
     ValueError
         If there is no such channel, samples are not even, or no piece is as long as a segment.
     """
-    channel, pieces, rate = pieces_of(ds, channel)
-    longest = max(len(piece) for piece in pieces)
-    nperseg = nperseg or longest // SEGMENTS
-    long = [piece for piece in pieces if len(piece) >= nperseg >= 4]
-    if not long:
+    series = _stretches(ds, channel)
+    channel, rate = series.channel, series.rate_hz
+    whole = filled(series.pieces, series.apart)
+    long = whole.pieces
+    longest = max(map(len, long))
+    settings = {"window": window, "scaling": scaling}
+    if not 4 <= (nperseg or longest) <= longest:
         raise ValueError(
-            f"nperseg = {nperseg}: no piece of {channel} is as long; the longest without a gap has {longest} samples. "
-            "A segment has at least 4."
+            f"nperseg = {nperseg or longest}: must be at least 4, and at most the longest stretch of {channel} without "
+            f"a gap, which has {longest} samples."
         )
-    found = averaged(long, rate, window=window, nperseg=nperseg, scaling=scaling)
+    found = _averaged(long, rate, nperseg, **settings) if nperseg else _resolved(long, rate, **settings)
     drive_hz = drive_hz or ds.attrs.get("frequency_hz")
     unit = shown_unit(ds[channel].attrs, "1")
     both, frequency = ("spectrum", "bin"), found.frequency_hz[None]
@@ -179,16 +198,78 @@ def spectrum_of(
     for name in ("n_averages", "resolution_hz", "bandwidth_hz"):
         variables[name] = ("spectrum", [getattr(found, name)])
     variables["variance"] = ("spectrum", [found.variance], {"units": power_unit(unit, "spectrum")})
-    variables["kept"] = ("spectrum", [found.power_below(len(found.power), scaling) / found.variance])
+    variables["kept"] = ("spectrum", [found.kept(scaling)])
+    variables["n_interpolated"] = ("spectrum", [whole.n_samples])
     coords: dict[str, Any] = {"frequency_hz": (both, frequency, {"units": "Hz", "long_name": "frequency"})}
     if drive_hz:
         coords["order"] = (both, frequency / float(drive_hz), {"units": "1", "long_name": "order"})
     attrs = {"title": "spectrum", "channel": channel, "unit": unit, "scaling": scaling, "window": window}
+    attrs["notes"] = "\n".join(_notes(whole, found, scaling, rate))
     return xr.Dataset(variables, coords, {**told_by(ds.attrs), **attrs})
+
+
+def _averaged(pieces: Sequence[Array], rate_hz: float, nperseg: int, **settings: str) -> Averaged:
+    """Average the periodograms of the pieces that have a whole segment."""
+    return averaged([p for p in pieces if len(p) >= nperseg], rate_hz, nperseg=nperseg, **settings)
+
+
+def _resolved(
+    pieces: Sequence[Array], rate_hz: float, chosen: Settings = Settings(), *, window: str, scaling: str
+) -> Averaged:
+    """Average periodograms of segments that are long enough for the slowest motion, if a piece is."""
+    longest = max(map(len, pieces))
+    nperseg = min(longest, max(4, sum(map(len, pieces)) // chosen.segments))
+    while True:
+        found = _averaged(pieces, rate_hz, nperseg, window=window, scaling=scaling)
+        # a share that is no number, of a constant series, is not below the bound either
+        if nperseg == longest or not found.kept(scaling) < chosen.kept:
+            return found
+        nperseg = min(2 * nperseg, longest)
+
+
+def _notes(whole: Filled, found: Averaged, scaling: str, rate_hz: float) -> list[str]:
+    """Return sentences about filled gaps, pieces that are left out, and segments that are too short."""
+    notes = []
+    if whole.n_gaps:
+        notes.append(
+            f"{whole.n_samples} samples in {whole.n_gaps} short {'gap' if whole.n_gaps == 1 else 'gaps'} were "
+            f"interpolated (at most {whole.longest} in a row)"
+        )
+    lengths = [len(piece) for piece in whole.pieces]
+    nperseg = round(rate_hz / found.resolution_hz)
+    if short := sum(n for n in lengths if n < nperseg):
+        n = sum(n < nperseg for n in lengths)
+        notes.append(
+            f"{short} of {sum(lengths)} samples were left out: {n} of {len(lengths)} stretches without a gap hold "
+            f"fewer than the {nperseg} samples of a segment"
+        )
+    if (kept := found.kept(scaling)) < Settings.kept:
+        is_longest = nperseg == max(lengths)
+        remedy = "more samples in a row" if is_longest else f"longer segments, up to {max(lengths)} samples (nperseg)"
+        notes.append(
+            f"warning: the bins hold {kept:.0%} of the variance; the rest moves more slowly than once in a segment "
+            f"({1.0 / found.resolution_hz:.4g} s) and needs {remedy}"
+        )
+    return notes
+
+
+class _Stretches(NamedTuple):
+    """Stretches of a channel without gaps, in the order of time."""
+
+    channel: str
+    pieces: list[Array]
+    rate_hz: float
+    apart: Array  # from the last sample of a stretch to the first of the next [samples]
 
 
 def pieces_of(ds: xr.Dataset, channel: str) -> tuple[str, list[Array], float]:
     """Return the channel (by default the first), its stretches without gaps, and its samples per second."""
+    found = _stretches(ds, channel)
+    return found.channel, found.pieces, found.rate_hz
+
+
+def _stretches(ds: xr.Dataset, channel: str) -> _Stretches:
+    """Divide a channel (by default the first) at its gaps; raise ValueError unless samples are even."""
     names = [str(name) for name, v in ds.data_vars.items() if v.ndim == 1 and v.dims == ds["time"].dims]
     channel = channel or names[0]
     if channel not in names:
@@ -210,4 +291,5 @@ def pieces_of(ds: xr.Dataset, channel: str) -> tuple[str, list[Array], float]:
     # the mean interval of the longest stretch is more exact than the median of rounded times
     longest = max(stretches, key=len)
     rate = (len(longest) - 1) / float(time[longest[-1]] - time[longest[0]])
-    return channel, [values[part] for part in stretches], rate
+    apart = np.array([time[after[0]] - time[before[-1]] for before, after in pairwise(stretches)]) * rate
+    return _Stretches(channel, [values[part] for part in stretches], rate, apart)

@@ -143,7 +143,9 @@ def test_series_of__a_noisy_orbit_and_a_torus_are_not_chaotic():
     low, value, high = one(found, "exponent")
     assert low < 0.0 < high
     assert abs(value) < 0.002
-    assert "cycle" not in found["quantity"]
+    # a quantity that is not there has no number, and says why
+    assert np.isnan(one(found, "cycle")[1])
+    assert reason(found, "cycle") == "maxima do not repeat"
 
 
 @pytest.mark.slow
@@ -175,6 +177,34 @@ def test_series_of__a_cycle_of_three_maxima_has_the_period_of_the_whole():
     assert one(found, "cycle")[1] == 3
     low, _, high = one(found, "period")
     assert low - 1e-4 <= 2.0 * np.pi <= high + 1e-4
+
+
+def henon_map(n):
+    x = np.zeros(n + 2)
+    for i in range(2, n + 2):
+        x[i] = 1.0 - 1.4 * x[i - 1] ** 2 + 0.3 * x[i - 2]
+    return x[2:]
+
+
+def test_series_of__refuses_the_iterates_of_a_map_in_words():
+    ds = series(henon_map(300), 1.0).assign_attrs(model="henon")
+    with pytest.raises(ValueError, match=r"one value per iterate of the map henon.*analyse chaos"):
+        magpend.series_of(ds)
+
+
+@pytest.mark.slow
+def test_series_of__a_series_without_a_course_between_its_samples_says_so():
+    """One value per return, under no model: a missing quantity is NaN and says why, and the quantities are the same."""
+    found = magpend.series_of(series(henon_map(600), 1.0))
+    smooth = magpend.series_of(series(np.sin(0.3 * np.arange(600)), 1.0))
+    assert found["quantity"].values.tolist() == smooth["quantity"].values.tolist()
+    for name in ("delay", "period", "period_scatter", "cycle", "exponent"):
+        assert np.isnan(one(found, name)[1])
+        assert "samples to an oscillation, fewer than 6: one value per iterate or return, or noise" in reason(
+            found, name
+        )
+    assert one(smooth, "cycle")[1] == 1
+    assert reason(smooth, "cycle") == ""
 
 
 def test_series_of__refuses_what_it_cannot_measure():

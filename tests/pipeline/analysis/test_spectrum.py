@@ -12,6 +12,7 @@ import magpend
 from pipeline.analysis.series.analysis import series_table
 from pipeline.analysis.spectrum.analysis import LINES, spectrum_table
 from pipeline.analysis.spectrum.estimate import ALL, frequencies_of
+from pipeline.analysis.spectrum.gaps import filled
 from pipeline.specification.problems import SpecError
 
 from .cubes import swept
@@ -76,6 +77,73 @@ def test_spectrum_of__pieces_and_gaps_are_averaged_apart_and_uneven_samples_are_
         magpend.spectrum_of(ds, nperseg=1001)
     with pytest.raises(ValueError, match="even"):
         magpend.spectrum_of(ds.assign_coords(time=np.arange(3000) ** 1.1))
+
+
+def swing_with_gaps(n, rate, gaps, *, hertz=0.8, noise=0.01):
+    """A swing with noise, some stretches of it left out: from a sample on, so many samples."""
+    t = np.arange(n) / rate
+    x = np.cos(TURN * hertz * t) + noise * np.random.default_rng(2).normal(size=n)
+    there = np.ones(n, bool)
+    for first, length in gaps:
+        there[first : first + length] = False
+    piece = np.cumsum(np.diff(there.astype(int), prepend=1) > 0)
+    ds = xr.Dataset({"x": ("time", x, {"units": "m"}), "piece": ("time", piece)}, {"time": t})
+    return ds.isel(time=np.flatnonzero(there))
+
+
+def largest_line(found):
+    one = found.isel(spectrum=0)
+    return float(one["frequency_hz"][int(one["power"].values.argmax())])
+
+
+def test_spectrum_of__segments_are_as_long_as_the_stretches_between_gaps_allow():
+    """A swing of 0.8 Hz in 13 stretches of 5 to 6 s: a sixteenth of a stretch is a third of its period."""
+    ds = swing_with_gaps(16_000, 200.0, [(1250 * k, 190) for k in range(1, 13)])
+    found = magpend.spectrum_of(ds)
+    assert float(found["resolution_hz"][0]) == pytest.approx(200.0 * 16 / ds.sizes["time"], rel=0.01)
+    assert largest_line(found) == pytest.approx(0.8, abs=float(found["resolution_hz"][0]) / 2)
+    assert float(found["kept"][0]) > 0.95
+    assert int(found["n_interpolated"][0]) == 0
+    # an own choice that is too short is told
+    short = magpend.spectrum_of(ds, nperseg=78)
+    assert float(short["kept"][0]) < 0.9
+    assert "warning: the bins hold" in short.attrs["notes"]
+    assert "up to 1250 samples (nperseg)" in spectrum_table(short).lines[-1]
+
+
+def test_spectrum_of__segments_are_lengthened_for_a_slow_motion():
+    """Three periods in the whole series: a sixteenth has a fifth of one."""
+    ds = swing_with_gaps(1600, 100.0, [], hertz=3.0 / 16.0)
+    found = magpend.spectrum_of(ds)
+    assert float(found["kept"][0]) > 0.9
+    assert largest_line(found) == pytest.approx(3.0 / 16.0, abs=float(found["resolution_hz"][0]))
+    assert found.attrs["notes"] == ""
+
+
+def test_spectrum_of__short_gaps_are_interpolated_and_counted():
+    gaps = [(700 * k, 1 + k % 3) for k in range(1, 20)]
+    whole = magpend.spectrum_of(swing_with_gaps(16_000, 200.0, []))
+    found = magpend.spectrum_of(swing_with_gaps(16_000, 200.0, gaps))
+    assert int(found["n_interpolated"][0]) == sum(n for _, n in gaps)
+    assert "38 samples in 19 short gaps were interpolated (at most 3 in a row)" in found.attrs["notes"]
+    np.testing.assert_allclose(found["power"], whole["power"], atol=1e-4 * float(whole["power"].max()))
+    # missing samples within a piece are such gaps as well
+    holes = swing_with_gaps(16_000, 200.0, [])
+    holes["x"][5000:5003] = np.nan
+    assert int(magpend.spectrum_of(holes)["n_interpolated"][0]) == 3
+
+
+def test_filled__neither_long_gaps_nor_leaps_are_interpolated():
+    x = np.sin(0.05 * np.arange(2000))
+    parts = [x[:900], x[905:1500], x[1560:] + 5.0]
+    found = filled(parts, np.array([6.0, 61.0]))
+    assert [len(p) for p in found.pieces] == [1500, 440]
+    np.testing.assert_allclose(found.pieces[0], x[:1500], atol=1e-4)
+    # half a turn is missing; a leap of the level; a clock that started anew; fewer samples than the fit needs
+    for gap, leap, shift in ((63, 0.0, 0.0), (3, 1.0, 0.0), (3, 0.0, 0.4)):
+        apart = filled([x[:900], x[900 + gap :] + leap], np.array([gap + 1.0 + shift]))
+        assert (apart.n_gaps, apart.n_samples, len(apart.pieces)) == (0, 0, 2)
+    assert filled([x[:900], x[903:904]], np.array([4.0])).n_gaps == 0
 
 
 @pytest.mark.parametrize("drive", [None, 0.4])
