@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of
-from pipeline.specification.tables import FREQUENCY, RATES, Rate
+from magpend_core.models.model import Model
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of
+from pipeline.specification.tables import FREQUENCY, RATES, Rate, word_named
 
 RATE = "drive_rate"
 """Attribute with the word, if it is not ``frequency_hz``."""
@@ -36,6 +37,22 @@ _TOLD = re.compile(rf"\b{FREQUENCY} = ([-+.,e\d ]*\d)(?: ± ([-+.e\d]*\d))?")
 def rate_attribute(word: str) -> dict[str, str]:
     """Return the dataset attribute that names the word; `in_own_words` reads it."""
     return {} if word == FREQUENCY else {RATE: word}
+
+
+def spelling_of(name: str, model: Model) -> tuple[str, Callable[[Any], Any]]:
+    """Return the axis that a name in a user's file stands for, and the function that converts a value to its unit.
+
+    The drive's rate may be ``frequency_hz``, ``omega`` or ``period``, unless the model has a parameter of that name; an
+    angle may end in ``_deg``. Any other name stands for itself.
+    """
+    word = "" if name in model.parameter_names else word_named(name)
+    if word:
+        return FREQUENCY_DIM, RATES[word].hertz
+    base = name.removesuffix("_deg")
+    is_angle = base in model.parameter_names and model.parameter(base).unit.startswith("rad")
+    if name not in model.parameter_names and is_angle:
+        return base, np.radians
+    return axis_name(name), np.asarray
 
 
 def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:

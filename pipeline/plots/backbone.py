@@ -10,12 +10,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.lines import Line2D
 
+from pipeline.analysis.branches.levels import at_levels, refuse_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain
 from pipeline.layout.vocabulary import FREQUENCY_DIM, parameter_name
 from pipeline.plots import labels, style
 from pipeline.plots.branches import UNSTABLE
-from pipeline.plots.figure import frame_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.response import amplitude_of, draw_branch, levels_of
 from pipeline.products.backbone import BackboneOptions
 from pipeline.products.figures import BackboneFigureOptions
@@ -105,9 +106,12 @@ def _handles(ds: xr.Dataset, kinds: Sequence[str], levels: Mapping[Any, str]) ->
 
 def draw_backbone(run: OpenRun, options: BackboneFigureOptions) -> style.DataFigure:
     """Draw the figure ``backbone`` of a run."""
+    at, notes = values_of(run, options)
     found = run.derive("backbone", **options.part(BackboneOptions))
+    if not found.attrs["force"]:
+        refuse_at(at, "the figure backbone", "normal modes of the free motion have no level of a force")
     response = None
     if found.attrs["force"]:
         asked = {"parameter": parameter_name(FREQUENCY_DIM), "low": options.low, "high": options.high}
-        response = run.derive("response", **asked)
-    return plot_backbone(found, response, degrees=options.degrees, frame=frame_of(options))
+        response = at_levels(run.derive("response", **asked), at)
+    return noted(plot_backbone(found, response, degrees=options.degrees, frame=frame_of(options)), notes)

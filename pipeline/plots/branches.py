@@ -14,6 +14,7 @@ from matplotlib.patches import Circle
 
 from pipeline.analysis.branches.analysis import isolas_of, limits_of
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
+from pipeline.analysis.branches.levels import refuse_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import axis_name
@@ -557,5 +558,6 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
 
 def draw_multipliers(run: OpenRun, options: MultiplierOptions) -> style.DataFigure:
     """Draw the figure ``multipliers`` of a run."""
+    refuse_at(options.at, "the figure multipliers", "--branch chooses the branch and with it the values")
     found = run.derive("branches", **options.part(BranchOptions))
     return plot_multipliers(found, options.branch, frame=frame_of(options))

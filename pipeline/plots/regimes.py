@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS
+from pipeline.analysis.branches.levels import refuse_at
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, index_of_rows
 from pipeline.analysis.run import OpenRun
@@ -412,8 +413,10 @@ def _of_period(kind: str, period: int) -> str:
 
 def draw_curves(run: OpenRun, options: CurveFigureOptions) -> style.DataFigure:
     """Draw the figure ``curves`` of a run, alone or over the regime map of another run."""
-    found = run.derive("curves", **options.part(CurveOptions))
     if not options.over:
-        return plot_curves(found, frame=frame_of(options))
-    below = run.of(options.over).derive("attractors")
-    return plot_regimes(below, show=options.show, curves=found, frame=frame_of(options))
+        refuse_at(options.at, "the figure curves", "curves are drawn in the plane of both parameters")
+        return plot_curves(run.derive("curves", **options.part(CurveOptions)), frame=frame_of(options))
+    other = run.of(options.over)
+    at, notes = values_of(other, options)
+    found, below = run.derive("curves", **options.part(CurveOptions)), other.derive("attractors")
+    return noted(plot_regimes(below, show=options.show, at=at, curves=found, frame=frame_of(options)), notes)

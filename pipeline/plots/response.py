@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,15 +12,19 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of
 from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.levels import SAME, at_levels
+from pipeline.analysis.points import POINT, read_points
 from pipeline.analysis.run import OpenRun
-from pipeline.layout.vocabulary import model_of, parameter_name
+from pipeline.layout.own_words import RATE
+from pipeline.layout.vocabulary import axis_name, model_of, split_dims
 from pipeline.plots import labels, style
 from pipeline.plots.branches import MARKERS, NAMES, STABLE, UNSTABLE, stretches, with_located
-from pipeline.plots.figure import frame_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.products.figures import ResponseFigureOptions
 from pipeline.products.response import ResponseOptions
 from pipeline.specification.problems import SpecError
+from pipeline.specification.tables import FREQUENCY
 
 _POINTS: dict[str, Any] = {
     "linestyle": "none",
@@ -42,7 +44,7 @@ def plot_response(
     *,
     channel: str = "",
     harmonic: int = 0,
-    points: Mapping[str, np.ndarray] | None = None,
+    points: xr.Dataset | None = None,
     degrees: bool = False,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
@@ -61,7 +63,8 @@ def plot_response(
     harmonic
         Harmonic whose amplitude is drawn; 0 draws half of peak to peak, and the phase of the first harmonic.
     points
-        Measured points: values of the parameter, ``amplitude`` and perhaps ``phase`` [rad], of equal shape.
+        Measured points from `read_points`: ``amplitude`` and perhaps ``phase`` [rad] over the parameter. Points at
+        a level that was computed have its colour, others are black.
     degrees
         Degrees for phases, and for a channel that is an angle.
     frame
@@ -98,7 +101,7 @@ def plot_response(
     if not harmonic:
         _draw_jumps(axes[0], ds, channel, measure, levels)
     _name_isolas(axes[0], ds, measure.shown(chosen[0][0].values))
-    _draw_points(axes, points, (measure, phase))
+    drawn = _draw_points(axes, points, (measure, phase), levels)
     name = str(ds.attrs["parameter"])
     what = "amplitude" if not harmonic else f"harmonic {harmonic}"
     style.label_axes(axes[-1], labels.swept_label(name, ds.attrs["parameter_units"]), "")
@@ -108,13 +111,13 @@ def plot_response(
         axes[1].set_ylabel(labels.with_unit(f"lag of harmonic {max(harmonic, 1)}", phase.unit))
         labels.angle_ticks(axes[1], phase, most=4.5)
     style.caption(axes[0], labels.caption(ds, with_start=False))
-    style.legend_above(fig, _handles(ds, levels, points is not None), size=fig.look.tick)
+    style.legend_above(fig, _handles(ds, levels, drawn), size=fig.look.tick)
     style.finish(fig)
     return fig
 
 
-def _stored(ds: xr.Dataset, points: Mapping[str, np.ndarray] | None) -> xr.Dataset:
-    measured = {f"measured_{name}": ("measured", values) for name, values in (points or {}).items()}
+def _stored(ds: xr.Dataset, points: xr.Dataset | None) -> xr.Dataset:
+    measured = {} if points is None else {f"measured_{name}": v.variable for name, v in points.variables.items()}
     return style.storable(ds, "frequency response").assign(measured)
 
 
@@ -195,50 +198,59 @@ def _name_isolas(ax: Axes, ds: xr.Dataset, amplitude: np.ndarray) -> None:
         )  # fmt: skip
 
 
-def _draw_points(axes: np.ndarray, points: Mapping[str, np.ndarray] | None, measures: tuple[Measure, Measure]) -> None:
+def _draw_points(
+    axes: np.ndarray, points: xr.Dataset | None, measures: tuple[Measure, Measure], levels: Mapping[Any, str]
+) -> list[dict[str, Any]]:
+    """Draw measured points in the colours of their levels; return their legend entries."""
+    looks = list(_by_level(points, levels)) if points is not None else []
     for ax, name, measure in zip(axes, ("amplitude", "phase"), measures, strict=False):
-        if points is not None and name in points:
-            ax.plot(points["parameter"], measure.shown(points[name]), **_POINTS)
+        for own, look in looks:
+            if points is not None and name in points:
+                ax.plot(points["parameter"].values[own], measure.shown(points[name].values[own]), **look)
+    return [look for _, look in looks]
 
 
-def _handles(ds: xr.Dataset, levels: Mapping[Any, str], has_points: bool) -> list[Line2D]:
+def _by_level(points: xr.Dataset, levels: Mapping[Any, str]) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
+    """Yield the points of each level with their look, and at last those that belong to no level of the curves."""
+    rest = np.ones(points.sizes[POINT], bool)
+    for level, colour in levels.items():
+        told = {name: value for name, value in level if axis_name(name) in points or name in points}
+        own = rest.copy()
+        for name, value in told.items():
+            values = points[name if name in points else axis_name(name)].values
+            own &= np.isclose(values, value, rtol=SAME, atol=0.0)
+        if own.any() and (told or len(levels) == 1):
+            rest &= ~own
+            text = ", ".join(f"{name} = {value:g}" for name, value in told.items()) if len(levels) > 1 else ""
+            yield own, {**_POINTS, "markerfacecolor": colour, "label": f"measured{', ' if text else ''}{text}"}
+    if rest.any():
+        other = "at other levels" if any(name in points for level in levels for name, _ in level) else ""
+        yield rest, {**_POINTS, "label": f"measured {other}".rstrip()}
+
+
+def _handles(ds: xr.Dataset, levels: Mapping[Any, str], points: list[dict[str, Any]]) -> list[Line2D]:
     lines = [{**STABLE, "label": "stable"}, {**UNSTABLE, "label": "unstable"}]
     if len(levels) > 1:
         lines += [{"color": c, "label": ", ".join(f"{n} = {v:g}" for n, v in level)} for level, c in levels.items()]
     kinds = [KINDS[k] for k in sorted({int(k) for k in ds["kind"].values})]
     mark = {"linestyle": "none", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": "black"}
     lines += [{**mark, "marker": MARKERS[k], "label": f"{LABELS[k]} {NAMES[k]}"} for k in kinds]
-    if has_points:
-        lines.append({**_POINTS, "label": "measured"})
-    return style.handles(lines)
+    return style.handles([*lines, *points])
 
 
-def read_points(path: str | Path, parameter: str) -> dict[str, np.ndarray]:
-    """Read measured points from a CSV file with a header: the parameter's name, ``amplitude`` and perhaps ``phase``.
-
-    Raises
-    ------
-    SpecError
-        If the file cannot be read, or a column is missing or no number.
-    """
-    name = parameter_name(parameter)
-    try:
-        with Path(path).open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        columns = {n: [row[n] for row in rows] for n in (name, "amplitude", "phase") if rows and n in rows[0]}
-        found = {n: np.array(values, dtype=np.float64) for n, values in columns.items()}
-    except (OSError, ValueError, TypeError) as error:
-        raise SpecError(f"--points {path}: {error}.") from None
-    if missing := [n for n in (name, "amplitude") if n not in found]:
-        raise SpecError(f"--points {path}: has no column {missing[0]}; the first line names the columns.")
-    return {"parameter": found.pop(name), **found}
+def _points_of(run: OpenRun, options: ResponseFigureOptions) -> xr.Dataset:
+    """Read the measured points of a figure: over its parameter, with the levels of the other swept ones."""
+    cube, along = run.cube(), axis_name(options.parameter)
+    others = [d for d in split_dims(cube["status"])[0] if d != along]
+    return read_points(options.points, run.model, along, others=others, rate=str(cube.attrs.get(RATE, FREQUENCY)))
 
 
 def draw(run: OpenRun, options: ResponseFigureOptions) -> style.DataFigure:
     """Draw the figure ``response`` of a run."""
     if options.harmonic > options.harmonics:
         raise SpecError(f"--harmonic {options.harmonic}: only {options.harmonics} are computed; raise --harmonics.")
-    points = read_points(options.points, options.parameter) if options.points else None
-    found = run.derive("response", **options.part(ResponseOptions))
+    at, notes = values_of(run, options)
+    points = _points_of(run, options) if options.points else None
+    found = at_levels(run.derive("response", **options.part(ResponseOptions)), at)
     chosen: dict[str, Any] = {name: getattr(options, name) for name in ("channel", "harmonic", "degrees")}
-    return plot_response(found, points=points, frame=frame_of(options), **chosen)
+    return noted(plot_response(found, points=points, frame=frame_of(options), **chosen), notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from pipeline.analysis.branches.kinds import LABELS
+from pipeline.analysis.branches.levels import bifurcations_at, levels_of_bifurcations
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.analysis.tolerances import NO_INFLUENCE
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.plots import labels, style
 from pipeline.plots.branches import NAMES
-from pipeline.plots.figure import frame_of
+from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.branches import SensitivityOptions
 from pipeline.products.figures import SensitivityFigureOptions
 
@@ -51,6 +53,7 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
     name, unit = str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"])
     there = np.flatnonzero((np.abs(ds["elasticity"].values) > NO_INFLUENCE).any(axis=1))
     chosen = there[np.argsort(ds["value"].values[there], kind="stable")][:shown]
+    levels = levels_of_bifurcations(ds)
     n_columns = min(1 if frame.compact else 2, max(len(chosen), 1))
     n_rows = -(-max(len(chosen), 1) // n_columns)
     counts = (np.abs(ds["elasticity"].values[chosen]) > NO_INFLUENCE).sum(axis=1)
@@ -69,7 +72,8 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
         period = int(ds["orbit_period"][k])
         what = f"period {period}" if period else "equilibrium"
         value = f"{float(ds['value'][k]):.5g}{'' if unit in ('', '1') else f' {labels.raised(unit)}'}"
-        ax.set_title(f"{LABELS[kind]} {NAMES[kind]} at {value}, {what}", loc="left", fontsize=fig.look.tick)
+        text = f"{LABELS[kind]} {NAMES[kind]} at {value}, {what}"
+        ax.set_title(style.join([text, *_level(ds, levels[k])]), loc="left", fontsize=fig.look.tick)
     if not len(chosen):
         axes.flat[0].set_visible(True)
         axes.flat[0].text(0.5, 0.5, "no bifurcation with elasticities", ha="center", va="center")
@@ -81,12 +85,27 @@ def plot_sensitivities(ds: xr.Dataset, *, shown: int = 6, frame: style.Frame = s
         Patch(edgecolor="black", linewidth=0.6, label=t, **LOOKS[up]) for up, t in ((True, "grows"), (False, "shrinks"))
     ]
     style.legend_above(fig, handles, size=fig.look.tick)
-    rest = f"the {MOST_BARS} largest moves of each" if max(counts, default=0) > MOST_BARS else ""
-    if text := style.join([labels.caption(ds, with_start=False), rest]):
+    parts = [labels.caption(ds, with_start=False), *_left_out(ds, len(there), len(chosen))]
+    parts += [f"the {MOST_BARS} largest moves of each"] if max(counts, default=0) > MOST_BARS else []
+    if text := style.join(parts):
         size = fig.look.title
         fig.suptitle(style.folded(text, frame.width_in - 0.3, size), fontsize=size, x=0.01, ha="left")
     style.finish(fig)
     return fig
+
+
+def _level(ds: xr.Dataset, level: Mapping[str, float]) -> list[str]:
+    """Return the values of the parameters that tell one bifurcation from the others, with their units."""
+    units = dict(zip(map(parameter_name, map(str, ds["parameter"].values)), map(str, ds["unit"].values), strict=True))
+    shown = {name: "" if units[name] in ("", "1") else f" {labels.raised(units[name])}" for name in level}
+    return [f"{name.removesuffix('_hz')} = {value:.5g}{shown[name]}" for name, value in level.items()]
+
+
+def _left_out(ds: xr.Dataset, n_moving: int, n_shown: int) -> list[str]:
+    """Return how many bifurcations have no panel, and why."""
+    n_still = ds.sizes["bifurcation"] - n_moving
+    found = [f"{n_shown} of {n_moving} bifurcations, the first by value (--shown)"] if n_shown < n_moving else []
+    return found + ([f"{n_still} without elasticities left out"] if n_still else [])
 
 
 def _draw_bars(ax: Axes, one: xr.Dataset) -> None:
@@ -114,5 +133,6 @@ def _draw_bars(ax: Axes, one: xr.Dataset) -> None:
 
 def draw_sensitivities(run: OpenRun, options: SensitivityFigureOptions) -> style.DataFigure:
     """Draw the figure ``sensitivities`` of a run."""
-    found = run.derive("sensitivities", **options.part(SensitivityOptions))
-    return plot_sensitivities(found, shown=options.shown, frame=frame_of(options))
+    at, notes = values_of(run, options)
+    found = bifurcations_at(run.derive("sensitivities", **options.part(SensitivityOptions)), at)
+    return noted(plot_sensitivities(found, shown=options.shown, frame=frame_of(options)), notes)

@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm
 from scipy.signal import find_peaks
 
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.spectrum.analysis import AVERAGE, LINES, NONE, axes_of
+from pipeline.analysis.spectrum.analysis import AVERAGE, FOLDED, LINES, NONE, axes_of
 from pipeline.analysis.spectrum.estimate import Settings, power_unit
 from pipeline.layout.vocabulary import ATTRACTS, KINDS, STABILITIES, TORUS, letter
 from pipeline.plots import labels, palette, style
@@ -89,7 +89,7 @@ def plot_spectrum(
         one = data.isel(spectrum=k)
         _draw_one(ax, one, column, measure, colour)
         ax.set_title(style.join([name, *_evidence(one, column)]), loc="left", fontsize=fig.look.legend)
-    style.limits(axes[-1], frame, (0.0, 1.02 * max(_end(ax) for ax in axes)))
+    style.limits(axes[-1], frame, (0.0, 1.02 * max(_end(data.isel(spectrum=k), column) for k in range(len(good)))))
     for ax, k in zip(axes, range(len(good)), strict=True):
         _name_lines(ax, data.isel(spectrum=k), column)
     style.label_axes(axes[-1], _label(ds, column))
@@ -100,11 +100,16 @@ def plot_spectrum(
     return fig
 
 
-def _end(ax: Axes) -> float:
-    """Return the largest frequency at which something is above the lower end of a panel."""
-    low, _ = ax.get_ylim()
-    places = [line.get_xydata() for line in ax.get_lines()]
-    return max((float(xy[xy[:, 1] >= low, 0].max()) for xy in map(np.asarray, places) if len(xy)), default=1.0)
+def _end(one: xr.Dataset, column: str) -> float:
+    """Return the frequency below which almost all of the power lies; the larger ones would be an empty plane."""
+    is_lines = "estimate" in one and int(one["estimate"]) == LINES
+    x, power = one[column].values, one["amplitude"].values ** 2 if is_lines else one["power"].values
+    there = np.isfinite(x) & (power > 0.0)
+    x, power = x[there], power[there]
+    if not len(x):
+        return 1.0
+    beyond = power.sum() - np.cumsum(power)
+    return max(float(x[np.argmax(beyond <= FOLDED * power.sum())]), 2.0 if column == "order" else 0.0)
 
 
 def _fixed(data: xr.Dataset) -> str:
@@ -270,7 +275,8 @@ def plot_waterfall(
     shown = np.ma.masked_invalid(np.where(image < low, np.nan, image))
     ramp = colormaps[rcParams["image.cmap"]].reversed()  # faint values are light, as the paper beside them
     ax.pcolormesh(style.edges(x), style.edges(y), shown, norm=norm, cmap=ramp, rasterized=True, gid="waterfall")
-    style.limits(ax, frame, None, (0.0, float(y.max())))
+    top_shown = 1.02 * max(_end(data.isel(spectrum=k), column) for k in range(data.sizes["spectrum"]))
+    style.limits(ax, frame, None, (0.0, min(top_shown, float(y.max()))))
     coordinate = ds[along].rename(along.removeprefix("at_"))
     style.label_axes(ax, labels.parameter_label(coordinate), _label(ds, column))
     unit = power_unit(measure.unit, "density") if is_density else measure.unit

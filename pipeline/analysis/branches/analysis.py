@@ -24,10 +24,12 @@ from pipeline.analysis.branches.kinds import (
 )
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, value_with_error, values
+from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
 from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.tables import FREQUENCY
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -326,7 +328,9 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     values.
     """
     parameter = str(ds.attrs["parameter"])
-    found = {FREQUENCY_DIM: ds[FREQUENCY_DIM]} if parameter != FREQUENCY_DIM and FREQUENCY_DIM in ds else {}
+    # a dataset in the word of the specification has the drive's rate under this word
+    words = dict.fromkeys([FREQUENCY_DIM, *dims_in_own_words([FREQUENCY_DIM], str(ds.attrs.get(RATE, FREQUENCY)))])
+    found = {word: ds[word] for word in words if word != parameter and word in ds}
     for variable in ds.data_vars.values():
         told = str(variable.attrs.get("long_name", ""))
         if variable.dims == ("branch",) and told.startswith("value of "):

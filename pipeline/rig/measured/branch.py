@@ -19,7 +19,8 @@ from magpend_core.models.parameters import near_names
 from pipeline.analysis.branches.problems import parameter_units
 from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_attribute, model_of, parameter_name
+from pipeline.layout.own_words import spelling_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_attribute, model_of, parameter_name
 from pipeline.products.product import Table
 from pipeline.rig.recordings import parse_mapping, read_recording
 from pipeline.specification import tables as specification
@@ -142,11 +143,12 @@ def read_branch(path: str | Path, model: Model | None = None, state: str = "") -
     """Read a measured branch from a CSV table of orbits, or from a TOML specification of recorded orbits,
     ``[measured.branch]``.
 
-    The first column of a CSV file is the parameter of `model`; others are ``amplitude``, ``amplitude_sd``, ``mean``,
-    ``frequency`` (with ``_sd``), ``stable`` (yes, no, unknown) and ``name``. The tables that ``magpend measured branch
-    --csv`` writes can be read as well. `state` is by default the model's first. Return over the dim ``orbit`` the
-    parameter's ``value``, ``amplitude``, ``mean`` and ``frequency`` with the scatter ``..._sd``, ``harmonic``
-    amplitudes, ``stability`` (codes of `STABILITIES`), ``n_cycles``; NaN where unknown.
+    The first column of a CSV file is the parameter of `model`, of the drive's rate in any of its words. Others are
+    ``amplitude``, ``amplitude_sd``, ``mean``, ``frequency`` (with ``_sd``), ``stable`` (yes, no, unknown) and ``name``.
+    The tables that ``magpend measured branch --csv`` writes can be read as well. `state` is by default the model's
+    first. Return over the dim ``orbit`` the parameter's ``value``, ``amplitude``, ``mean`` and ``frequency`` with the
+    scatter ``..._sd``, ``harmonic`` amplitudes, ``stability`` (codes of `STABILITIES`), ``n_cycles``; NaN where
+    unknown.
 
     Raise `SpecError` if the file cannot be read, or for unknown or missing keys, columns and numbers; all at once.
     """
@@ -267,7 +269,7 @@ def _number(text: str | None, where: str, problems: list[str]) -> float:
 
 def _name_problems(model: Model, parameter: str, state: str) -> list[str]:
     names = (*model.parameter_names, *(() if model.crossing is not None else (FREQUENCY_DIM,)))
-    found = [] if axis_name(parameter) in names else [unknown_name("parameter", parameter, names)]
+    found = [] if spelling_of(parameter, model)[0] in names else [unknown_name("parameter", parameter, names)]
     return found + ([] if state in model.state_names else [unknown_name("state", state, model.state_names)])
 
 
@@ -281,8 +283,10 @@ def _dataset(
 ) -> xr.Dataset:
     unit = model.state(state).unit
     units = {"frequency": "Hz"}
+    axis, convert = spelling_of(parameter, model)
+    own = convert(np.array([row["value"] for row in rows], float))
     variables: dict[str, Any] = {
-        "value": ("orbit", [row["value"] for row in rows], {"units": parameter_units(axis_name(parameter), model)}),
+        "value": ("orbit", own, {"units": parameter_units(axis, model)}),
         "stability": (
             "orbit",
             np.array([STABILITIES.index(_YES[str(row["stable"])]) for row in rows], np.int8),
@@ -298,7 +302,7 @@ def _dataset(
         variables["harmonic"] = (("orbit", "order"), np.array(harmonics), about)
     coords: dict[str, Any] = {"name": ("orbit", [row["name"] for row in rows])}
     coords |= {"order": ("order", np.arange(1, N_HARMONICS + 1))} if harmonics is not None else {}
-    attrs = {"model": model_attribute(model), "parameter": axis_name(parameter), "state": state}
+    attrs = {"model": model_attribute(model), "parameter": axis, "state": state}
     return xr.Dataset(variables, coords, attrs)
 
 

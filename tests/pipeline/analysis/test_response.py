@@ -13,12 +13,14 @@ import magpend
 from magpend_core.models import load_model
 from pipeline.analysis.response.analysis import response_table
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
-from pipeline.plots.response import read_points
 from pipeline.specification.problems import SpecError
 
 from .cubes import swept
 
 OMEGA = 2.0 * np.pi
+
+MEASURED = ((0.1, 0.1, 0.2, 0.1), (0.3, 0.2, 0.9, 0.4), (0.25, 0.15, 0.5, 0.2))
+"""Levels of the force, frequencies, amplitudes and phases of measured points; one level was not computed."""
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +246,7 @@ def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
 @pytest.mark.slow
 def test_figure__shows_levels_and_measured_points(hardening, response, tmp_path):
     file = tmp_path / "measured.csv"
-    file.write_text("frequency_hz,amplitude,phase\n0.1,0.2,0.1\n0.2,0.9,0.4\n")
+    file.write_text("F,omega,amplitude,phase\n" + "".join(f"{f},{OMEGA * h!r},{a},{p}\n" for f, h, a, p in MEASURED))
     upper, lower = hardening.plot.response(parameter="frequency_hz", points=str(file))
     drawn = [line for line in upper.get_lines() if line.get_linestyle() == "-"]
     assert len({line.get_color() for line in drawn}) == 2
@@ -252,21 +254,30 @@ def test_figure__shows_levels_and_measured_points(hardening, response, tmp_path)
     stable = (response["n_unstable"] == 0).values
     own = response["amplitude"].sel(channel="x").values[stable]
     assert set(own).issubset(set(solid[:, 1]))
-    points = [line for line in lower.get_lines() if list(line.get_xdata()) == [0.1, 0.2]]
-    assert list(points[0].get_ydata()) == [0.1, 0.4]
+    points = [line for line in lower.get_lines() if line.get_marker() == "o" and line.get_linestyle() == "None"]
+    np.testing.assert_allclose(np.concatenate([line.get_xdata() for line in points]), [0.1, 0.2, 0.15], rtol=1e-12)
+    assert [list(line.get_ydata()) for line in points] == [[0.1], [0.4], [0.2]]
+    # of a level that was computed in its colour, of another one black
+    colours = {line.get_markerfacecolor() for line in points}
+    assert colours == {line.get_color() for line in drawn} | {"black"}
+    assert [text.get_text() for text in upper.figure.legends[0].get_texts()][-3:] == [
+        "measured, F = 0.1", "measured, F = 0.3", "measured at other levels",
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [("amplitude\n1\n", "no column frequency_hz"), ("frequency_hz,amplitude\n1,x\n", "'x'"), (None, "No such file")],
-)
-def test_points__are_refused_with_the_file_and_the_column(tmp_path, text, named):
-    file = tmp_path / "points.csv"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(SpecError, match=named) as refused:
-        read_points(file, "frequency")
-    assert str(file) in str(refused.value)
+@pytest.mark.slow
+def test_figure__shows_the_level_that_is_asked_for(hardening):
+    upper, _ = hardening.plot.response(parameter="frequency_hz", at={"F": 0.3})
+    assert set(upper.figure.data["F"].values.tolist()) == {0.3}
+    assert upper.figure.data.sizes["branch"] < hardening.response(parameter="frequency_hz").sizes["branch"]
+    both = hardening.plot.sensitivities(parameter="frequency_hz")
+    names = [ax.get_title(loc="left") for ax in both]
+    assert all("F = 0.3" in name or "F = 0.1" in name for name in names)
+    one = hardening.plot.sensitivities(parameter="frequency_hz", at={"F": 0.3}, shown=1)
+    assert one[0].figure.data.sizes["bifurcation"] < both[0].figure.data.sizes["bifurcation"]
+    assert "1 of 2 bifurcations" in one[0].figure.get_suptitle()
+    with pytest.raises((SpecError, ValueError), match=r"F = 0\.2"):
+        hardening.plot.response(parameter="frequency_hz", at={"F": 0.2})
 
 
 @pytest.mark.slow
