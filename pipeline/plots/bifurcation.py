@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,50 +30,81 @@ def draw_bands(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | 
     """Shade the bands about the section points of orbits, and draw the intervals of bifurcations as horizontal bars.
 
     A bar goes through the first section point of its bifurcation. Bifurcations at which no stable orbit begins or ends
-    have none, and neither have those that fewer than half of the draws have. The limits of the axes are final. Return
-    handles for the legend.
+    have none, and neither have those that fewer than half of the draws have. The axes are widened to hold both, unless
+    the user chose them. Return handles for the legend; those of bands and bars that are as thin as a line have the
+    width.
     """
-    edges: list[float] = []
+    tubes = list(_tubes(bands, measure, max_period))
+    bars = list(_bars(bands, measure, max_period))
+    edges = [(x, y) for x, below, above in tubes for y in (below, above)] + [
+        (np.array(b[:2]), np.array(b[2:])) for b in bars
+    ]
+    hold(ax, [x for x, _ in edges], [] if measure.on_circle else [y for _, y in edges])
+    for x, below, above in tubes:
+        ax.fill_between(x, below, above, **SHADE, gid="band")
+    for low, high, y in bars:
+        ax.plot([low, high], [y, y], scalex=False, scaley=False, gid="interval", **BAR)
+    handles: list[Any] = []
+    if tubes:
+        width = max(float(np.nanmax(above - below)) for _, below, above in tubes)
+        text = f"95 % of the orbits{thin(width, ax.get_ylim(), measure.unit)}"
+        handles.append(Patch(label=text, **{**SHADE, "zorder": None}))
+    if bars:
+        unit = str(bands.attrs.get("parameter_units", ""))
+        text = f"95 % of bifurcations{thin(max(b - a for a, b, _ in bars), ax.get_xlim(), unit)}"
+        handles.append(Line2D([], [], label=text, color=BAR["color"], linewidth=BAR["linewidth"]))
+    return handles
+
+
+HAIRLINE = 0.01
+"""Width of a band relative to that of the axes, below which it looks like a line and is stated as a number."""
+
+
+def thin(width: float, limits: tuple[float, float], unit: str) -> str:
+    """Return the largest width of bands as words if they look like a line on axes with such limits; else nothing."""
+    if not width < HAIRLINE * abs(limits[1] - limits[0]):
+        return ""
+    return f", at most {width:.2g}{'' if unit in ('', '1') else f' {labels.raised(unit)}'} wide"
+
+
+def hold(ax: Axes, x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> None:
+    """Widen axes so that they hold some coordinates, but for an axis whose range the user chose."""
+    frame = style.figure_of(ax).frame
+    for values, chosen, get, put in (
+        (x, frame.xlim, ax.get_xlim, ax.set_xlim),
+        (y, frame.ylim, ax.get_ylim, ax.set_ylim),
+    ):
+        known = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
+        known = known[np.isfinite(known)]
+        low, high = get()
+        if chosen is None and len(known) and (known.min() < min(low, high) or known.max() > max(low, high)):
+            room = 0.03 * max(abs(high - low), np.ptp(known))
+            ends = min(low, high, known.min() - room), max(low, high, known.max() + room)
+            put(*(ends if low <= high else ends[::-1]))
+
+
+def _tubes(
+    bands: xr.Dataset, measure: Measure, max_period: int | None
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the parameter and the two edges of the band about each section point of each stretch of a branch."""
     levels = bands["section_level"].sel(state=measure.name).values
     low, high = levels[0], levels[-1]
     for _, _, chosen in stretches(bands):
         period = int(np.isfinite(low[chosen]).any(axis=0).sum())
-        if max_period is not None and period > max_period:
-            continue
-        x = bands["parameter_value"].values[chosen]
-        for phase in range(period):
-            below, above = (measure.shown(edge[chosen, phase]) for edge in (low, high))
-            ax.fill_between(x, below, above, **SHADE, gid="band")
-            edges += [np.nanmin(low[chosen, phase]), np.nanmax(high[chosen, phase])]
-    if edges and style.figure_of(ax).frame.ylim is None and not measure.on_circle:
-        _make_room(ax, measure.shown(np.array(edges)))
-    bars = _draw_bars(ax, bands, measure, max_period)
-    handles: list[Any] = [Patch(label="95 % of the orbits", **{**SHADE, "zorder": None})] if edges else []
-    if bars:
-        handles.append(Line2D([], [], label="95 % of bifurcations", color=BAR["color"], linewidth=BAR["linewidth"]))
-    return handles
+        if max_period is None or period <= max_period:
+            for phase in range(period):
+                below, above = (measure.shown(edge[chosen, phase]) for edge in (low, high))
+                yield bands["parameter_value"].values[chosen], below, above
 
 
-def _make_room(ax: Axes, heights: np.ndarray) -> None:
-    """Widen the vertical axis so that it shows all heights."""
-    bottom, top = ax.get_ylim()
-    room = 0.03 * (top - bottom)
-    ax.set_ylim(min(bottom, float(heights.min()) - room), max(top, float(heights.max()) + room))
-
-
-def _draw_bars(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | None) -> int:
-    """Draw the bars of the bifurcations; return their number."""
-    n = 0
+def _bars(bands: xr.Dataset, measure: Measure, max_period: int | None) -> Iterator[tuple[float, float, float]]:
+    """Yield the ends of the interval of each bifurcation, and its height."""
     for k in range(bands.sizes["bifurcation"]):
         one = bands.isel(bifurcation=k)
         low, _, high, n_known = interval_of(one["bifurcation_value"].values)
         too_long = max_period is not None and int(one["orbit_period"]) > max_period
-        if too_long or not bool(one["is_border"]) or n_known < LEAST_SHARE * bands.sizes["draw"]:
-            continue
-        y = measure.shown(one["bifurcation_section"].sel(state=measure.name).values)[0]
-        ax.plot([low, high], [y, y], scalex=False, scaley=False, gid="interval", **BAR)
-        n += 1
-    return n
+        if not too_long and bool(one["is_border"]) and n_known >= LEAST_SHARE * bands.sizes["draw"]:
+            yield low, high, float(measure.shown(one["bifurcation_section"].sel(state=measure.name).values)[0])
 
 
 def with_bands(data: xr.Dataset, bands: xr.Dataset) -> xr.Dataset:

@@ -188,9 +188,15 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     Raises
     ------
     SpecError
-        If the draws are of another model, or the run sweeps more than one parameter.
+        If the draws are of another model or do not differ along the branches, or the run sweeps more than one
+        parameter.
     """
-    drawn = draws_of(run, options.posterior, options.parameter).isel(draw=slice(options.draws or None))
+    drawn = draws_of(run, options.posterior).isel(draw=slice(options.draws or None))
+    if not moving_of(drawn, options.parameter):
+        raise SpecError(
+            f"--posterior {options.posterior}: {options.parameter} alone was identified, and the branches run along "
+            "it: nothing differs between the draws. Give --parameter another one."
+        )
     located = run.derive("branches", **options.part(BranchOptions))
     base = parameters_of(run.cube())
     along = _along(options, base, located)
@@ -201,7 +207,7 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     guess = np.array([*states, *guesses]).reshape(len(data), n_states + 1)
     start, solved = solvable(OrbitData(along, "", tuple(data), Solution(base.pack(), guess, np.zeros_like(guess))))
     run.echo(f"bands: {len(solved)} orbits and bifurcations for each of {drawn.sizes['draw']} draws")
-    values, sections = _carry(start, _packed(base, drawn), located.sizes["phase"])
+    values, sections = _carry(start, _packed(base, drawn, options.parameter), located.sizes["phase"])
     is_orbit = np.array([d.kind == ORBIT for d in start.data], bool)
     own = [solved[k] - len(points) for k in np.flatnonzero(is_orbit)]
     of_points = [chosen[solved[k]] for k in np.flatnonzero(~is_orbit)]
@@ -215,26 +221,28 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
         parameter_units=located.attrs["parameter_units"],
         **{k: v for k, v in located.attrs.items() if k == "model"},
         n_draws=drawn.sizes["draw"],
-        identified=str(drawn.attrs["identified"]),
+        identified=" ".join(moving_of(drawn, options.parameter)),
     )
 
 
-def draws_of(run: OpenRun, posterior: str, parameter: str) -> xr.Dataset:
-    """Read draws of a model's parameters for branches along a parameter; raise SpecError if they do not suit them."""
+def draws_of(run: OpenRun, posterior: str) -> xr.Dataset:
+    """Read draws of a model's parameters; raise SpecError if they are of another model."""
     with xr.open_dataset(_path(posterior), engine="scipy") as ds:
         drawn = ds.load()
     names = [str(name) for name in drawn["parameter"].values]
     own = [name for name in run.model.parameter_names if name in names]
-    identified = str(drawn.attrs["identified"]).split()
-    swept = parameter_name(parameter)
-    problems = []
     if len(own) != len(names):
-        problems.append(f"--posterior {posterior}: has the parameters {', '.join(names)}: another model's.")
-    if swept in identified:
-        problems.append(f"--posterior {posterior}: {swept} was identified, and the branches run along it.")
-    if problems:
-        raise SpecError(problems)
+        raise SpecError(f"--posterior {posterior}: has the parameters {', '.join(names)}: another model's.")
     return drawn
+
+
+def moving_of(drawn: xr.Dataset, parameter: str) -> list[str]:
+    """Return the parameters whose values differ between draws: the identified and tied ones, without the followed one.
+
+    Along the followed parameter its own values replace the drawn ones; those of the others are carried.
+    """
+    moving = [*str(drawn.attrs["identified"]).split(), *str(drawn.attrs.get("tied", "")).split()]
+    return [name for name in moving if name != parameter_name(parameter)]
 
 
 def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along:
@@ -253,13 +261,12 @@ def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along
     return Along(base.model, axis_name(options.parameter), options.low, options.high, frequency)
 
 
-def _packed(base: Parameters, drawn: xr.Dataset) -> np.ndarray:
-    """Return the parameters of each draw: those of the run, with the drawn values of the identified ones."""
+def _packed(base: Parameters, drawn: xr.Dataset, parameter: str) -> np.ndarray:
+    """Return the parameters of each draw: those of the run, with the drawn values of `moving_of`."""
     names = [str(name) for name in drawn["parameter"].values]
     values = drawn["value"].values
     packed = np.tile(base.pack(), (len(values), 1))
-    moving = str(drawn.attrs["identified"]).split() + str(drawn.attrs.get("tied", "")).split()
-    for name in moving:
+    for name in moving_of(drawn, parameter):
         packed[:, base.names.index(name)] = values[:, names.index(name)]
     return packed
 

@@ -19,7 +19,7 @@ from magpend_core.models.model import Model, Parameters
 from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of, settle_branches
-from pipeline.analysis.branches.bands import digest_of_draws, draws_of
+from pipeline.analysis.branches.bands import digest_of_draws, draws_of, moving_of
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, LABELS
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test, parameter_units
@@ -300,8 +300,8 @@ def _covariance(run: OpenRun, options: SensitivityOptions, names: Sequence[str])
     """Return the covariance of all parameters: of the draws, and of the deviations that were given."""
     found = np.zeros((len(names), len(names)))
     if options.posterior:
-        draws = draws_of(run, options.posterior, options.parameter)
-        moving = [*str(draws.attrs["identified"]).split(), *str(draws.attrs.get("tied", "")).split()]
+        draws = draws_of(run, options.posterior)
+        moving = moving_of(draws, options.parameter)
         twice = sorted(set(moving) & set(options.deviation))
         if twice:
             raise SpecError(f"--deviation {twice[0]}: the posterior has its deviation; give one of both.")

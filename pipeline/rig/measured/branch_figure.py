@@ -13,6 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.plots import labels, style
+from pipeline.plots.bifurcation import hold, thin
 from pipeline.rig.measured.branch import STABILITIES
 
 
@@ -89,14 +90,30 @@ def plot_branch(
         labels.with_unit(f"amplitude of {state}", unit),
     )
     room = 0.12 * (high - low) or 0.1 * abs(high) or 1.0
-    left, right = low - room, high + room
-    for _, begin, end in bands.intervals if bands is not None else ():
-        left, right = min(left, begin - 0.2 * room), max(right, end + 0.2 * room)
-    style.limits(ax, frame, (left, right), (0.0, 1.15 * float(measured["amplitude"].max())))
+    bars = measured["amplitude"].values + BARS * np.nan_to_num(measured["amplitude_sd"].values)
+    style.limits(ax, frame, (low - room, high + room), (0.0, 1.15 * float(np.nanmax(bars))))
+    hold(ax, *_drawn(branches, computed, bands))
+    if bands is not None and bands.tubes:
+        width = max(float(np.nanmax(tube["high"] - tube["low"])) for tube in bands.tubes)
+        entries[0].set_label(f"95 %{thin(width, ax.get_ylim(), unit)}")
     style.caption(ax, f"bars: ±{BARS:g} scatters of single cycles")
     style.legend_above(fig, [*_computed_entries(ax), *entries])
     style.finish(fig)
     return fig
+
+
+def _drawn(
+    branches: xr.Dataset | None, computed: np.ndarray | None, bands: Bands | None
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the parameters and the amplitudes of all computed curves and bands."""
+    x, y = [], []
+    if branches is not None and computed is not None:
+        x.append(np.where(np.isfinite(computed), branches["parameter"].values, np.nan))
+        y.append(computed)
+    if bands is not None:
+        x += [np.asarray(tube["x"]) for tube in bands.tubes] + [np.array(ends) for _, *ends in bands.intervals]
+        y += [np.asarray(tube["high"]) for tube in bands.tubes]
+    return x, y
 
 
 def _draw_bands(ax: Axes, bands: Bands) -> list[Any]:

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.branches.bands import GRID, bands_table, orbit_data, place_variables
+from pipeline.analysis.branches.bands import GRID, bands_table, moving_of, orbit_data, place_variables
 from pipeline.analysis.branches.carrying import Along
 from pipeline.analysis.draws import LEVELS, stretches
+from pipeline.plots.bifurcation import draw_bands
+from pipeline.plots.labels import Measure
+from pipeline.plots.style import WIDE, new_figure
 from pipeline.runs.derive import derive, stored
 from pipeline.runs.drawing import figure
 from pipeline.specification.problems import SpecError
@@ -92,15 +95,66 @@ def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
     np.testing.assert_array_equal(other["bifurcation_value"], found["bifurcation_value"][:10])
     some = derive(directory, "bands", {"posterior": str(folder / "fit"), "draws": 10})
     np.testing.assert_array_equal(other["bifurcation_value"], some["bifurcation_value"])
-    folder, directory, *_ = bench
-    along = {"parameter": "g", "low": 1.0, "high": 1.4}
-    with pytest.raises(SpecError, match=r"g was identified, and the branches run along it"):
-        derive(directory, "bands", {"posterior": str(folder / "fit"), **along})
     with xr.open_dataset(folder / "fit" / "posterior.nc", engine="scipy") as ds:
         draws = ds.load()
     draws.assign_coords(parameter=["a", "b", "c", "d"]).to_netcdf(tmp_path / "other.nc", engine="scipy")
     with pytest.raises(SpecError, match=r"has the parameters a, b, c, d: another model's"):
         derive(directory, "bands", {"posterior": str(tmp_path / "other.nc")})
+
+
+@pytest.mark.slow
+def test_bands__along_an_identified_parameter_carry_the_others(computed, tmp_path):
+    """Along g the fold lies at g = 1/(4 (h - m)), whatever g was drawn."""
+    parameters = {name: {"value": v} for name, v in {"m": -0.1, "g": 1.2, "h": 0.05, "w": 6.0}.items()}
+    model = {**SWEEP["model"], "parameters": parameters}
+    directory = computed({**SWEEP, "model": model, "axes": {"g": {"start": 1.0, "stop": 2.0, "num": 5}}})
+    random = np.random.default_rng(4)
+    h = 0.05 + 0.01 * random.standard_normal(20)
+    write_draws(tmp_path / "posterior.nc", 1.2 + 0.3 * random.standard_normal(20), h)
+    found = derive(directory, "bands", {"posterior": str(tmp_path)})
+    assert found.attrs["identified"] == "h"
+    words = str(found["kind"].attrs["flag_meanings"]).split()
+    k = [words[int(c)] for c in found["kind"].values].index("fold")
+    np.testing.assert_allclose(found["bifurcation_value"].values[:, k], 1 / (4 * (h + 0.1)), atol=1e-6)
+
+
+def test_moving_of__the_axis_replaces_the_value_that_was_drawn():
+    drawn = xr.Dataset(attrs={"identified": "amplitude k", "tied": "c"})
+    assert moving_of(drawn, "amplitude") == ["k", "c"]
+    assert moving_of(drawn, "frequency") == ["amplitude", "k", "c"]
+    assert moving_of(xr.Dataset(attrs={"identified": "amplitude"}), "amplitude") == []
+
+
+@pytest.mark.parametrize(
+    ("half", "told"), [(1e-4, "95 % of the orbits, at most 0.0002 m wide"), (0.1, "95 % of the orbits")]
+)
+def test_draw_bands__axes_hold_them_and_a_hairline_has_its_width(half, told):
+    grid = np.linspace(0.0, 2.0, GRID)
+    levels = np.stack([grid - half, grid, grid + half])[:, :, None, None]
+    bands = xr.Dataset(
+        {
+            "section_level": (("level", "orbit", "phase", "state"), levels),
+            "parameter_value": ("orbit", grid),
+            "share": ("orbit", np.ones(GRID)),
+            "bifurcation_value": (("draw", "bifurcation"), np.array([[2.4], [2.5], [2.6]])),
+            "bifurcation_section": (("bifurcation", "phase", "state"), [[[3.0]]]),
+            "is_border": ("bifurcation", [True]),
+            "orbit_period": ("bifurcation", [1]),
+            **{name: ("orbit", v) for name, v in (("branch", 0 * grid), ("run", 0 * grid), ("is_stable", grid > -1.0))},
+            "step": ("orbit", np.arange(GRID)),
+        },
+        {"state": ["x"]},
+        {"parameter_units": "1"},
+    )
+    ax = new_figure(3.0, bands, WIDE).add_subplot()
+    ax.set_xlim(0.5, 1.5)
+    ax.set_ylim(0.6, 1.4)
+    labels = [str(handle.get_label()) for handle in draw_bands(ax, bands, Measure("x", "x", "m"))]
+    assert labels == [told, "95 % of bifurcations"]
+    assert ax.get_xlim()[0] < 0.0
+    assert ax.get_xlim()[1] > 2.59
+    assert ax.get_ylim()[0] < 0.0
+    assert ax.get_ylim()[1] > 3.0
 
 
 @pytest.mark.slow
