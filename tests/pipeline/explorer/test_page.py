@@ -78,3 +78,15 @@ def test_broken_lines__draw_nothing_across_the_circle():
     assert len(lines[0]) == 4  # 19.9 rad go through half a turn three times
     assert len(lines[1]) == 1
     assert max(map(abs, lines[1][0][::2])) < np.pi  # brought next to 0 by a full turn
+
+
+def test_holding__a_diagram_shows_all_of_its_branches_and_marks():
+    """Points in [0, 1] x [-1, 1]; a branch up to y = 3, x = 1.2; a mark at x = -1. A null is a gap."""
+    segments = json.dumps([{"x": [0.2, 1.5], "y": [0, None]}, {"x": [0.5, 1.2], "y": [3, 0.5]}])
+    found = f'{{ branches: [{{ segments: {segments} }}], points: [{{ x: -1, y: [0.2] }}] }}'
+    low, high, bottom, top = evaluated("branches.js", f"m.holding([0, 1, -1, 1], {found})")
+    assert -1.1 < low < -1.0
+    assert 1.2 < high < 1.3
+    assert bottom == -1
+    assert 3.0 < top < 3.2
+    assert evaluated("branches.js", "m.holding([0, 1, -1, 1], null)") == [0, 1, -1, 1]

@@ -10,6 +10,26 @@ export function shapesOf(points) {
   return new Map(kinds.map((kind, k) => [kind, SHAPES[k % SHAPES.length]]));
 }
 
+/** Bounds widened so that they hold all branches and bifurcations, with some room beyond these. */
+export function holding(bounds, found) {
+  const ends = [bounds.slice(0, 2), bounds.slice(2)];
+  const take = (k, value) => {
+    if (value !== null && Number.isFinite(value)) ends[k] = [Math.min(ends[k][0], value), Math.max(ends[k][1], value)];
+  };
+  const curves = [...(found?.branches ?? []).flatMap((branch) => branch.segments), ...(found?.points ?? []).map(({ x, y }) => ({ x: y.map(() => x), y }))];
+  for (const { x, y } of curves) {
+    for (let i = 0; i < x.length; i++) {
+      if (y[i] === null) continue;
+      take(0, x[i]);
+      take(1, y[i]);
+    }
+  }
+  return ends.flatMap(([low, high], k) => {
+    const [first, last] = bounds.slice(2 * k, 2 * k + 2), room = 0.03 * (high - low);
+    return [low < first ? low - room : first, high > last ? high + room : last];
+  });
+}
+
 /**
  * Paint branches: solid where stable, dashed where not. The stable ones lie under the points, which tell where
  * orbits were found, by whom they are reached; the others over them.

@@ -2,7 +2,7 @@
 // wheel, fingers and keys do with it.
 
 import { FONT, boxOf, paintAxes, paintFrame, placeX, placeY, told } from "./axes.js";
-import { bifurcationAt, paintBifurcations, paintBranches } from "./branches.js";
+import { bifurcationAt, holding, paintBifurcations, paintBranches } from "./branches.js";
 import { el, focusedIn } from "./dom.js";
 import { Gestures, bounded } from "./gestures.js";
 import { onKey } from "./keyboard.js";
@@ -35,7 +35,7 @@ export class Diagram {
       class: "diagram", tabindex: "0", role: "application", "aria-roledescription": "diagram",
       "aria-label": "Bifurcation diagram: arrows move, + and - zoom, 0 shows all, Enter goes to a point, ? lists all keys",
     }, this.lower, this.upper, this.tip, this.note);
-    this.full = [0, 1, 0, 1];
+    this.full = this.ofPoints = [0, 1, 0, 1];
     [this.base, this.detail, this.data, this.branches, this.selection] = [null, null, null, null, null];
     [this.width, this.height, this.asked, this.version, this.skipped] = [0, 0, 0, 0, 0];
     this.listen();
@@ -108,7 +108,8 @@ export class Diagram {
     this.data = { x: x.slice(), at: at.slice(), first: first.slice(), cell: cell.slice(), status: status.slice(), colours, attrs };
     const { extent, count } = await this.points.ask("load", { data: { x, at, first, y } }, this.points.worker ? [y.buffer] : []);
     if (asked !== this.asked) return;
-    this.full = fullOf(this.data.x, attrs.extent ?? extent, this.horizontal);
+    this.ofPoints = fullOf(this.data.x, attrs.extent ?? extent, this.horizontal);
+    this.full = holding(this.ofPoints, this.branches);
     // a diagram of very many points has the last sections of each cell only
     this.skipped = (attrs.n_keep ?? 0) - (attrs.kept ?? attrs.n_keep ?? 0);
     this.count = count;
@@ -135,14 +136,25 @@ export class Diagram {
     const wanted = overlays.branches && this.view.has.branches ? JSON.stringify([x, y, at]) : null;
     if (wanted === this.branchesOf) return;
     this.branchesOf = wanted;
-    this.branches = null;
-    this.repaint();
+    this.setBranches(null);
     if (!wanted) return;
     try {
       const found = await this.source.branches({ x, y, at });
-      if (wanted === this.branchesOf) this.branches = found;
+      if (wanted === this.branchesOf) this.setBranches(found);
     } catch (error) {
       this.reader.say(error.message);
+    }
+  }
+
+  /** Take other branches; the whole of the diagram holds them. */
+  setBranches(found) {
+    this.branches = found;
+    const full = holding(this.ofPoints, found), isSame = String(full) === String(this.full);
+    if (this.data && !isSame) {
+      this.full = full;
+      this.version += 1;
+      [this.base, this.detail] = [null, null];
+      this.draw(true);
     }
     this.repaint();
   }
@@ -189,7 +201,7 @@ export class Diagram {
 
   within([low, high]) {
     const [x0, x1] = this.window;
-    return Math.max(x0, this.full[0]) >= low && Math.min(x1, this.full[1]) <= high;
+    return Math.max(x0, this.ofPoints[0]) >= low && Math.min(x1, this.ofPoints[1]) <= high;
   }
 
   /** Draw the window: quickly while it moves, wholly when it rests. */
