@@ -83,22 +83,14 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
         )
     if problems:
         raise SpecError(problems)
+    cuts = _cuts(spec, channels, recordings)
     smoothed = [smooth(ds) for ds in recordings]
     kept: list[Piece] = []
     held: list[Piece] = []
     for i, table in enumerate(spec.recordings):
-        try:
-            own = pieces_of(spec.model, channels, (recordings[i], smoothed[i]), table, i, spec.fit.decimate)
-        except SpecError as error:
-            problems += [f"recordings[{i}]: {p}" for p in error.problems]
-            continue
-        problems += _hold_out_problems(i, table, own)
+        own = pieces_of(spec.model, channels, (recordings[i], smoothed[i]), table, i, spec.fit.decimate)
         held += [p for p in own if p.number in table.hold_out]
         kept += _rechained([p for p in own if p.number not in table.hold_out], len(kept))
-    if problems:
-        raise SpecError(problems)
-    if recordings and not kept:
-        raise SpecError("recordings: all pieces are held out; leave some to be fitted.")
     both = apply_settings([*kept, *held], {i: t.parameters for i, t in enumerate(spec.recordings)})
     kept, held = both[: len(kept)], both[len(kept) :]
     problem = Problem(
@@ -117,8 +109,30 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
     )
     problem = replace(problem, orbits=first_orbits(tables, problem.values(problem.start)))
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
-    said = tuple(tuple(summary(f for f in findings_of(ds) if f.severity != "note")) for ds in recordings)
+    said = tuple(
+        (*summary(f for f in findings_of(ds) if f.severity != "note"), *cut.dropped_sentences())
+        for ds, cut in zip(recordings, cuts, strict=True)
+    )
     return Built(problem, tuple(replace(p, follows=-1) for p in held), tuple(tables), simulated, said)
+
+
+def _cuts(spec: IdentificationSpec, channels: Sequence[str], recordings: Sequence[xr.Dataset]) -> list[_Cut]:
+    """Cut all recordings; raise `SpecError` with the problems of all, before anything that takes time is done."""
+    found, problems = [], list[str]()
+    for i, (table, ds) in enumerate(zip(spec.recordings, recordings, strict=True)):
+        try:
+            cut = _cut(ds, table, channels, _drive_of(table, ds), i, spec.fit.decimate)
+        except SpecError as error:
+            problems += [f"recordings[{i}]: {p}" for p in error.problems]
+            continue
+        problems += _hold_out_problems(i, table, cut)
+        found.append(cut)
+    if problems:
+        raise SpecError(problems)
+    numbers = [(i, s.number) for i, cut in enumerate(found) for s, _ in cut.kept]
+    if found and all(number in spec.recordings[i].hold_out for i, number in numbers):
+        raise SpecError("recordings: all pieces are held out; leave some to be fitted.")
+    return found
 
 
 def channels_of(
@@ -199,17 +213,19 @@ def _clock_problems(model: Model, table: RecordingTable, ds: xr.Dataset, where: 
     ]
 
 
-def _hold_out_problems(i: int, table: RecordingTable, own: Sequence[Piece]) -> list[str]:
-    n = len(own)
-    wrong = [k for k in table.hold_out if k >= n]
-    if not wrong:
-        if table.drive != "known" or table.phase is not None or any(p.number not in table.hold_out for p in own):
-            return []
+def _hold_out_problems(i: int, table: RecordingTable, cut: _Cut) -> list[str]:
+    numbers, n = {s.number for s, _ in cut.kept}, len(cut.kept) + len(cut.dropped)
+    if wrong := [k for k in table.hold_out if k >= n]:
+        return [f"recordings[{i}].hold_out: there are pieces 0 to {n - 1}, and no {', '.join(map(str, wrong))}."]
+    if short := [k for k in table.hold_out if k not in numbers]:
+        few = f"has fewer than {FEWEST_SAMPLES} usable samples and is dropped"
+        return [f"recordings[{i}].hold_out: piece {short[0]} {few}; give one of the others."]
+    if table.drive == "known" and table.phase is None and numbers <= set(table.hold_out):
         return [
             f"recordings[{i}].phase: missing; all pieces are held out, so it cannot be fitted: give it (0 to 1 drive "
             "periods), or leave a piece to be fitted."
         ]
-    return [f"recordings[{i}].hold_out: there are pieces 0 to {n - 1}, and no {', '.join(map(str, wrong))}."]
+    return []
 
 
 def free_of(spec: IdentificationSpec, channels: Sequence[str]) -> tuple[Free, ...]:
@@ -266,26 +282,20 @@ def pieces_of(
     """Cut a recording into the pieces that are fitted, each with samples, drive and a first guess of its initial state.
 
     `both` is the recording as measured, and smoothed for the guess. `decimate` is the step between the samples that are
-    used. Raise `SpecError` if pieces are too short or the drive does not cover them.
+    used. Pieces with fewer than `FEWEST_SAMPLES` usable samples are dropped; their numbers stay free. Raise `SpecError`
+    if none is left or the drive does not cover them.
     """
     ds, smoothed = both
     drive = _drive_of(table, ds)
     found: list[Piece] = []
-    problems: list[str] = []
-    for stretch in stretches(ds, table.piece_s, recording):
-        samples = _usable(ds, stretch, channels, drive)
+    for stretch, samples in _cut(ds, table, channels, drive, recording, decimate).kept:
         own = ds.isel(sample=samples)
         time = own["time"].values[::decimate]
-        if len(time) < FEWEST_SAMPLES:
-            problems.append(
-                f"piece {stretch.number} has {len(time)} usable samples; a piece needs {FEWEST_SAMPLES} or "
-                "more: choose a longer piece_s or window_s, or a smaller fit.decimate."
-            )
-            continue
         measured = np.stack([own[name].values[::decimate] for name in channels], axis=1)
         pieces_drive = None if drive is None else drive.window(float(time[0]), float(time[-1]))
         start = _start(model, smoothed.isel(sample=samples))
         whole = samples.start == stretch.samples.start
+        follows = bool(found) and found[-1].number == stretch.number - 1 and stretch.continues and whole
         found.append(
             Piece(
                 recording,
@@ -294,14 +304,54 @@ def pieces_of(
                 measured,
                 start,
                 pieces_drive,
-                len(found) - 1 if stretch.continues and found and whole else -1,
+                len(found) - 1 if follows else -1,
                 float(time[0]),
                 table.frequency_hz or 0.0,
             )
         )
-    if problems:
-        raise SpecError(problems)
     return found
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Stretches of a recording with their usable samples, and the number of samples of those that are too short."""
+
+    kept: list[tuple[Stretch, slice]]
+    dropped: dict[int, int]  # by the number of the stretch
+
+    def dropped_sentences(self) -> list[str]:
+        """Return a sentence about the stretches that are too short for a fit; none if there are none."""
+        if not self.dropped:
+            return []
+        n = len(self.dropped)
+        which = ", ".join(map(str, self.dropped)) if n <= 6 else f"{n} of {n + len(self.kept)}"
+        return [
+            f"pieces dropped: {which}, with fewer than {FEWEST_SAMPLES} usable samples ({sum(self.dropped.values())} "
+            "in all)"
+        ]
+
+
+def _cut(
+    ds: xr.Dataset, table: RecordingTable, channels: Sequence[str], drive: _Driven | None, recording: int, decimate: int
+) -> _Cut:
+    """Cut a recording into stretches, and drop remnants; raise `SpecError` if nothing else is there."""
+    kept: list[tuple[Stretch, slice]] = []
+    dropped: dict[int, int] = {}
+    for stretch in stretches(ds, table.piece_s, recording):
+        samples = _usable(ds, stretch, channels, drive)
+        n = len(range(samples.start, samples.stop, decimate))
+        if n < FEWEST_SAMPLES:
+            dropped[stretch.number] = n
+        else:
+            kept.append((stretch, samples))
+    if not kept:
+        most = max(dropped.values(), default=0)
+        raise SpecError(
+            f"no piece has {FEWEST_SAMPLES} usable samples; the longest of {len(dropped)} has {most}: choose a longer "
+            "piece_s or window_s, or a smaller fit.decimate. If gaps or uneven times part the samples, add resample = "
+            "RATE [Hz] to the mapping."
+        )
+    return _Cut(kept, dropped)
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:

@@ -15,6 +15,7 @@ from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import smooth
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
+from pipeline.specification.problems import SpecError
 
 NOISE = 1e-3
 
@@ -104,6 +105,36 @@ def test_stretches__are_even_and_stay_within_pieces():
     assert [s.continues for s in found] == [False, True, True, True, False]
     assert [s.number for s in found] == list(range(5))
     assert [s.samples.stop - s.samples.start for s in b.stretches(ds, None, 0)] == [1000, 300]
+
+
+def with_remnants(ds, lengths):
+    """The recording in pieces of some lengths."""
+    numbers = np.repeat(np.arange(len(lengths)), lengths)
+    return ds.assign_coords(piece=("sample", np.resize(numbers, ds.sizes["sample"]))).isel(sample=slice(len(numbers)))
+
+
+def test_pieces_of__remnants_are_dropped_and_said(forced):
+    """Pieces of 1 and 5 samples, as gaps leave them, do not stop an identification."""
+    parameters, ds = forced
+    ds = with_remnants(ds, [400, 1, 500, 5, 300])
+    recorded = table(drive="recorded")
+    pieces = b.pieces_of(parameters.model, ("x",), (ds, smooth(ds)), recorded, 0)
+    assert [(p.number, len(p.time)) for p in pieces] == [(0, 400), (2, 500), (4, 300)]
+    drive = b._drive_of(recorded, ds)
+    cut = b._cut(ds, recorded, ("x",), drive, 0, 1)
+    assert cut.dropped_sentences() == ["pieces dropped: 1, 3, with fewer than 12 usable samples (6 in all)"]
+    # a remnant is held out by nobody
+    (problem,) = b._hold_out_problems(0, table(hold_out=[3]), cut)
+    assert "piece 3 has fewer than 12 usable samples and is dropped" in problem
+    assert b._hold_out_problems(0, table(hold_out=[4]), cut) == []
+    assert b._cut(ds.isel(sample=slice(400)), recorded, ("x",), drive, 0, 1).dropped_sentences() == []
+
+
+def test_cut__nothing_but_remnants_is_refused_before_anything_is_smoothed(forced):
+    _, ds = forced
+    ds = with_remnants(ds, [3, 9, 1])
+    with pytest.raises(SpecError, match=r"no piece has 12 usable samples; the longest of 3 has 9: .*resample = RATE"):
+        b._cut(ds, table(), ("x",), None, 0, 1)
 
 
 def test_pieces_of__starts_where_all_is_measured(forced):
