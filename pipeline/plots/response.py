@@ -110,7 +110,7 @@ def plot_response(
     if has_phase:
         axes[1].set_ylabel(labels.with_unit(f"lag of harmonic {max(harmonic, 1)}", phase.unit))
         labels.angle_ticks(axes[1], phase, most=4.5)
-    style.caption(axes[0], labels.caption(ds, with_start=False))
+    style.caption(axes[0], style.join([labels.caption(ds, with_start=False), *_one_level(ds, levels)]))
     style.legend_above(fig, _handles(ds, levels, drawn), size=fig.look.tick)
     style.finish(fig)
     return fig
@@ -127,6 +127,12 @@ def levels_of(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
     if len(found) <= 1:
         return dict.fromkeys(found, "black")
     return {level: style.PALETTE[k % len(style.PALETTE)] for k, level in enumerate(found)}
+
+
+def _one_level(ds: xr.Dataset, levels: Mapping[Any, str]) -> list[str]:
+    """Return the fixed parameters of all branches for the caption, if they are the same; else the legend has them."""
+    told = next(iter(levels), ()) if len(levels) == 1 else ()
+    return [f"{name} = {value:g}" for name, value in told if axis_name(name) not in ds.coords]
 
 
 def amplitude_of(ds: xr.Dataset, channel: str, harmonic: int) -> tuple[xr.DataArray, xr.DataArray]:

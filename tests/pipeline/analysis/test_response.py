@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
@@ -269,6 +270,7 @@ def test_figure__shows_levels_and_measured_points(hardening, response, tmp_path)
 def test_figure__shows_the_level_that_is_asked_for(hardening):
     upper, _ = hardening.plot.response(parameter="frequency_hz", at={"F": 0.3})
     assert set(upper.figure.data["F"].values.tolist()) == {0.3}
+    assert "F = 0.3" in " ".join(text.get_text() for text in upper.figure.findobj(Text))
     assert upper.figure.data.sizes["branch"] < hardening.response(parameter="frequency_hz").sizes["branch"]
     both = hardening.plot.sensitivities(parameter="frequency_hz")
     names = [ax.get_title(loc="left") for ax in both]
