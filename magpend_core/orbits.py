@@ -14,14 +14,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magpend_core.defaults import MOST_STEPS
 from magpend_core.engine.entry import integrate
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.pointwise import rates_packed
+from magpend_core.precision import limits_at
 from magpend_core.sizes import LEVEL
+from magpend_core.status import Status
 from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
 
 RTOL = 1e-12
@@ -57,6 +58,9 @@ class PeriodicOrbits:
         that did not converge.
     derivative : ndarray, (n, n_states, n_states)
         Monodromy matrix at `section`; NaN for rows that did not converge.
+    status : ndarray of int, (n,)
+        Codes of `Status`: ``PERIODIC`` for rows that converged, ``BOUNDED`` where Newton's method did not converge,
+        else what ended an integration.
     """
 
     section: np.ndarray
@@ -68,6 +72,7 @@ class PeriodicOrbits:
     seconds: np.ndarray
     points: np.ndarray
     derivative: np.ndarray
+    status: np.ndarray
 
     @property
     def is_stable(self) -> np.ndarray:
@@ -89,11 +94,14 @@ class Returns:
         matrix of a periodic orbit.
     times : ndarray, (n, n_periods)
         How long each period took [s].
+    status : ndarray of int, (n,)
+        Codes of `Status`; ``BOUNDED`` for rows that were integrated to the end.
     """
 
     images: np.ndarray
     derivatives: np.ndarray
     times: np.ndarray
+    status: np.ndarray
 
 
 def section_map(
@@ -119,7 +127,7 @@ def section_map(
     n_periods
         Number of drive periods or returns: one number, or one per row; the derivative is that of the row's last image.
     rtol
-        Relative and absolute tolerance.
+        Relative tolerance; see `magpend_core.precision` for the absolute one, and for the steps a period may take.
     system
         System to integrate.
 
@@ -150,20 +158,18 @@ def section_map(
         n_keep=most,
         n_measures=1,
         measures=periods[order, None, None],
-        rtol=rtol,
-        atol=rtol,
-        max_steps_per_period=MOST_STEPS,
+        **limits_at(rtol),
     )
     back = np.argsort(order)
     states = np.where(is_finite[:, None, None], cells.section[back, 0], np.nan)
-    images = states[:, :, :n]
+    images, status = states[:, :, :n], cells.status[back, 0]
     # tangent vector k, the derivative by state k, is a column
     derivatives = states[rows, periods - 1, n:].reshape(len(starts), n, n).transpose(0, 2, 1) / sizes
     crossed = crossed_state(system)
     if crossed is None:
-        return Returns(images, derivatives, np.repeat(1.0 / frequency[:, None], most, axis=1))
+        return Returns(images, derivatives, np.repeat(1.0 / frequency[:, None], most, axis=1), status)
     slopes = rates_packed(system, images[rows, periods - 1], packed, frequency)
-    return Returns(images, on_section_derivative(derivatives, slopes, crossed), cells.return_times[back, 0])
+    return Returns(images, on_section_derivative(derivatives, slopes, crossed), cells.return_times[back, 0], status)
 
 
 def crossed_state(system: System) -> int | None:
@@ -256,7 +262,7 @@ def polish_orbits(
     max_iterations
         Limit on the Newton steps.
     rtol
-        Relative and absolute tolerance of the integration, which bounds the residual that can be reached.
+        Relative tolerance of the integration, which bounds the residual that can be reached.
     least_period
         Whether a multiple of the true period is reduced. Not with a large `tolerance`: beside its doubling an
         orbit would be taken for the one of half its period.
@@ -296,6 +302,7 @@ def polish_orbits(
         seconds=np.full(len(guesses), np.nan),
         points=np.full((len(guesses), longest, n), np.nan),
         derivative=np.full((len(guesses), n, n), np.nan),
+        status=np.full(len(guesses), int(Status.BOUNDED)),
     )
     rows = np.arange(len(guesses))
     while len(rows):
@@ -326,6 +333,7 @@ def _take(
     last = ends.images[np.arange(len(rows)), found.orbit_period[rows] - 1]
     residual = found.residual[rows] = scaled_distance(last, found.section[rows], system)
     going = np.isfinite(residual)
+    found.status[rows] = np.where(going, int(Status.BOUNDED), ends.status)
     for i in np.flatnonzero(residual <= tolerance):
         row, period = rows[i], int(found.orbit_period[rows[i]])
         images = ends.images[i, :period]
@@ -336,7 +344,8 @@ def _take(
         going[i] = False
         multipliers = np.linalg.eigvals(ends.derivatives[i])
         found.multipliers[row] = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
-        found.converged[row], found.seconds[row] = True, ends.times[i, :period].sum()
+        found.converged[row], found.status[row] = True, int(Status.PERIODIC)
+        found.seconds[row] = ends.times[i, :period].sum()
         found.points[row, 0], found.points[row, 1:period] = found.section[row], images[:-1]
         found.derivative[row] = ends.derivatives[i]
     return np.asarray(going)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.models.model import Parameters
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, Samples, sample
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 
@@ -23,7 +24,6 @@ def flown(
         [times],
         piece=np.zeros(n, np.int64),
         drives=[drive],
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
+        **tolerances_at(PORTRAIT_RTOL),
         **more,
     )

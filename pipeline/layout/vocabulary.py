@@ -43,8 +43,11 @@ STABILITIES = ("absent", "attracts", "unstable", "transient", "not_settled", "ne
 _, ATTRACTS, UNSTABLE, TRANSIENT, NOT_SETTLED, NEUTRAL = range(len(STABILITIES))
 """Values of `stability`; see `pipeline.analysis.attractors.finding.stability`."""
 
-EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume", "one_side")
-"""Values of `evidence`: the grounds for the stability of a set."""
+EVIDENCE = (
+    *("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume", "one_side"),
+    *("step_limit", "no_return", "no_convergence"),
+)
+"""Values of `evidence`: the grounds for the stability of a set, or how Newton's method ended where it showed none."""
 
 DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")
 UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))

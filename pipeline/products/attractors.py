@@ -65,6 +65,7 @@ IDENTIFIED = Analysis(
     "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
+    version=2,
     by_point=True,
     version=2,
 )

@@ -21,6 +21,7 @@ from magpend_core.engine.threads import using_threads
 from magpend_core.models import import_model
 from magpend_core.models.imported import origin
 from magpend_core.models.model import Model
+from magpend_core.precision import Precision
 from pipeline.analysis.ragged import isel, joined
 from pipeline.analysis.run import OpenRun
 from pipeline.compute import clients, execute
@@ -169,7 +170,7 @@ def compute_block(
             f"{directory}: this worker's magpend would not compute the same {analysis.name}; install the same version "
             "everywhere."
         )
-    with using_threads(1):
+    with using_threads(1), Precision.of(run.cube().attrs).used():
         result: xr.Dataset = function_of(analysis.compute)(Part(run, blocks[index], known), options)
     with writing_results():
         write_block(run.info.files, _name(key, index), result.assign_attrs(key))

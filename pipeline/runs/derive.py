@@ -27,6 +27,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magpend_core.precision import Precision
 from pipeline.layout.conventions import conventional
 from pipeline.layout.own_words import in_own_words, rate_attribute
 from pipeline.layout.vocabulary import overrides_attribute
@@ -328,7 +329,7 @@ def _compute(run: AnalysedRun, analysis: Analysis, options: Options, *, can_keep
     started = time.perf_counter()
     threads = contextlib.nullcontext() if run.workers is None else using_threads(max(run.workers, 1))
     # matrices are so small that threads of linear algebra would wait for each other
-    with refused(run.name), threads, threadpool_limits(1):
+    with refused(run.name), threads, threadpool_limits(1), Precision.of(run.cube().attrs).used():
         if analysis.by_point and can_keep and not getattr(options, "at", None):
             result = in_blocks(run, analysis, options)
         else:

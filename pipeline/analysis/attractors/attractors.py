@@ -110,6 +110,7 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
+from magpend_core.precision import Precision
 from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
@@ -198,15 +199,16 @@ def identify(
     )
     search = Search(options, tolerance, dynamics, settings)
     found: dict[tuple[int, ...], Found] = {}
-    for points in slabs(ds, dynamics, block_bytes):
-        if dynamics.can_rest:
-            tell_rest(points.values(), tolerance, dynamics.geometry)
-        if dynamics.can_rest and not dynamics.is_flow and options.polish:
-            tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
-        works = {index: analyse(point, search) for index, point in points.items()}
-        own = answer_all(works, points, settings)
-        follow(own, points, search)
-        found |= own
+    with Precision.of(ds.attrs).used():
+        for points in slabs(ds, dynamics, block_bytes):
+            if dynamics.can_rest:
+                tell_rest(points.values(), tolerance, dynamics.geometry)
+            if dynamics.can_rest and not dynamics.is_flow and options.polish:
+                tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
+            works = {index: analyse(point, search) for index, point in points.items()}
+            own = answer_all(works, points, settings)
+            follow(own, points, search)
+            found |= own
     return _with_exponents(_dataset(ds, found, search), ds)
 
 

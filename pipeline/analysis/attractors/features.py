@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magpend_core.defaults import MOST_STEPS
 from magpend_core.models.model import Mirror, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
+from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
@@ -195,9 +195,8 @@ def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, g
         np.array([found.points[0] for found, _, _ in orbits]),
         times,
         drives=[Drive(np.full(period, 1.0 / frequency)) for _, _, frequency in orbits],
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
-        max_steps_per_interval=MOST_STEPS,
+        **tolerances_at(PORTRAIT_RTOL),
+        max_steps_per_interval=limits_at(PORTRAIT_RTOL)["max_steps_per_period"],
         limits_first_step=False,
     )
     if (paths.status != Status.BOUNDED).any():

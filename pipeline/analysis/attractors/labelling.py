@@ -259,7 +259,13 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
     rows = rows_by_number(left)
     for i, g in enumerate(sorted(best)):
         labels.put(rows[g], len(state.orbits) + i, SAME_SET if search.options.polish else CLOSED)
-    return [raw_orbit(best[g][2], search.geometry) for g in sorted(best)]
+    return [raw_orbit(best[g][2], search.geometry, _failure(point, state, g)) for g in sorted(best)]
+
+
+def _failure(point: Point, state: State, group: int) -> int:
+    """Return the `Status` with which Newton's method ended for the boxes of a group; 0 if it was not tried there."""
+    ended = [point.unpolished.get(key, 0) for key in state.keys[state.group == group].tolist()]
+    return max(ended, default=0)
 
 
 def _label_sets(
@@ -437,6 +443,7 @@ def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Featu
         cells.low,
         cells.high,
         stability=orbit.stability,
+        evidence=stability.by_failure(orbit.failed),
     )
     if point.parameters is not None:
         found.side = cells.side(point.parameters, point.frequency)

@@ -10,6 +10,7 @@ import xarray as xr
 
 from magpend_core.models.model import Parameters
 from magpend_core.models.sectioned import of_flow
+from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.ragged import dense
@@ -103,8 +104,7 @@ def mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) ->
         starts,
         n_transient=0,
         n_keep=16,
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
+        **limits_at(PORTRAIT_RTOL),
         system=parameters.model.system,
     )
     assert result.return_time is not None
@@ -121,9 +121,7 @@ def _orbit(one: xr.Dataset, parameters: Parameters, step: float, n_samples: int,
     if kind == PERIODIC_ORBIT and (parameters.model.crossing is not None or not periods):
         n = math.ceil(float(one["period_s"]) / step)
     times = np.arange(n + 1) * step
-    return trajectory(
-        of_flow(parameters), 1.0 / (step * n_samples), start, times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL
-    )
+    return trajectory(of_flow(parameters), 1.0 / (step * n_samples), start, times, **tolerances_at(PORTRAIT_RTOL))
 
 
 def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters, step: float) -> xr.Dataset:

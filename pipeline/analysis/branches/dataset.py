@@ -11,6 +11,7 @@ import xarray as xr
 from magpend_core.models.model import Classifier, Model, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.orbits import on_section
+from magpend_core.precision import limits_at
 from magpend_core.sampling import Drive, sample
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.bifurcations import (
@@ -350,8 +351,7 @@ def rotation_of(branch: Branch) -> np.ndarray:
         on_section(rows.states, rows.parameters, family.system),
         n_transient=0,
         n_keep=family.period + 1,
-        rtol=BRANCH_RTOL,
-        atol=BRANCH_RTOL,
+        **limits_at(BRANCH_RTOL),
         system=family.system,
     )
     return np.asarray(result.turns[0, 0] / family.period, np.float64)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from magpend_core.orbits import crossed_state, section_map
+from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.bifurcations import SAME_PLACE, SHIFTS, TESTS, Bifurcation, locate, settle_sides
@@ -433,8 +434,7 @@ def crossings_of(cycles: Branch, section: Family, most: int) -> list[tuple[np.nd
         rows.states,
         n_transient=1,
         n_keep=1,
-        rtol=BRANCH_RTOL,
-        atol=BRANCH_RTOL,
+        **limits_at(BRANCH_RTOL),
         system=section.system,
     ).section[:, 0, 0]
     found = section_map(rows.parameters, rows.frequency_hz, first, most, rtol=BRANCH_RTOL, system=section.system)

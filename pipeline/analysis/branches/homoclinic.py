@@ -28,6 +28,7 @@ from magpend_core.engine.variational import with_tangents
 from magpend_core.equilibria import find_equilibria
 from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.lockstep import Query, Steps
@@ -106,7 +107,7 @@ class HomoclinicProblem:
     @property
     def atol(self) -> float:
         """Absolute tolerance of the integrations."""
-        return BRANCH_RTOL * min(1.0, self.extent)
+        return tolerances_at(BRANCH_RTOL)["atol"] * min(1.0, self.extent)
 
     @property
     def _step(self) -> float:

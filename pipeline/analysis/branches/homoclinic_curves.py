@@ -29,6 +29,7 @@ from magpend_core.equilibria import find_equilibria
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import find_root
@@ -330,7 +331,7 @@ def _cycle(
     system = family.system
     packed = family.rows(family.unknowns(start, values)[None]).parameters
     times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
-    orbit = sample(system, packed, start[None], [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL).states[0]
+    orbit = sample(system, packed, start[None], [times], drives=[drive], **tolerances_at(BRANCH_RTOL)).states[0]
     away = np.linalg.norm(wrap_angles(orbit - saddle, system) / np.asarray(system.scales), axis=1)
     first = int(away[:-1].argmin())
     states = np.concatenate([orbit[first:-1], orbit[: first + 1] + (orbit[-1] - orbit[0])])

@@ -24,6 +24,7 @@ from scipy.optimize import least_squares
 from magpend_core.equilibria import find_equilibria
 from magpend_core.orbits import crossed_state, scaled_distance
 from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.following import Branch, Limit, leading_of, opposite, problem_of
@@ -141,7 +142,7 @@ def last_orbit(family: Family, end: Point) -> np.ndarray:
     rows, seconds = family.rows(end.u[None]), end.value.seconds
     times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
     packed = rows.parameters[:1]
-    orbit = sample(family.system, packed, rows.states, [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
+    orbit = sample(family.system, packed, rows.states, [times], drives=[drive], **tolerances_at(BRANCH_RTOL))
     return np.asarray(orbit.states[0][np.isfinite(orbit.states[0]).all(axis=1)])
 
 

@@ -14,6 +14,7 @@ import xarray as xr
 from magpend_core import run_branches
 from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
+from magpend_core.precision import limits_at
 from magpend_core.rotation import CLOSED_TURNS, TurningState, rotation_numbers
 from pipeline.analysis.branches.analysis import interval_of, swept_axis, windows_of
 from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
@@ -93,8 +94,7 @@ class Search:
             turning=self.turning,
             n_periods=self.n_periods,
             orbit_period=closed,
-            rtol=TOLERANCE,
-            atol=TOLERANCE,
+            **limits_at(TOLERANCE),
         )
         return np.asarray(np.where(found.error <= CLOSED_TURNS, found.rotation, np.nan))
 
@@ -107,8 +107,7 @@ class Search:
             rows.states,
             n_transient=n_transient,
             n_keep=n_keep,
-            rtol=TOLERANCE,
-            atol=TOLERANCE,
+            **limits_at(TOLERANCE),
             system=self.system,
         )
         return np.asarray(found.section[:, 0])

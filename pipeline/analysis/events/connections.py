@@ -18,6 +18,7 @@ import numpy as np
 from magpend_core.equilibria import find_equilibria
 from magpend_core.orbits import section_map
 from magpend_core.pointwise import rates_at
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.starting_orbits import orbits_near
 from pipeline.analysis.events.contact import (
@@ -121,8 +122,7 @@ def motion_of(along: SectionMap, value: float, own: Sample) -> tuple[np.ndarray,
         [grid],
         piece=np.zeros(len(rows.states), np.int64),
         drives=[Drive(np.array([seconds]))],
-        rtol=along.rtol,
-        atol=along.rtol,
+        **tolerances_at(along.rtol),
     )
     return found.states, float(grid[1])
 

@@ -21,11 +21,11 @@ from math import lcm
 
 import numpy as np
 
-from magpend_core.defaults import MOST_STEPS
 from magpend_core.engine.entry import integrate
 from magpend_core.engine.lanes import Cells
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.orbits import polish_orbits, section_map
+from magpend_core.precision import limits_at
 from magpend_core.status import Status
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.problems import Family, Rows
@@ -166,9 +166,7 @@ class SectionMap:
             n_keep=int(lengths.max()),
             n_measures=1,
             measures=lengths[:, None, None],
-            rtol=self.rtol,
-            atol=self.rtol,
-            max_steps_per_period=MOST_STEPS,
+            **limits_at(self.rtol),
         )
 
     def rows(self, value: float | np.ndarray, states: np.ndarray) -> Rows:

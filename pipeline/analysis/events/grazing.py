@@ -18,6 +18,7 @@ import numpy as np
 
 from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import surfaces_at
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.known import at_value
@@ -129,7 +130,7 @@ def _heights(family: Family, point: Point, times: np.ndarray) -> tuple[np.ndarra
     frequency, packed = float(rows.frequency_hz[0]), rows.parameters
     is_flow = crossed_state(system) is not None
     drive = Drive(np.array([seconds]) if is_flow else np.full(family.period, 1.0 / frequency))
-    orbit = sample(system, packed, rows.states, [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
+    orbit = sample(system, packed, rows.states, [times], drives=[drive], **tolerances_at(BRANCH_RTOL))
     return surfaces_at(system, np.mod(times, 1.0 / frequency), orbit.states[0], packed[0], frequency)
 
 

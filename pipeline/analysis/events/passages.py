@@ -23,8 +23,8 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import least_squares
 
-from magpend_core.defaults import MOST_STEPS
 from magpend_core.extension import more_sections
+from magpend_core.precision import limits_at
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
 from pipeline.analysis.branches.problems import Family
@@ -195,9 +195,7 @@ def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int,
         rows.states,
         np.zeros(len(rows.states)),
         n_more=n,
-        rtol=TOLERANCE,
-        atol=TOLERANCE,
-        max_steps_per_period=MOST_STEPS,
+        **limits_at(TOLERANCE),
         system=family.system,
     )
     return np.asarray(found.section[:, 0].reshape(len(values), many, n, -1))

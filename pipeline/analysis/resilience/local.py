@@ -22,6 +22,7 @@ from magpend_core.engine.variational import with_tangents
 from magpend_core.models.model import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import jacobian
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.resilience.shocks import Bases, bases_of
@@ -161,8 +162,7 @@ def _steps(own: Parameters, bases: Bases, period: float, scales: np.ndarray) -> 
         [np.array([period / len(phases)])] * len(phases),
         piece=piece,
         drives=[Drive(np.array([period]), start_s=float(p) * period) for p in phases],
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
+        **tolerances_at(PORTRAIT_RTOL),
     )
     if (found.status != Status.BOUNDED).any():
         return None

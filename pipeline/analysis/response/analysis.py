@@ -10,6 +10,7 @@ import xarray as xr
 
 from magpend_core.models.model import Model, Parameters, Quantity, State
 from magpend_core.models.sectioned import of_flow
+from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of
@@ -226,8 +227,7 @@ def _landed(starts: Sequence[Orbit], frequency_hz: Sequence[float]) -> list[tupl
         np.array([orbit.state for orbit in starts]),
         n_transient=PATIENCE,
         n_keep=LONGEST,
-        rtol=PORTRAIT_RTOL,
-        atol=PORTRAIT_RTOL,
+        **limits_at(PORTRAIT_RTOL),
         stop_when_closed=True,
         closure_tolerance=CLOSURE,
         max_orbit_period=LONGEST,

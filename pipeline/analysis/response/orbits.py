@@ -11,6 +11,7 @@ import numpy as np
 from magpend_core.models.model import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import drive_level, evaluate
+from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
@@ -113,8 +114,7 @@ def sampled(orbits: Sequence[Orbit], n: int) -> Array:
             starts,
             times,
             drives=[Drive(np.full(period, orbit.seconds / period)) for orbit in orbits],
-            rtol=BRANCH_RTOL,
-            atol=BRANCH_RTOL,
+            **tolerances_at(BRANCH_RTOL),
             limits_first_step=False,
         ).states
     else:

@@ -21,6 +21,7 @@ import numpy as np
 
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import rates_at
+from magpend_core.precision import tolerances_at
 from magpend_core.status import Status
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.extension.clouds import OTHER, Cloud, is_stationary, mixing, thinned
@@ -276,10 +277,7 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
     for n in STRETCHES:
         whole = point.parameters.model.is_map
         times = np.arange(n * seconds + 1.0) if whole else np.linspace(0.0, n * seconds, n * SAMPLES)
-        paths = [
-            trajectory(flow_of, rate, states[i], times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL)
-            for i in [0, *(kept + 1)]
-        ]
+        paths = [trajectory(flow_of, rate, states[i], times, **tolerances_at(PORTRAIT_RTOL)) for i in [0, *(kept + 1)]]
         turns = np.asarray(geometry.is_angle) & (np.ptp(paths[0], axis=0) >= TWO_PI)
         first, *others = (_ranges(path, geometry)[:, ~turns] for path in paths)
         if max(np.abs(other - first).max(initial=0.0) for other in others) <= ALIKE * ASIDE:

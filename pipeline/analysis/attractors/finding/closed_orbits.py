@@ -14,7 +14,9 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import PeriodicOrbits, polish_orbits
+from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
+from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import position_error
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.sets import Geometry, rounded_points
@@ -50,6 +52,7 @@ class Orbit:
     seconds: float = np.nan  # period [s]; NaN if not polished
     # scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen
     approached_within: float = 0.0
+    failed: int = 0  # `Status` with which Newton's method ended in vain; 0 if it converged or was not tried
     # units of the states in which errors of the monodromy matrix are estimated; empty for 1
     sizes: tuple[float, ...] = ()
 
@@ -102,10 +105,13 @@ def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
     return np.asarray(orbit.derivative * scales[None, :] / scales[:, None])
 
 
-def raw_orbit(points: np.ndarray, geometry: Geometry) -> Orbit:
-    """Make an orbit from its section points (period, state), without refining it by Newton's method."""
+def raw_orbit(points: np.ndarray, geometry: Geometry, failed: int = 0) -> Orbit:
+    """Make an orbit from its section points (period, state), without refining it by Newton's method; `failed` says how
+    that ended.
+    """
     n = points.shape[1]
-    return Orbit(_rolled(points, geometry), np.full(n, np.nan + 0j), np.nan, np.full((n, n), np.nan))
+    none = np.full(n, np.nan + 0j)
+    return Orbit(_rolled(points, geometry), none, np.nan, np.full((n, n), np.nan), failed=failed)
 
 
 def _rolled(points: np.ndarray, geometry: Geometry) -> np.ndarray:
@@ -123,6 +129,7 @@ def polish(
     system: System,
     tolerance: float,
     known: dict[bytes, Orbit | None] | None = None,
+    status: np.ndarray | None = None,
 ) -> list[Orbit | None]:
     """Refine many guesses of closed orbits by Newton's method in one call; each guess can have its own parameters.
 
@@ -137,6 +144,9 @@ def polish(
     known
         Results of earlier calls with the same system and tolerance; this call adds its own. Guesses that lead
         to an orbit of an earlier call are not polished again.
+    status
+        Array of codes that is filled with the `status` of `polish_orbits`, if it is given: what ended the search for
+        each guess.
 
     Returns
     -------
@@ -168,18 +178,21 @@ def polish(
     rounded = rounded_points(first[good], geometry)
     rows = np.column_stack([packed[good], frequency[good], periods[good], rounded])
     keys = [row.tobytes() for row in rows]
-    new = {key: i for i, key in reversed(list(enumerate(keys))) if key not in known}
+    new: dict[bytes, int] = {}
+    for i, key in enumerate(keys):
+        if key not in known and (key not in new or first[good[i]].tolist() < first[good[new[key]]].tolist()):
+            new[key] = i
     once = np.array(sorted(new.values()), np.int64)
-    # start from the rounded point, so that an orbit does not depend on which guess came first
-    orbits = _polished(
-        packed[good[once]],
-        frequency[good[once]],
-        rounded[once] * np.asarray(geometry.scales),
-        periods[good[once]],
-        geometry,
-        system,
-        tolerance,
+    # start from the rounded point, so that an orbit does not depend on which guess came first; but a state that rounds
+    # to 0 may be small and not 0 (a population that is almost extinct)
+    starts = np.where(rounded[once] == 0.0, first[good[once]], rounded[once] * np.asarray(geometry.scales))
+    orbits, ended = _polished(
+        packed[good[once]], frequency[good[once]], starts, periods[good[once]], geometry, system, tolerance
     )
+    if status is not None:
+        status[:] = near.status
+        of_key = dict(zip([keys[i] for i in once], ended.tolist(), strict=True))
+        status[good] = [of_key.get(key, Status.BOUNDED) for key in keys]
     known.update(zip([keys[i] for i in once], orbits, strict=True))
     found: list[Orbit | None] = [None] * len(points)
     for i, key in zip(good, keys, strict=True):
@@ -202,12 +215,13 @@ def _polished(
     geometry: Geometry,
     system: System,
     tolerance: float,
-) -> list[Orbit | None]:
+) -> tuple[list[Orbit | None], np.ndarray]:
     """Refine guesses of orbits by Newton's method, and then once more from the first section point in canonical
-    order.
+    order. Return the orbits, and the status of each (see `polish_orbits`).
     """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits = [orbit_of(found, row, system) if found.converged[row] else None for row in range(len(points))]
+    status = found.status.copy()
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}
     rows = [row for row, point in least.items() if (point != orbits[row].points[0]).any()]  # type: ignore[union-attr]
     if rows:
@@ -215,9 +229,10 @@ def _polished(
         again = polish_orbits(
             packed[rows], frequency[rows], starts, found.orbit_period[rows], tolerance=tolerance, system=system
         )
+        status[rows] = again.status
         for i, row in enumerate(rows):
             orbits[row] = orbit_of(again, i, system) if again.converged[i] else None
-    return orbits
+    return orbits, status
 
 
 def orbit_of(found: PeriodicOrbits, row: int, system: System) -> Orbit:
@@ -252,8 +267,7 @@ def run_on(
         points,
         n_transient=RUN_ON_PERIODS,
         n_keep=1,
-        rtol=EXTEND_RTOL,
-        atol=EXTEND_RTOL,
+        **limits_at(EXTEND_RTOL),
         stop_when_closed=True,
         closure_tolerance=EXTEND_CLOSURE,
         max_orbit_period=max_orbit_period,

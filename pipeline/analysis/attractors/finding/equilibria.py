@@ -15,6 +15,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from magpend_core.equilibria import find_equilibria, newton_steps
+from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from magpend_core.sizes import natural_size
 from magpend_core.status import Status
@@ -108,8 +109,7 @@ def _waited(point: Point, path: np.ndarray) -> np.ndarray:
         path[:, -1],
         n_transient=0,
         n_keep=1,
-        rtol=WAIT_RTOL,
-        atol=WAIT_RTOL,
+        **limits_at(WAIT_RTOL),
         system=point.integrates,
     )
     waits = result.status[:, 0] == Status.NO_RETURN

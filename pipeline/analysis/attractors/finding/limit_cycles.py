@@ -16,6 +16,7 @@ import numpy as np
 from magpend_core.engine.crossing import with_section
 from magpend_core.orbits import polish_orbits
 from magpend_core.pointwise import rates_at
+from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.finding.closed_orbits import orbit_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle
@@ -53,8 +54,7 @@ class _Crossings:
             states,
             n_transient=0,
             n_keep=RETURNS,
-            rtol=rtol,
-            atol=rtol,
+            **limits_at(rtol),
             system=self._system,
         )
         return np.asarray(found.section[:, 0])

@@ -118,6 +118,8 @@ class Point:
     # (cell,): index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
     # nor bounded.
     on_cycle: np.ndarray | None = None
+    # `Status` with which Newton's method ended in vain, by the key of the guess (its box of section points)
+    unpolished: dict[int, int] = field(default_factory=dict)
     n_periods: int = 0  # drive periods or returns that the run integrated here, summed over cells
     is_flow: bool = False  # whether sections are crossings of a flow
     can_rest: bool = False  # whether equilibria are searched

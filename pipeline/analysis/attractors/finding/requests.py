@@ -16,6 +16,7 @@ import xarray as xr
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
+from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
@@ -205,6 +206,7 @@ def _polished(
         packed[unknown], frequency[unknown], start[unknown], settings.longest, settings.system
     )
     rows, place = _each_once(np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, settings.geometry)
+    status = np.full(len(rows), int(Status.BOUNDED))
     polished = polish(
         packed[rows],
         frequency[rows],
@@ -214,7 +216,12 @@ def _polished(
         system=settings.system,
         tolerance=settings.residual,
         known=settings.known,
+        status=status,
     )
+    for point, guess, own in zip((points[i] for i in asked), guesses, _slices(asked, sizes, ends), strict=True):
+        for key, i in zip(guess.key.tolist(), place[own[1]].tolist(), strict=True):
+            if i < 0 or polished[i] is None:
+                point.unpolished.setdefault(key, int(status[i]) if i >= 0 else int(Status.BOUNDED))
     found = [polished[i] if i >= 0 else None for i in place]
     return {index: found[own] for index, own in _slices(asked, sizes, ends)}
 

@@ -9,7 +9,8 @@ attracts        eigenvalues with negative real parts, multipliers inside the uni
 unstable        an eigenvalue or a multiplier outside, by more than its error; for a half-stable equilibrium,
                 trajectories of one side that leave
 transient       cells of the set left it
-not settled     none: the budget was too short
+not settled     none: the budget was too short, or Newton's method ended in vain (``step_limit``,
+                ``no_return``, ``no_convergence``)
 neutral         eigenvalues or multipliers on the axis or circle within their error, or a flow that
                 preserves volume
 ==============  ======================================================================================
@@ -26,11 +27,10 @@ from functools import cache
 
 import numpy as np
 
+from magpend_core.status import Status
 from pipeline.layout.vocabulary import ATTRACTS, EVIDENCE, NEUTRAL, UNSTABLE
 
-(BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING, BY_VOLUME, BY_ONE_SIDE) = range(
-    len(EVIDENCE)
-)
+(BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING, BY_VOLUME, BY_ONE_SIDE) = range(8)
 """Values of `evidence`."""
 
 TIMES_LONGEST = 10.0
@@ -72,6 +72,14 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 @cache
 def _signs(shape: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng(0).choice([-1.0, 1.0], (_TRIALS, *shape))
+
+
+def by_failure(status: int) -> int:
+    """Return the evidence code of a set on which Newton's method ended with a `Status`; 0 stands for not tried."""
+    if not status:
+        return BY_NOTHING
+    words = {Status.STEP_LIMIT: "step_limit", Status.STEP_UNDERFLOW: "step_limit", Status.NO_RETURN: "no_return"}
+    return EVIDENCE.index(words.get(Status(status), "no_convergence"))
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
