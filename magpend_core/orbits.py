@@ -19,6 +19,7 @@ from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+from magpend_core.ordering import canonical_order
 from magpend_core.pointwise import rates_packed
 from magpend_core.precision import limits_at
 from magpend_core.sizes import LEVEL
@@ -343,12 +344,18 @@ def _take(
             continue
         going[i] = False
         multipliers = np.linalg.eigvals(ends.derivatives[i])
-        found.multipliers[row] = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
+        found.multipliers[row] = multipliers[_by_modulus(multipliers)]
         found.converged[row], found.status[row] = True, int(Status.PERIODIC)
         found.seconds[row] = ends.times[i, :period].sum()
         found.points[row, 0], found.points[row, 1:period] = found.section[row], images[:-1]
         found.derivative[row] = ends.derivatives[i]
     return np.asarray(going)
+
+
+def _by_modulus(multipliers: np.ndarray) -> np.ndarray:
+    """Return the order of multipliers by falling modulus; those of one modulus by their phase, the positive first."""
+    modulus, phase = np.maximum(np.abs(multipliers), 1e-300), np.angle(multipliers)
+    return canonical_order(-np.column_stack([np.log(modulus), np.cos(phase), np.sin(phase)]))
 
 
 def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System) -> np.ndarray:

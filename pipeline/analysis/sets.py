@@ -16,6 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from magpend_core.ordering import SAME_DIGITS, canonical_order
+
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.models.model import Model
@@ -178,19 +180,36 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
 
 
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
-    """Return a canonical order of sets, by the least rounded point of each.
+    """Return a canonical order of sets, by the least point of each; see `canonical_order`.
 
-    In a tie the shorter set comes first; then all points decide, in the order given.
+    In a tie the shorter set comes first; then all points decide, from the least one on.
     """
+    if len(points) < 2:
+        return list(range(len(points)))
+    # a set as a row: its least point, its length, its other points
+    longest = max(map(len, points))
+    rows = np.full((len(points), longest * geometry.n_states + 1), np.inf)
+    for row, own in zip(rows, points, strict=True):
+        ordered = centred(own, geometry)[order_of_points(own, geometry)].ravel()
+        values = np.concatenate([ordered[: geometry.n_states], [len(own)], ordered[geometry.n_states :]])
+        row[: len(values)] = values
+    return [int(i) for i in canonical_order(rows)]
 
-    def key(i: int) -> tuple[tuple[float, ...], int, bytes]:
-        rounded = rounded_points(points[i], geometry)
-        return tuple(min(rounded.tolist())), len(rounded), rounded.tobytes()
 
-    return sorted(range(len(points)), key=key)
+def order_of_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Return the canonical order of states (n, state), the least one first; see `canonical_order`."""
+    return canonical_order(centred(points, geometry))
+
+
+def centred(points: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Scale states and wrap their angles to half a circle around 0; angles that are nearly the lower end are at the
+    upper one.
+    """
+    found = geometry.difference(points, np.zeros(points.shape[-1]))
+    is_low = (geometry.circumference > 0.0) & (found <= -0.5 * geometry.circumference + SAME_DIGITS)
+    return np.asarray(np.where(is_low, found + geometry.circumference, found))
 
 
 def rounded_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Scale states, wrap their angles to (-pi, pi], and round them to 1e-6 so that sorting them is reproducible."""
-    centred = geometry.difference(points, np.zeros(points.shape[-1]))
-    return np.asarray(np.round(centred, 6) + 0.0)
+    """Scale states, wrap their angles, and round them to 1e-6, so that most guesses of one orbit are equal."""
+    return np.asarray(np.round(geometry.difference(points, np.zeros(points.shape[-1])), 6) + 0.0)

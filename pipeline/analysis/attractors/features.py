@@ -20,6 +20,7 @@ import numpy as np
 
 from magpend_core.models.model import Mirror, Parameters
 from magpend_core.models.sectioned import of_flow
+from magpend_core.ordering import SAME_DIGITS
 from magpend_core.pointwise import evaluate
 from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.sampling import Drive, sample
@@ -28,7 +29,7 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
 from pipeline.analysis.flown import flown
-from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points, rows_by_number
+from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, order_of_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, samples_per_period
@@ -290,12 +291,12 @@ def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geomet
             + float(np.abs(turned * a.rotation - b.rotation).max(initial=0.0))
             for b in found
         ]
-        nearest = int(np.argmin(distances))
+        # of several that are equally near the first, whatever the last digits say
+        nearest = int(np.argmax(distances <= np.min(distances) + SAME_DIGITS))
         a.mirror_distance = distances[nearest]
         a.mirror_partner = nearest if distances[nearest] <= threshold else -1
 
 
 def sorted_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Sort section points (n, state) in lexicographic order of their scaled and rounded values."""
-    rounded = rounded_points(points, geometry)
-    return np.asarray(points[np.lexsort(rounded.T[::-1])])
+    """Sort section points (n, state) in canonical order."""
+    return np.asarray(points[order_of_points(points, geometry)])

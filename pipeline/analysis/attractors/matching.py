@@ -34,6 +34,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Parameters
+from magpend_core.ordering import SAME_DIGITS
 from pipeline.analysis.branches.connecting import Web, connect
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.sheets import GOING, OPEN, UNTRIED, Axis, Grid
@@ -288,10 +289,20 @@ def _assign(
 
     cost = np.array([[cost_of(a, identity) for identity in identities] for a in here])
     # clip, so that an assignment beyond the threshold costs as much as none
-    for row, column in zip(*linear_sum_assignment(np.minimum(cost, rule.threshold)), strict=True):
+    for row, column in zip(*linear_sum_assignment(_leveled(np.minimum(cost, rule.threshold))), strict=True):
         if cost[row, column] < rule.threshold:
             given[row] = identities[column]
     return given
+
+
+def _leveled(cost: np.ndarray) -> np.ndarray:
+    """Make costs equal that differ by last digits, so that the order of the rows decides between mirror images."""
+    order = np.argsort(cost, axis=None)
+    values = cost.ravel()[order]
+    first = np.maximum.accumulate(np.where(np.diff(values, prepend=-np.inf) > SAME_DIGITS, np.arange(len(order)), 0))
+    leveled = np.empty_like(values)
+    leveled[order] = values[first]
+    return leveled.reshape(cost.shape)
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray) -> xr.Dataset:

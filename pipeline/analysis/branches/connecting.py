@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
+from magpend_core.ordering import canonical_order
 from pipeline.analysis.branches.sheets import ENDED, GOING, LONGEST, NEAR, OPEN, UNTRIED, Array, Grid, Orbits, Values
 from pipeline.analysis.tolerances import SAME_CONNECTED
 from pipeline.products.reporting import report
@@ -68,9 +69,9 @@ def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:
     """
     scaled = [np.asarray(x) / np.asarray(grid.system.scales) for x in orbits]
     # the result depends neither on the order of the orbits nor on where they begin
-    scaled = [np.roll(x, -int(np.lexsort(x.T[::-1])[0]), axis=0) for x in scaled]
+    scaled = [np.roll(x, -int(canonical_order(x)[0]), axis=0) for x in scaled]
     firsts = np.array([x[0] for x in scaled])
-    order = np.lexsort((*firsts.T[::-1], [len(x) for x in scaled], place))
+    order = canonical_order(np.column_stack([place, [len(x) for x in scaled], firsts]))
     flood = _Flood(grid, place[order], [scaled[i] for i in order])
     flood.run()
     back = np.concatenate([order, np.arange(len(order), len(flood.nodes))])

@@ -19,7 +19,7 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import position_error
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
-from pipeline.analysis.sets import Geometry, rounded_points
+from pipeline.analysis.sets import Geometry, order_by_points, order_of_points, rounded_points
 from pipeline.analysis.tolerances import (
     EXTEND_CLOSURE,
     EXTEND_RTOL,
@@ -44,7 +44,7 @@ RUN_ON_PERIODS = 2000
 class Orbit:
     """A closed orbit at one parameter point, by its section points and its multipliers."""
 
-    # (period, state): section points in the order of time, the least one (rounded, scaled, lexicographic) first
+    # (period, state): section points in the order of time, the least one in canonical order first
     points: np.ndarray
     multipliers: np.ndarray  # complex, (state,): NaN if not polished
     residual: float  # residual of `polish_orbits`; NaN if not polished
@@ -115,8 +115,7 @@ def raw_orbit(points: np.ndarray, geometry: Geometry, failed: int = 0) -> Orbit:
 
 
 def _rolled(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    rounded = rounded_points(points, geometry).tolist()
-    return np.roll(points, -min(range(len(points)), key=rounded.__getitem__), axis=0)
+    return np.roll(points, -int(order_of_points(points, geometry)[0]), axis=0)
 
 
 def polish(
@@ -277,17 +276,15 @@ def run_on(
 
 
 def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
-    """Merge orbits that coincide, and sort them. The result does not depend on the order in which they were given."""
-
-    def key(orbit: Orbit) -> tuple[int, tuple[float, ...], bytes]:
-        least = rounded_points(orbit.points[:1], geometry)[0]
-        return orbit.period, tuple(least.tolist()), orbit.points.tobytes()
-
+    """Merge orbits that coincide, and sort them by period and canonical order. The result does not depend on the order
+    in which they were given.
+    """
     kept: list[Orbit] = []
-    for orbit in sorted(orbits, key=key):
+    for orbit in sorted(orbits, key=lambda one: (one.period, one.points.tobytes())):
         if not any(_coincide(orbit, other, geometry) for other in kept):
             kept.append(orbit)
-    return kept
+    ordered = [kept[i] for i in order_by_points([one.points for one in kept], geometry)]
+    return sorted(ordered, key=lambda one: one.period)
 
 
 def number_of(orbit: Orbit, orbits: Sequence[Orbit], geometry: Geometry) -> int:

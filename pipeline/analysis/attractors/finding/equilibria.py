@@ -21,7 +21,7 @@ from magpend_core.sizes import natural_size
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.sets import Geometry, hashes, rounded_points
+from pipeline.analysis.sets import Geometry, hashes, order_of_points
 from pipeline.analysis.tolerances import AT_EQUILIBRIUM, NEAR_REST, SAME_EQUILIBRIUM, WAIT_RTOL
 
 WAITS = 16
@@ -147,8 +147,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
             break
     if not kept:
         return []
-    order = np.lexsort(rounded_points(np.array([e.state for e in kept]), geometry).T[::-1])
-    return [kept[i] for i in order]
+    return [kept[i] for i in order_of_points(np.array([e.state for e in kept]), geometry)]
 
 
 def _settled(point: Point, path: np.ndarray, waits: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
