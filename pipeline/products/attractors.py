@@ -80,6 +80,7 @@ ATTRACTORS = Analysis(
     run itself. Basin fractions are fractions of the cells that end on attractors, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
+    version=2,
     table="pipeline.analysis.attractors.analysis:attractors_table",
     builds_on=("identified",),
     figure="attractors",

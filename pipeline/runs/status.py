@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ import numpy as np
 from magpend_core.status import Status
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.plan import Plan
+from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
 from pipeline.runs.preview import figure_command
 from pipeline.store.files import Files
@@ -37,6 +38,8 @@ class State:
         Committed tasks.
     cells : dict
         Number of committed cells by status name.
+    remarks : tuple of str
+        Warnings about the cells of a complete run.
     """
 
     files: Files
@@ -44,6 +47,7 @@ class State:
     plan: Plan
     done: frozenset[int]
     cells: dict[str, int] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -73,7 +77,8 @@ def state(source: str | Path | Files | RunDirectory) -> State:
         See `RunDirectory.open`.
     """
     run = RunDirectory.open(source)
-    return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
+    found = State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
+    return replace(found, remarks=tuple(small_states(run.cube()))) if found.complete else found
 
 
 def describe_state(found: State) -> list[str]:
@@ -86,7 +91,7 @@ def describe_state(found: State) -> list[str]:
         f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
         f"{len(found.done)} of {plan.n_tasks} tasks",
     ]
-    return lines + _status_lines(found.cells, plan.n_cells - found.n_committed)
+    return [*lines, *_status_lines(found.cells, plan.n_cells - found.n_committed), *found.remarks]
 
 
 def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:
@@ -162,7 +167,7 @@ def _outcome(status: xr.DataArray, code: Status) -> Outcome:
 def summary(run: RunDirectory) -> list[str]:
     """Return the text lines that ``magpend run`` prints at its end: cells by status, and suggested commands."""
     found = outcomes_of(run)
-    lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
+    lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found), *small_states(run.cube())]
     lines.append(f"plot it with: {figure_command(run)}")
     lost = lost_cells(found)
     if lost:

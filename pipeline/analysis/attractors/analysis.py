@@ -29,6 +29,7 @@ from pipeline.analysis.tabular import (
     with_interval,
     words_of,
 )
+from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims, time_unit
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions
 from pipeline.products.product import Table
@@ -40,6 +41,10 @@ RUN_AWAY = {"diverged", "not settled"}
 """What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
 
 _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high")
+
+
+WITHOUT_DIGITS = "without_digits"
+"""Attribute with a line for each state that falls below the run's `atol` and comes back."""
 
 
 def identified(run: OpenRun, options: IdentifyOptions) -> xr.Dataset:
@@ -54,7 +59,8 @@ def attractors(run: OpenRun, options: AttractorOptions) -> xr.Dataset:
     from pipeline.analysis.attractors.attractors import match
 
     found = run.derive("identified", **options.part(IdentifyOptions))
-    return match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
+    found = match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
+    return found.assign_attrs({WITHOUT_DIGITS: "\n".join(small_states(run.cube()))})
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
@@ -163,7 +169,7 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
     out.
     """
-    lines, what = [], "the map" if model_of(ds).is_map else "the flow"
+    lines, what = ds.attrs.get(WITHOUT_DIGITS, "").splitlines(), "the map" if model_of(ds).is_map else "the flow"
     if any(row["evidence"] == "volume" for row in rows):
         if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
             lines.append(f"{what} preserves volume on some sets: none of them attracts")
