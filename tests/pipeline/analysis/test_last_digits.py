@@ -96,8 +96,9 @@ def test_identified__with_other_last_digits(monkeypatch, tmp_path):
     import magpend
     from pipeline.runs.derive import derive
 
-    spec = magpend.Spec("sweep", "duffing", preset="twin-well").with_axis("amplitude", 0.2, 0.35, 6)
-    spec = spec.with_start_random(n=24, seed=1).with_integration(n_transient=300, n_keep=16)
+    spec = magpend.Spec("sweep", "duffing").with_parameters(preset="twin-well", frequency_hz=1.2 / (2.0 * np.pi))
+    spec = spec.with_axis("amplitude", 0.2, 0.35, 4).with_start_random(n=8, seed=1, x=(-1.5, 1.5), v=(-1.0, 1.0))
+    spec = spec.with_integration(n_transient=300, n_keep=16)
     run = magpend.run(spec, tmp_path / "run", workers=0)
     plain = derive(run.directory, "attractors", workers=0)
     whole = closed_orbits.polish_orbits
