@@ -65,9 +65,8 @@ IDENTIFIED = Analysis(
     "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
-    version=2,
+    version=3,
     by_point=True,
-    version=2,
 )
 
 ATTRACTORS = Analysis(
