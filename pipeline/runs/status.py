@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,8 +38,6 @@ class State:
         Committed tasks.
     cells : dict
         Number of committed cells by status name.
-    remarks : tuple of str
-        Warnings about the cells of a complete run.
     """
 
     files: Files
@@ -47,7 +45,6 @@ class State:
     plan: Plan
     done: frozenset[int]
     cells: dict[str, int] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -77,8 +74,7 @@ def state(source: str | Path | Files | RunDirectory) -> State:
         See `RunDirectory.open`.
     """
     run = RunDirectory.open(source)
-    found = State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
-    return replace(found, remarks=tuple(small_states(run.cube()))) if found.complete else found
+    return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
 
 
 def describe_state(found: State) -> list[str]:
@@ -91,7 +87,8 @@ def describe_state(found: State) -> list[str]:
         f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
         f"{len(found.done)} of {plan.n_tasks} tasks",
     ]
-    return [*lines, *_status_lines(found.cells, plan.n_cells - found.n_committed), *found.remarks]
+    lines += _status_lines(found.cells, plan.n_cells - found.n_committed)
+    return lines + (small_states(RunDirectory.open(found.files).cube()) if found.complete else [])
 
 
 def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:
