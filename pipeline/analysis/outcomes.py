@@ -1,7 +1,7 @@
 """Decide the outcome of each cell of a run: an attractor, divergence, or no outcome.
 
-Shares and basins count only cells that end on attractors or diverge. All other cells are counted by name: by
-the stability of their set, or by the way they failed. Only this module makes that decision.
+Shares are fractions of all cells. Cells that end on no attractor are counted by name: by the stability of their set,
+or by the way they failed. Only this module makes that decision.
 """
 
 from __future__ import annotations
@@ -85,11 +85,21 @@ def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
     for code, name in _ON_SET.items():
         found[name] = left & (stability == code)
     left &= stability == 0
+    found["growing"] = left & (_cells(ids, "decision") == vocabulary.GROWS)
+    left &= ~found["growing"]
     for code, name in _BY_STATUS.items():
         found[name] = left & (status == code)
         left &= status != code
     found["not settled"] = found["not settled"] | left
     return {name: which for name, which in found.items() if which.any()}
+
+
+def shares_of_others(ids: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return by reason the fraction of the cells of each parameter point that end on no attractor, in the order of the
+    points.
+    """
+    n_points = int(np.prod([ids.sizes[d] for d in split_dims(ids["attractor_id"])[0]]))
+    return {name: which.reshape(n_points, -1).mean(axis=1) for name, which in other_cells(ids).items()}
 
 
 def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

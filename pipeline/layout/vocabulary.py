@@ -49,8 +49,8 @@ EVIDENCE = (
 )
 """Values of `evidence`: the grounds for the stability of a set, or how Newton's method ended where it showed none."""
 
-DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")
-UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
+DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges", "grows")
+UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES, GROWS = range(len(DECISIONS))
 """How a cell was decided: values of `decision`."""
 
 (PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN, CHATTER) = Status

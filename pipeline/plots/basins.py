@@ -101,9 +101,7 @@ def plot_basins(
     _dress(ax, attractors, axes, degrees)
     if scale is not None:
         _draw_scale(fig, ax, scale, periods_of(model_of(attractors)))
-    finished = _finished(counts)
-    about = f"shares of the {finished} of {codes.size} cells that end on attractors or diverge"
-    style.complete(fig, ax, style.join([labels.caption(part, drop=axes), about if finished < codes.size else ""]))
+    style.complete(fig, ax, labels.caption(part, drop=axes))
     _write_letters(ax, codes, cast)
     return fig
 
@@ -219,29 +217,16 @@ def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: boo
     labels.angle_ticks(ax, y, "y")
 
 
-_DIVERGED = _FIRST_GREY - list(palette.GREYS).index("diverged")
-
-
-def _finished(counts: Mapping[int, int]) -> int:
-    """Return the number of cells with an outcome: they end on attractors or diverge."""
-    return sum(n for code, n in counts.items() if code >= 0 or code in (_OTHERS, _DIVERGED))
-
-
 def _entries(cast: palette.Cast, counts: Mapping[int, int]) -> list[tuple[str, str]]:
-    finished = _finished(counts)
+    total = sum(counts.values())
     own = [i for i in cast.order if i in counts]
-    entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / finished)}", cast.colours[i]) for i in own]
+    entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
         n = len(cast.names) - len(cast.main)
-        entries.append((f"{n} others, {palette.percent(counts[_OTHERS] / finished)}", palette.OTHERS))
+        entries.append((f"{n} others, {palette.percent(counts[_OTHERS] / total)}", palette.OTHERS))
     for k, name in enumerate(palette.GREYS):
         if (code := _FIRST_GREY - k) in counts:
-            share = (
-                palette.percent(counts[code] / finished)
-                if code == _DIVERGED
-                else f"{counts[code]} cell{'s' * (counts[code] > 1)}"
-            )
-            entries.append((f"{name}, {share}", palette.GREYS[name]))
+            entries.append((f"{name}, {palette.percent(counts[code] / total)}", palette.GREYS[name]))
     return entries
 
 

@@ -102,6 +102,7 @@ GREYS = {
     "on an unstable orbit or equilibrium": "#6b5d4f",
     "on a neutral set": "#acbfd2",
     "diverged": "0.0",
+    "growing": "#2f2a26",
     "failed": "0.45",
     "no return": "0.17",
     "chatter": "#320836",

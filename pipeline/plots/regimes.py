@@ -272,7 +272,7 @@ def _period_name(period: int) -> str:
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
     """Return the basin fractions with their 95 % intervals, and a bound on the size of a basin that was missed."""
-    about = {"units": "1", "long_name": "share of the cells with an outcome"}
+    about = {"units": "1", "long_name": "share of all cells"}
     found = {ROW_SIZE: part[ROW_SIZE].variable, "share": (SET, part["share"].values, about)}
     if "branch" not in start_dims(part):
         interval = share_interval(part["n_cells"].values, part["share"].values)

@@ -76,7 +76,7 @@ ATTRACTORS = Analysis(
     Options that are given hold for the run from then on: all other analyses and figures show these attractors.
     Prints a table per parameter point, or with more than six points a line per attractor with the
     range in which it exists. Cells on no known orbit are integrated further, at most as long as in the
-    run itself. Basin fractions are fractions of the cells that end on attractors, with 95 % intervals.""",
+    run itself. Basin fractions are fractions of all cells, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
     version=2,

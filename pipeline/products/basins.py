@@ -38,4 +38,5 @@ BASINS = Analysis(
     figure="basins",
     version=2,
     by_point=True,
+    version=2,
 )

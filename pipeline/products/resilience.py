@@ -71,6 +71,7 @@ RESILIENCE = Analysis(
     builds_on=("attractors",),
     figure="resilience",
     by_point=True,
+    version=2,
 )
 
 EDGE = Analysis(

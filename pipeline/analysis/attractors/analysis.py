@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.outcomes import other_cells, sentence, share_interval
-from pipeline.analysis.ragged import N_IDS, N_POINTS, SAMPLE, SET, places_of_rows, row_of_cells
+from pipeline.analysis.intervals import binomial_interval
+from pipeline.analysis.outcomes import other_cells, sentence, share_interval, shares_of_others
+from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, places_of_rows, row_of_cells
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import (
     FEW_POINTS,
@@ -37,7 +38,7 @@ from pipeline.products.product import Table
 MOST_STATES = 2
 """Most states of a model whose places are printed; the CSV table has those of all models."""
 
-RUN_AWAY = {"diverged", "not settled"}
+RUN_AWAY = {"diverged", "growing", "not settled"}
 """What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
 
 _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high")
@@ -80,9 +81,11 @@ def attractors_table(ds: xr.Dataset) -> Table:
         shown, more = _largest(rows)
         lines += [*summary(ds, shown, dims, _id_summary, "attractor_id"), *more]
     else:
-        for _, where in points_of(ds, dims):
+        others = _others_lines(ds)
+        for i, (_, where) in enumerate(points_of(ds, dims)):
             shown, more = _largest([row for row in rows if all(row[k] == v for k, v in where.items())])
-            lines += [*point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, unit)), *more]
+            table = point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, unit))
+            lines += [*table, *more, *others[i]]
     return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
 
 
@@ -99,18 +102,40 @@ def _largest(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
     return shown, [f"  and {len(kinds)} smaller ones: {told}; all are in --csv and --json"]
 
 
+def _others_lines(ds: xr.Dataset) -> list[list[str]]:
+    """Return for each parameter point the lines with the share of the cells that end on no attractor, by reason."""
+    n_points = int(np.prod([ds.sizes[d] for d in split_dims(ds["attractor_id"])[0]]))
+    lines: list[list[str]] = [[] for _ in range(n_points)]
+    n_cells = ds["attractor_id"].size // n_points
+    for name, share in shares_of_others(ds).items() if _has_shares(ds) else ():
+        low, high = binomial_interval(np.rint(share * n_cells), np.full(n_points, n_cells))
+        for i in np.flatnonzero(share).tolist():
+            row = {"fraction": share[i], "low": low[i], "high": high[i]}
+            lines[i].append(f"  on no attractor: {with_interval(row, FRACTION, '.4f')} {name}")
+    return lines
+
+
+def _has_shares(ds: xr.Dataset) -> bool:
+    """Return whether cells are a sample of initial conditions; the branches of a continuation are none."""
+    return split_dims(ds["attractor_id"])[1] not in ((), ("branch",))
+
+
 def _rows(ds: xr.Dataset) -> list[Row]:
     """Return one table row for each set (attractor or other) at each parameter point.
 
-    `fraction` is a share of the cells that attract or diverge, with its interval; it is NaN for a set that
-    does not attract. A continuation has no fractions: its branches are no sample of initial conditions.
+    `fraction` is a share of all cells, with its interval; it is NaN for a set that does not attract. The columns
+    ``rest_REASON`` have the shares of the cells of this point that end on no attractor. A continuation has no
+    fractions: its branches are no sample of initial conditions.
     """
     dims, start_dims = split_dims(ds["attractor_id"])
     columns = dict(zip(dims, (axis.astype(object) for axis in places_of_rows(ds, dims)), strict=True)) | _columns(ds)
-    if start_dims and start_dims != ("branch",):
+    if _has_shares(ds):
         attracts, share = ds["stability"].values == ATTRACTS, ds["share"].values
         shares = (np.where(attracts, share, np.nan), *share_interval(ds["n_cells"].values, share))
         columns |= {name: values.astype(object) for name, values in zip(FRACTION, shares, strict=True)}
+        point = np.repeat(np.arange(ds[ROW_SIZE].size), ds[ROW_SIZE].values.ravel())
+        rest = shares_of_others(ds)
+        columns |= {f"rest_{name.replace(' ', '_')}": share[point].astype(object) for name, share in rest.items()}
     words = words_of(ds["decision"])
     decided = np.zeros((ds.sizes[SET], len(words)), np.int64)
     cells = row_of_cells(ds)
@@ -169,12 +194,15 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
     out.
     """
-    lines, what = ds.attrs.get(WITHOUT_DIGITS, "").splitlines(), "the map" if model_of(ds).is_map else "the flow"
+    lines, what = _growing_lines(ds), "the map" if model_of(ds).is_map else "the flow"
+    lines += ds.attrs.get(WITHOUT_DIGITS, "").splitlines()
     if any(row["evidence"] == "volume" for row in rows):
         if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
             lines.append(f"{what} preserves volume on some sets: none of them attracts")
         else:
             lines.append(f"{what} preserves volume: a conservative system has no attractors")
+        if any(row["evidence"] == "volume" and row["kind"] == "bounded_set" and row["n_cells"] > 1 for row in rows):
+            lines.append("cells of a bounded set that is neutral are each on an orbit or a torus of their own")
     above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
     longest = int(ds.attrs.get("identify_max_orbit_period", 0))
     unsettled = [row for row in rows if row["stability"] == "not_settled"]
@@ -200,6 +228,21 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     if RUN_AWAY & set(other_cells(ds)):
         lines += model_of(ds).flow.angle_remarks
     return lines
+
+
+def _growing_lines(ds: xr.Dataset) -> list[str]:
+    """Return a line on the cells that grow, with the evidence, by the point with the fastest growth."""
+    cells = other_cells(ds).get("growing")
+    if cells is None:
+        return []
+    n, rates = int(cells.sum()), ds["growth_rate"].values
+    at = np.unravel_index(int(np.nanargmax(rates)), rates.shape)
+    factor, length = float(ds["growth_factor"].values[at]), int(ds["growth_length"].values[at])
+    verbs = "grows without returning and is" if n == 1 else "grow without returning and are"
+    return [
+        f"{counted(n, 'cell')} {verbs} on no set: the distance from where they began grew {factor:.3g} times over "
+        f"{length} sections, at the end at a rate of {rates[at]:.3g} per {time_unit(model_of(ds))}"
+    ]
 
 
 def _attractor_words(row: Row, n_points: int, unit: str) -> Words:

@@ -26,15 +26,17 @@ variable                 dims                                  dtype, fill  mean
 ``status``               parameter dims, start dims            int8         as in the cube
 ``ran_out``              parameter dims                        int8, 0      1 if the budget of the extension
                                                                             ended before all was decided
+``growth_rate``          parameter dims                        float64, NaN of cells that grow: relative growth of
+``growth_factor``                                              float64, NaN their distance from where they began, at
+``growth_length``                                              int64, 0     the end [1/s], its factor, and sections
 ``kind``                 set                                   int8, 0      `vocabulary.KINDS`
 ``stability``            set                                   int8, 0      `vocabulary.STABILITIES`
 ``evidence``             set                                   int8, 0      evidence for the stability:
                                                                             `vocabulary.EVIDENCE`
 ``orbit_period``         set                                   int32, 0     drive periods; 0 if not periodic
 ``n_cells``              set                                   int64, 0     cells
-``share``                set                                   float64, 0   of the cells of the point that end
-                                                                            on attractors or diverge; 0 of a
-                                                                            set that does not attract
+``share``                set                                   float64, 0   of all cells of the point; 0 of a set
+                                                                            that does not attract
 ``n_sets``               parameter dims                        int32        rows of the point
 ``attractor_points``     sample, state                         float64      section points, row after row
 ``n_points``             set                                   int32        section points of the row
@@ -88,9 +90,9 @@ there. The attribute ``n_ids`` is the number of ids. `matching` defines an id.
 Each row lists a *set* on which cells end. Only a set with the stability ``attracts`` is an attractor; see
 `stability` for the criteria. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on
 the orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
-`equilibria`), 7 diverged when it was extended (no id); `assigning.decide` has the criteria. A cell that is
-not bounded (diverged, step limit, pending, unreached, or without a return and yet not at rest) has the id -1
-and its own `status`. A bounded cell that belongs to no set has the id -1 and `decision` 0: it is not settled.
+`equilibria`), 7 diverged when it was extended (no id), 8 grows to the end of its extension (no id;
+`growth.Escape`); `assigning.decide` has the criteria. A cell that is not bounded (diverged, step limit,
+pending, unreached, or without a return and yet not at rest) has the id -1 and its own `status`. A bounded cell that belongs to no set has the id -1 and `decision` 0: it is not settled.
 
 A run with a loose `closure_tolerance` (above 1e-4, which makes the default `tolerance` of `identify` exceed
 1e-3) is short, and closure proves little: sections also recur
@@ -123,17 +125,7 @@ from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, index_of_rows
 from pipeline.analysis.sides import flags_of
 from pipeline.analysis.tolerances import CLOSURE
-from pipeline.layout.vocabulary import (
-    APERIODIC,
-    ATTRACTS,
-    DECISIONS,
-    DIVERGED,
-    DIVERGES,
-    EVIDENCE,
-    KINDS,
-    STABILITIES,
-    split_dims,
-)
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, DECISIONS, EVIDENCE, KINDS, STABILITIES, split_dims
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.chaos import ChaosOptions
 
@@ -227,14 +219,19 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
     result = xr.Dataset(_rows(ds, [found[at] for at in np.ndindex(*shape)], search))
     cell_dims = (*dims, *start_dims)
     cell_shape = (*shape, *(ds.sizes[d] for d in start_dims))
+    growth = {name: np.full(shape, getattr(Found, name)) for name in _GROWTH}
     n_sets, ran_out = np.zeros(shape, np.int32), np.zeros(shape, np.int8)
     ids, decisions = np.empty(cell_shape, np.int32), np.empty(cell_shape, np.int8)
     for index, one in found.items():
         ids[index] = one.label.reshape(cell_shape[len(dims) :])
         decisions[index] = one.decision.reshape(cell_shape[len(dims) :])
+        for name, values in growth.items():
+            values[index] = getattr(one, name)
         n_sets[index], ran_out[index] = len(one.features), one.ran_out
     result[ROW_SIZE] = (dims, n_sets, {"units": "1", "long_name": "number of sets", "sample_dimension": SET})
     result["ran_out"] = (dims, ran_out, {"units": "1", "long_name": "whether the extension's budget ended"})
+    for name, (units, text) in _GROWTH.items():
+        result[name] = (dims, growth[name], {"units": units, "long_name": text})
     result["attractor_id"] = (cell_dims, ids, {"units": "1", "long_name": "attractor of the cell, -1 none"})
     how = {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))}
     result["decision"] = (cell_dims, decisions, how)
@@ -250,6 +247,12 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
         {**kept, **settings, "matched": 0, N_IDS: int(n_sets.max(initial=0))}
     )
 
+
+_GROWTH = {
+    "growth_rate": ("1/s", "relative growth of cells that grow, at the end of their extension"),
+    "growth_factor": ("1", "factor by which their distance from where they began grew"),
+    "growth_length": ("1", "sections over which it grew"),
+}
 
 _ID = {"units": "1", "long_name": "attractor"}
 
@@ -271,9 +274,7 @@ def _rows(ds: xr.Dataset, found: Sequence[Found], search: Search) -> dict[str, A
         dims = (SET, *(angle_dim if d == "angle" else d for d in own))
         variables[name] = (dims, values, {"units": units, "long_name": text, **_words_of(name, model)})
     variables["n_cells"][1][:] = [n for one in found for n in one.counts]
-    n_diverged = (ds["status"] == DIVERGED).transpose(*split_dims(ds["status"])[0], ...).values
-    n_diverged = n_diverged.reshape(len(found), -1).sum(axis=1)
-    variables["share"][1][:] = [x for one, n in zip(found, n_diverged, strict=True) for x in _shares(one, int(n))]
+    variables["share"][1][:] = [x for one in found for x in _shares(one)]
     variables[N_POINTS][1][:] = [len(x.points) for x in features]
     variables[N_POINTS][2]["sample_dimension"] = SAMPLE
     points = np.concatenate([np.zeros((0, n_states)), *(x.points for x in features)])
@@ -292,12 +293,10 @@ def _value(x: Features, name: str) -> Any:
     return getattr(x, name)
 
 
-def _shares(one: Found, n_diverged: int) -> np.ndarray:
-    """Return the fraction of trajectories on each attractor, among those that end on one or diverge."""
-    counts = np.array(one.counts, np.int64)
+def _shares(one: Found) -> np.ndarray:
+    """Return the fraction of all trajectories that end on each attractor; 0 of a set that does not attract."""
     attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)
-    total = int(counts[attracts].sum()) + n_diverged + int((one.decision == DIVERGES).sum())
-    return np.where(attracts, counts / max(total, 1), 0.0)
+    return np.where(attracts, np.array(one.counts, np.int64) / max(len(one.label), 1), 0.0)
 
 
 def _transitions(features: Sequence[Features]) -> dict[str, Any]:

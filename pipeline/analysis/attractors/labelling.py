@@ -11,9 +11,12 @@ from magpend_core.orbits import orbit_exponents
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
+from pipeline.analysis.attractors.extension.conservative import conservative_sets
 from pipeline.analysis.attractors.extension.courses import AT_REST as RESTS
-from pipeline.analysis.attractors.extension.courses import DIVERGED, ON_SET, rest_number
+from pipeline.analysis.attractors.extension.courses import DIVERGED, ON_SET, Course, rest_number
+from pipeline.analysis.attractors.extension.courses import GROWS as GROWS_ON
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
+from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.features import Cells, Features
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
@@ -38,6 +41,7 @@ from pipeline.layout.vocabulary import (
     CLOSED,
     DIVERGES,
     EXTENDED,
+    GROWS,
     NEUTRAL,
     PERIODIC_ORBIT,
     SAME_SET,
@@ -46,6 +50,10 @@ from pipeline.layout.vocabulary import (
 
 MOST_PROBES = 8
 """Most degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories."""
+
+
+ENDLESS = (DIVERGES, GROWS)
+"""Decisions on cells that end on no set."""
 
 
 @dataclass
@@ -57,6 +65,11 @@ class Found:
     features: list[Features]  # features of each set
     counts: list[int]  # number of cells on each set
     ran_out: bool = False  # whether the budget of the extension ended before all cells were decided
+    # of the cells that grow: relative growth of the distance from where they began at the end [1/s], its factor, and
+    # the number of sections; NaN and 0 if there are none
+    growth_rate: float = np.nan
+    growth_factor: float = np.nan
+    growth_length: int = 0
 
 
 @dataclass
@@ -80,7 +93,7 @@ def analyse(point: Point, search: Search) -> Work[Found]:
     """Find the sets on which the cells of a parameter point end, with their kind, stability and evidence."""
     labels = _Labels.of(point.n_cells)
     if search.options.polish and (yield from _preserves_volume(point, search)):
-        return _describe(point, [], [_conservative(point, labels)], labels, search)
+        return (yield from _conservative(point, labels, search))
     state = yield from search_orbits(point, search)
     groups = _label_orbits(point, state, labels, search)
     if search.options.polish:
@@ -97,6 +110,7 @@ def analyse(point: Point, search: Search) -> Work[Found]:
     _label_sets(point, len(state.orbits) + len(raw), found.sets, labels, groups, search)
     result = _describe(point, [*state.orbits, *raw], found.sets, labels, search)
     result.ran_out = found.ran_out
+    _fill_growth(result, found.courses, point, search)
     return result
 
 
@@ -157,11 +171,32 @@ def _some_points(point: Point, n: int = 16) -> np.ndarray:
     return found[:, 0]
 
 
-def _conservative(point: Point, labels: _Labels) -> BoundedSet:
-    for block in point.blocks():
-        own = np.flatnonzero(block.is_closed | block.is_bounded)
-        labels.put(own + block.cells.start, 0, SAME_SET)
-    return BoundedSet.neutral()
+def _conservative(point: Point, labels: _Labels, search: Search) -> Work[Found]:
+    options = search.options
+    budget = options.budget if options.extend else 0.0
+    sets, courses = yield from conservative_sets(point, search.settings, budget, options.n_sample)
+    for i, one in enumerate(sets):
+        labels.put(one.cells, i, SAME_SET)
+    for course in courses:
+        if course.end == GROWS_ON:
+            labels.put(np.array([course.cell]), -1, GROWS)
+    result = _describe(point, [], sets, labels, search)
+    _fill_growth(result, courses, point, search)
+    return result
+
+
+def _fill_growth(result: Found, courses: Sequence[Course], point: Point, search: Search) -> None:
+    """Describe the growth of the cells that grow, by the median over those that were integrated further."""
+    growing = [course for course in courses if course.end == GROWS_ON]
+    known = [(Escape.of(course.extension, search.geometry), course) for course in growing]
+    rates = [
+        (one.rate * (course.length / course.seconds if course.seconds else point.frequency), one.factor, one.length)
+        for one, course in known
+        if one is not None
+    ]
+    if rates:
+        result.growth_rate, result.growth_factor, length = np.median(rates, axis=0).tolist()
+        result.growth_length = int(length)
 
 
 # ---- labels ------------------------------------------------------------------------------------
@@ -239,6 +274,7 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
         end = looked_up(ends, keys, looked_up(by_group, groups[cells], ON_SET))
         labels.put(cells[end >= 0], end[end >= 0], EXTENDED)
         labels.decision[cells[end == DIVERGED]] = DIVERGES
+        labels.decision[cells[end == GROWS_ON]] = GROWS
         if point.at_rest is not None:
             rests = end <= RESTS
             point.at_rest[cells[rests]] = RESTS - end[rests]
@@ -250,7 +286,7 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
 
     After a search by Newton's method there may be no orbit: beside the ghost of a fold, cells move too slowly to see.
     """
-    left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
+    left = np.where((labels.label < 0) & ~np.isin(labels.decision, ENDLESS) & ~_is_elsewhere(point), groups, -1)
     if left.max(initial=-1) < 0:
         return []
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -281,7 +317,7 @@ def _label_sets(
         return
     clouds, elsewhere = [one.cloud for one in sets if one.cloud is not None], _is_elsewhere(point)
     for block in point.blocks():
-        free = (labels.label[block.cells] < 0) & (labels.decision[block.cells] != DIVERGES)
+        free = (labels.label[block.cells] < 0) & ~np.isin(labels.decision[block.cells], ENDLESS)
         rows = np.flatnonzero(block.is_bounded & free & ~elsewhere[block.cells])
         own = members(block.section[rows], clouds)
         labels.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
@@ -339,7 +375,7 @@ def _describe(
     table = np.full(max(numbers, default=0) + 2, -1, np.int32)
     table[order] = np.arange(len(order))
     _number_ends(ranked, order, sets, len(orbits), resting, table)
-    decided = (labels.label >= 0) | (labels.decision == DIVERGES)
+    decided = (labels.label >= 0) | np.isin(labels.decision, ENDLESS)
     return Found(
         table[labels.label],
         np.where(decided, labels.decision, UNDECIDED).astype(np.int8),

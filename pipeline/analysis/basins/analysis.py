@@ -11,6 +11,7 @@ import xarray as xr
 from pipeline.analysis.basins.boundaries import basin_entropy, box_sides, epsilons_of, uncertainty_exponent
 from pipeline.analysis.basins.numbers import basin_rows
 from pipeline.analysis.basins.wada import wada_merge_test
+from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import DIVERGED, other_cells, outcomes, told
 from pipeline.analysis.ragged import dims_of, places_of_rows
 from pipeline.analysis.run import OpenRun
@@ -54,11 +55,13 @@ def basins_table(ds: xr.Dataset) -> Table:
     """
     rows, dims = _rows(ds), dims_of(ds)
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
-    lines = [f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, {confidence}"]
+    lines = [f"fractions of all cells, {ds.attrs['basin_interval']}, {confidence}"]
     if int(np.prod([ds.sizes[d] for d in dims])) > FEW_POINTS:
-        shown, n_others = leading(rows, "label", "n_cells")
+        shown, n_others = leading([row for row in rows if row["label"] != NO_OUTCOME], "label", "n_cells")
         lines += summary(ds, shown, dims, _label_summary, "label")
         lines += [f"  and {n_others} smaller ones; all are in --csv and --json"] if n_others else []
+        others = [row for row in rows if row["label"] == NO_OUTCOME]
+        lines += summary(ds, others, dims, _label_summary, "outcome") if others else []
         lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
     else:
         for at, where in points_of(ds, dims):
@@ -74,13 +77,41 @@ def basins_table(ds: xr.Dataset) -> Table:
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
+    """Return a row for each outcome at each parameter point, and one for each reason why cells have none."""
     dims = dims_of(ds)
     columns = dict(zip(dims, places_of_rows(ds, dims), strict=True))
-    columns |= {"label": ds["attractor"].values, "n_cells": ds["count"].values}
-    names = ("n_inferred", *FRACTION, "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
-    columns |= {name: ds[name].values for name in names}
-    return [dict(zip(columns, row, strict=True)) for row in zip(*(c.tolist() for c in columns.values()), strict=True)]
+    label = ds["attractor"].values
+    words = np.where(label == DIVERGED, "diverged", "attractor")
+    columns |= {"label": label, "outcome": words, "n_cells": ds["count"].values}
+    columns |= {name: ds[name].values for name in ("n_inferred", *FRACTION, "fraction_if_all", "high_if_all")}
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*(c.tolist() for c in columns.values()), strict=True)]
+    return rows + [
+        _other_row(ds, at, where, name)
+        for at, where in points_of(ds, dims)
+        for name in _OTHERS
+        if ds[name].isel(at) > 0
+    ]
 
+
+def _other_row(ds: xr.Dataset, at: Mapping[str, int], where: Row, name: str) -> Row:
+    """Return the row of the cells of a parameter point that have no outcome for one reason."""
+    count, n = int(ds[name].isel(at)), int(ds["n_cells"].isel(at))
+    settings: dict[str, Any] = {"confidence": ds.attrs["basin_confidence"], "method": ds.attrs["basin_interval"]}
+    low, high = (float(end) for end in binomial_interval(count, n, **settings))
+    told = {"label": NO_OUTCOME, "outcome": _OTHERS[name], "n_cells": count, "n_inferred": 0}
+    return {
+        **where,
+        **told,
+        "fraction": count / n,
+        "low": low,
+        "high": high,
+        "fraction_if_all": count / n,
+        "high_if_all": high,
+    }
+
+
+NO_OUTCOME = -1
+"""Label of the rows of cells without an outcome."""
 
 _OTHERS = {
     "n_pending": "pending",
@@ -88,8 +119,14 @@ _OTHERS = {
     "n_transient": "on a transient set",
     "n_unstable": "on an unstable orbit or equilibrium",
     "n_neutral": "on a neutral set",
-    "n_failed": "that could not be integrated",
+    "n_growing": "growing",
+    "n_step_limit": "step limit",
+    "n_step_underflow": "step underflow",
+    "n_unreached": "unreached",
+    "n_no_return": "no return",
+    "n_chatter": "chatter",
 }
+"""Variables that count the cells without an outcome, and the reasons (`pipeline.analysis.outcomes.other_cells`)."""
 
 
 def _sentence(ds: xr.Dataset) -> str:
@@ -99,13 +136,13 @@ def _sentence(ds: xr.Dataset) -> str:
 
 
 def _basin_words(row: Row) -> Words:
-    unfinished = row["fraction_if_all"] > row["fraction_if_none"]
+    unfinished, is_attractor = row["fraction_if_all"] > row["fraction"], row["outcome"] == "attractor"
     return {
-        "id": "diverged" if row["label"] == DIVERGED else str(row["label"]),
+        "id": str(row["label"]) if is_attractor else row["outcome"],
         "cells": str(row["n_cells"]),
         "fraction": with_interval(row, FRACTION, ".4f"),
-        "with the unfinished": f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}" if unfinished else None,
-        "letter": "-" if row["label"] == DIVERGED else letter(row["label"]),
+        "with the unfinished": f"{row['low']:.4f} to {row['high_if_all']:.4f}" if unfinished else None,
+        "letter": letter(row["label"]) if is_attractor else "-",
         "inferred cells": str(row["n_inferred"] or "") or None,
     }
 
@@ -178,8 +215,8 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
         cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). One row (`pipeline.analysis.ragged`)
         for each outcome of cells at each parameter point, with `attractor`, the id or -2: the variables of
         `numbers.basin_rows`, in which cells without an outcome count as unfinished. On the
-        parameter dims: `n_pending`, `n_not_settled`, `n_transient`, `n_unstable`, `n_neutral` and `n_failed`
-        (step limits), which add up to `n_unfinished`.
+        parameter dims the number of the latter by reason, such as `n_not_settled` and `n_no_return` (`_OTHERS`);
+        they add up to `n_unfinished`.
 
         If the starts are a grid, evenly spaced along every axis, on the parameter dims:
         `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
@@ -225,27 +262,16 @@ def check_starts(ds: xr.Dataset) -> None:
 
 
 def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Count the cells without an outcome at each parameter point by reason, such as "not computed" or "not settled"."""
+    """Count the cells without an outcome at each parameter point by reason."""
     others = other_cells(ids)
     shape = ids["attractor_id"].transpose(*dims, ...).shape
-    kinds = {
-        "n_pending": (("pending",), "cells not computed"),
-        "n_not_settled": (("not settled",), "cells of which nothing could be shown"),
-        "n_transient": (("on a transient set",), "cells on sets that others were seen to leave"),
-        "n_unstable": (("on an unstable orbit or equilibrium",), "cells on sets that do not attract"),
-        "n_neutral": (("on a neutral set",), "cells on neutral sets"),
-        "n_failed": (
-            ("step limit", "step underflow", "unreached", "no return", "chatter"),
-            "cells that could not be integrated",
-        ),
-    }
     found = {}
-    for name, (words, text) in kinds.items():
-        which = np.zeros(shape, bool)
-        for word in words:
-            which |= others.get(word, False)
+    for name, reason in _OTHERS.items():
+        which = others.get(reason, np.zeros(shape, bool))
         count = which.reshape(*shape[: len(dims)], -1).sum(axis=-1, dtype=np.int64)
-        found[name] = xr.DataArray(count, dims=dims, attrs={"units": "1", "long_name": text})
+        found[name] = xr.DataArray(
+            count, dims=dims, attrs={"units": "1", "long_name": f"cells without an outcome: {reason}"}
+        )
     return found
 
 

@@ -27,8 +27,8 @@ def basin_rows(
 ) -> xr.Dataset:
     """Compute the basin fractions with their errors, as rows: one for each outcome of the cells at a parameter point.
 
-    `fraction` refers to the finished cells, as if the unfinished cells were distributed alike. Further variables state
-    the largest change that the unfinished cells can make. For an attractor without cells, `unseen_high` bounds the
+    `fraction` refers to all cells. Further variables state the largest change that cells without an outcome
+    (unfinished) can make. For an attractor without cells, `unseen_high` bounds the
     fraction by the exact one-sided bound ``1 - (1 - confidence)**(1/N)``, at 95 % the "rule of three" 3/N (Hanley and
     Lippman-Hand, J. Am. Med. Assoc. 249, 1743, 1983).
 
@@ -49,9 +49,9 @@ def basin_rows(
     -------
     Dataset
         Rows (`pipeline.analysis.ragged`) with the outcome as `attractor`, and `n_sets`, their number at each point. In
-        each row: `count`, and `n_inferred` of them; `fraction` with `low` and `high`, NaN where nothing finished;
-        `fraction_if_none` and `fraction_if_all`, the fraction if none or all of the unfinished cells belonged to the
-        outcome; `low_if_none` and `high_if_all`, the interval around both. At each point: `n_cells`, `n_unfinished`,
+        each row: `count`, and `n_inferred` of them; `fraction` of all cells, with `low` and `high`;
+        `fraction_if_all`, the fraction if all unfinished cells belonged to the outcome, and `high_if_all`, the upper
+        end of its interval. At each point: `n_cells`, `n_unfinished`,
         `fraction_unfinished`, `unseen_high`, and `unseen_high_if_all`, the bound if all unfinished cells went to one
         attractor that was not seen.
 
@@ -78,7 +78,7 @@ def basin_rows(
         inverse, weights=inferred.values.reshape(grid.shape)[point, cell], minlength=len(rows)
     ).astype(np.int64)
     found = xr.Dataset({name: (SET, values) for name, values in fractions.items()})
-    found["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
+    found["fraction"].attrs = {"long_name": "basin fraction of all cells", "units": "1"}
     sizes = np.bincount(point_of_row, minlength=len(grid)).astype(np.int32)
     found[ROW_SIZE] = (dims, sizes.reshape(shape), {"units": "1", "long_name": "number of outcomes"})
     found = found.assign(_of_points(dims, n_cells.reshape(shape), n_unfinished.reshape(shape), confidence))
@@ -99,18 +99,14 @@ def _with_intervals(
     method: Interval,
 ) -> dict[str, npt.NDArray[Any]]:
     """Compute from counts the fraction of each outcome, its interval, and its bounds due to unfinished cells."""
-    finished = cells - unknown
-    low, high = binomial_interval(count, finished, confidence=confidence, method=method)
-    low_if_none, _ = binomial_interval(count, cells, confidence=confidence, method=method)
+    low, high = binomial_interval(count, cells, confidence=confidence, method=method)
     _, high_if_all = binomial_interval(count + unknown, cells, confidence=confidence, method=method)
     return {
         "count": count,
-        "fraction": np.where(finished > 0, count / np.maximum(finished, 1), np.nan),
+        "fraction": count / cells,
         "low": low,
         "high": high,
-        "fraction_if_none": count / cells,
         "fraction_if_all": (count + unknown) / cells,
-        "low_if_none": low_if_none,
         "high_if_all": high_if_all,
     }
 

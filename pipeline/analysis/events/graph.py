@@ -44,8 +44,8 @@ def at_ends(
     Returns
     -------
     dict
-        ``stretch_side`` if the model has a classifier; ``stretch_fraction`` of the cells that end on attractors or
-        diverge, with its 95 % Wilson interval as in the analysis ``basins``. The fractions are NaN where the cells of a
+        ``stretch_side`` if the model has a classifier; ``stretch_fraction`` of all cells of the point,
+        with its 95 % Wilson interval as in the analysis ``basins``. The fractions are NaN where the cells of a
         parameter point are no independent starts.
     """
     dims, shape = ("stretch", "end"), (len(rows), 2)
@@ -56,7 +56,7 @@ def at_ends(
     count, total = np.zeros(shape), np.zeros(shape)
     for k, ends in enumerate(places):
         for end, (place, own) in enumerate(ends):
-            count[k, end], total[k, end] = np.isin(ids[place], own).sum(), (ids[place] != -1).sum()
+            count[k, end], total[k, end] = np.isin(ids[place], own).sum(), ids.shape[1]
     is_sweep = start_dims(ds) not in ([], ["branch"])
     for name, share in zip(("", "_low", "_high"), (count / total, *binomial_interval(count, total)), strict=True):
         about = {"units": "1", "long_name": "basin fraction" + name.replace("_", ", ")}

@@ -265,13 +265,12 @@ class _Result:
 
     def count(self, index: tuple[int, ...], labels: np.ndarray, weights: np.ndarray) -> None:
         """Fill in the shares of the cells that end on each attractor of a parameter point, plain and weighed."""
-        counted = labels != -1
-        total, squares = weights[counted].sum(), (weights[counted] ** 2).sum()
+        total, squares = weights.sum(), (weights**2).sum()
         # of weighed cells the share has the variance of as many independent cells (Kish, Survey Sampling, 1965)
         effective = total**2 / squares if squares > 0.0 else 0.0
         for own, row in self._attracting(index):
             here = labels == own
-            self._share("basin_stability", row, int(here.sum()), int(counted.sum()))
+            self._share("basin_stability", row, int(here.sum()), len(labels))
             share = min(weights[here].sum() / total, 1.0) if effective else 0.0
             self._share("weighted_stability", row, share * effective, effective)
             self._values["n_effective"][row] = effective
@@ -279,7 +278,7 @@ class _Result:
     def time(self, index: tuple[int, ...], found: Followed, weights: np.ndarray) -> None:
         """Fill in the arrival times of initial states, by attractor."""
         label, entered, put = found.label, found.entered, self._values
-        counted, total = int((label != -1).sum()), weights[label != -1].sum()
+        counted, total = len(label), weights.sum()
         for i in np.unique(label[label >= 0]).tolist():
             chosen, at = (label == i) & np.isfinite(entered), self._rows[index][i]
             own, weight = entered[chosen], weights[chosen]

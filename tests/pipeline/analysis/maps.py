@@ -37,7 +37,7 @@ class MapPoint:
     """Cells of a map in place of a parameter point."""
 
     can_rest, is_flow, n_neutral = False, False, 0
-    at_rest = on_cycle = None
+    at_rest = on_cycle = parameters = None
 
     def __init__(self, step, slope, starts, seen=N_KEEP):
         self.step, self.slope = step, slope
@@ -62,8 +62,12 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0, n_sample=32)
     n_states = point.section.shape[2]
     geometry = Geometry((False,) * n_states, (scale,) * n_states)
     settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry)
-    work = extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, n_sample)
-    answer = None
+    return drive(extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, n_sample), point)
+
+
+def drive(work, point):
+    """Answer the requests of a work by the map of its point; return its result."""
+    n_states, answer = point.section.shape[2], None
     while True:
         try:
             asked = work.send(answer)

@@ -3,12 +3,19 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import binomtest
 
+from pipeline.analysis.attractors.analysis import _others_lines
+from pipeline.analysis.attractors.attractors import _shares
+from pipeline.analysis.attractors.features import Features
 from pipeline.analysis.attractors.finding.points import PASSING
 from pipeline.analysis.attractors.hysteresis import find_hysteresis
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
+from pipeline.analysis.attractors.labelling import Found
+from pipeline.analysis.outcomes import share_interval, shares_of_others
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NO_RETURN, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.products.reporting import reporting
 from tests.pipeline.analysis.dense_sets import identify, match
+from tests.pipeline.plots.made_up import make_attractors
 
 from .cubes import STATES
 
@@ -337,3 +344,18 @@ def test_match__unlike_things_have_different_ids_however_near(periods, width, sa
     ds = ds.assign(kind=(dims, kinds), orbit_period=(dims, np.array(periods)[:, None]))
     ds["attractor_points"] = ((*dims, "point", "state"), points)
     assert match(ds).sizes["attractor"] == (1 if same else 2)
+
+
+def test_attractors_table__shares_are_of_all_cells():
+    """15 of 24 cells never cross the section: the attractor of the others has 9/24, the rest is named."""
+    ids = np.full((1, 24), -1)
+    ids[0, :9] = 0
+    status = np.where(ids >= 0, PERIODIC, NO_RETURN).astype(np.int8)
+    none = np.zeros(4)
+    one = Features(none[None], PERIODIC_ORBIT, 1, none[:2], 0, none, none, stability=ATTRACTS)
+    assert _shares(Found(ids[0], np.zeros(24), [one], [9])).tolist() == [9 / 24]
+    made = make_attractors(ids, ("frequency", "initial_condition"), {"frequency": [1.0]}, status=status)
+    assert {name: share.tolist() for name, share in shares_of_others(made).items()} == {"no return": [15 / 24]}
+    low, high = share_interval(np.array([9]), np.array([9 / 24]))
+    assert [low[0], high[0]] == pytest.approx([*binomtest(9, 24).proportion_ci(0.95, "wilson")])
+    assert _others_lines(made) == [["  on no attractor: 0.6250 (0.4271 to 0.7884) no return"]]

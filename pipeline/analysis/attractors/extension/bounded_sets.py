@@ -82,7 +82,7 @@ class BoundedSet:
 
     @classmethod
     def neutral(cls) -> BoundedSet:
-        """Return the set that holds all cells of a volume-preserving flow; its stability is neutral."""
+        """Return a set of a volume-preserving flow without its cells; its stability is neutral."""
         none = np.zeros(0, np.int64)
         evidence = stability.BY_VOLUME
         return cls(none, None, none, BOUNDED_SET, NEUTRAL, evidence, None, 0, 0, 0, 0.0, {})
@@ -227,18 +227,28 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
     n = min(n, most // n_cells)
     # use the last sections, when transients are over
     paths = np.stack([course.extension[-n:] for course in own[:n_cells]])
-    before, scales = paths[:, :-1].reshape(-1, n_states), np.asarray(settings.geometry.scales)
     for rtol in (ROUGH_SLOPE_RTOL, SLOPE_RTOL):
-        after, slopes = yield Slopes(before, rtol)
-        volumes = point.volumes(slopes, before, after).reshape(n_cells, n - 1)
-        derivatives = slopes.reshape(n_cells, n - 1, n_states, n_states)
+        derivatives, volumes = yield from slopes_along(paths, point, settings, rtol)
         whole = np.isfinite(derivatives).all(axis=(1, 2, 3))
         if not whole.any():
             return None
-        growth = growth_of(derivatives[whole] * scales / scales[:, None], point.n_neutral, volumes[whole])
+        growth = growth_of(derivatives[whole], point.n_neutral, volumes[whole])
         if growth.is_clear:
             break
     return growth
+
+
+def slopes_along(
+    paths: np.ndarray, point: Point, settings: Settings, rtol: float
+) -> Work[tuple[np.ndarray, np.ndarray]]:
+    """Compute the scaled derivatives of the section map along trajectories, shape (cell, section, state, state), and
+    the logarithms of its changes of volume (cell, section).
+    """
+    n_cells, n, n_states = paths.shape
+    before, scales = paths[:, :-1].reshape(-1, n_states), np.asarray(settings.geometry.scales)
+    after, slopes = yield Slopes(before, rtol)
+    volumes = point.volumes(slopes, before, after).reshape(n_cells, n - 1)
+    return (slopes * scales / scales[:, None]).reshape(n_cells, n - 1, n_states, n_states), volumes
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:

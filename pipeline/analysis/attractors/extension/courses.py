@@ -9,7 +9,7 @@ import numpy as np
 LEAST_SEEN = 8
 """Fewest section points on a set for a cell to count as having left it."""
 
-ON_SET, FAILED, DIVERGED, AT_REST = -1, -2, -3, -4
+ON_SET, FAILED, DIVERGED, GROWS, AT_REST = -1, -2, -3, -4, -5
 """Ends of extended cells other than orbits; `AT_REST` minus k is the equilibrium number k."""
 
 
@@ -25,6 +25,7 @@ class Course:
     step: float = 0.0
     legs: list[np.ndarray] = field(default_factory=list)  # sections of the extension, leg by leg
     end: int = ON_SET  # number of an orbit, or one of the codes above
+    seconds: float = 0.0  # time of the extension [s]; 0 if it is not known
     periods: float = 0.0  # drive periods or returns from its last kept section until it came near its end
     is_leaving: bool = False  # whether it was near its end from the start
     is_neighbour: bool = False  # whether it was drawn beside a cell, and is none itself

@@ -22,7 +22,8 @@ import numpy as np
 from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, is_one_torus, left_behind, were_on
 from pipeline.analysis.attractors.extension.clouds import group, members
-from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
+from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, GROWS, Course
+from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
@@ -109,12 +110,34 @@ def extend(
         yield from (work.run() if work.budget else work.conclude())
         loose = work.left_of(loose)
         n_sample *= 2
+    work.end_growing()
     if any(course.goes_on for course in work.courses):
         yield from work.conclude()
     work.add_transient()
     n_leaving = sum(course.is_leaving for course in work.courses)
     sets = [replace(one, n_leaving=n_leaving) for one in work.sets]
     return Outcome(work.orbits, work.courses, sets, work.spent, work.ran_out)
+
+
+def sample_cells(point: Point, loose: np.ndarray, n: int, settings: Settings, known: np.ndarray) -> list[Course]:
+    """Choose at most `n` of the cells `loose` to integrate further, none in a box of section points that is `known`."""
+    best: dict[int, tuple[int, Course]] = {}
+    is_loose = np.zeros(point.n_cells, bool)
+    is_loose[loose] = True
+    for block in point.blocks():
+        rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
+        keys = keys_of(block.section[rows], settings.closure, settings.geometry)
+        new = np.flatnonzero(~np.isin(keys, known))
+        rows, keys, marks = rows[new], keys[new], block.marks[rows[new]]
+        # the least hash of each box, and of these the least `n`
+        order = np.argsort(marks, kind="stable")
+        order = order[np.sort(np.unique(keys[order], return_index=True)[1])[:n]]
+        for row, key, mark in zip(rows[order], keys[order].tolist(), marks[order].tolist(), strict=True):
+            if key not in best or mark < best[key][0]:
+                step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
+                kept = block.section[row].copy()
+                best[key] = mark, Course(int(row) + block.cells.start, key, kept, kept[-1], step)
+    return [course for _, course in sorted(best.values(), key=lambda item: item[0])[:n]]
 
 
 class _Extension:
@@ -144,23 +167,7 @@ class _Extension:
         each box of section points.
         """
         known = np.array([course.key for course in self.courses], np.uint64)
-        best: dict[int, tuple[int, Course]] = {}
-        is_loose = np.zeros(self.point.n_cells, bool)
-        is_loose[loose] = True
-        for block in self.point.blocks():
-            rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
-            keys = keys_of(block.section[rows], self.settings.closure, self.geometry)
-            new = np.flatnonzero(~np.isin(keys, known))
-            rows, keys, marks = rows[new], keys[new], block.marks[rows[new]]
-            # the least hash of each box, and of these the least `n`
-            order = np.argsort(marks, kind="stable")
-            order = order[np.sort(np.unique(keys[order], return_index=True)[1])[:n]]
-            for row, key, mark in zip(rows[order], keys[order].tolist(), marks[order].tolist(), strict=True):
-                if key not in best or mark < best[key][0]:
-                    step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
-                    kept = block.section[row].copy()
-                    best[key] = mark, Course(int(row) + block.cells.start, key, kept, kept[-1], step)
-        return [course for _, course in sorted(best.values(), key=lambda item: item[0])[:n]]
+        return sample_cells(self.point, loose, n, self.settings, known)
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
         """Return the cells of `loose` whose end is still open: not integrated further, and on no set whose stability is
@@ -200,7 +207,7 @@ class _Extension:
             in_doubt = yield from self._extend_and_tell(target)
             if self.has_budget and self._draw_neighbours():
                 in_doubt = yield from self._extend_and_tell(target)
-            if not self.sets:
+            if not self.sets and not in_doubt:
                 return
             if not in_doubt and all(one.stability in (ATTRACTS, NEUTRAL) for one in self.sets):
                 self.ran_out = False  # the budget ended, but it was enough
@@ -261,10 +268,12 @@ class _Extension:
         """
         computed = (leg.status == Status.PERIODIC) | (leg.status == Status.BOUNDED)
         assert leg.step is not None
-        for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
-            course.state, course.step = state, float(step)
-            if ok:
-                course.legs.append(section)
+        seconds = np.zeros(len(going)) if leg.seconds is None else leg.seconds.sum(axis=1)
+        for i, course in enumerate(going):
+            course.state, course.step = leg.state[i], float(leg.step[i])
+            course.seconds += float(seconds[i])
+            if computed[i]:
+                course.legs.append(leg.section[i])
         for i in np.flatnonzero(~computed).tolist():
             self._fail(going[i], int(leg.status[i]))
         rows = np.flatnonzero(computed)
@@ -378,7 +387,12 @@ class _Extension:
         """Group the unfinished trajectories by set, and describe each set. Return whether any grouping or stability is
         still uncertain.
         """
-        going = [course for course in self.courses if course.goes_on]
+        on_sets = [course for course in self.courses if course.goes_on]
+        # what grows may still come to a set: its extension goes on
+        going = [course for course in on_sets if not self._grows(course)]
+        self._told, self.sets = self._lengths(), []
+        if not going:
+            return True
         cells = [course for course in going if not course.is_neighbour]
         has_stayed = bool(cells) and bool(cells[0].legs) and self._has_stayed(cells, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
@@ -386,7 +400,6 @@ class _Extension:
             [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
         ]
         gone = [] if has_stayed else [course for course in self.courses if course.has_left]
-        self._told = self._lengths()
         parts = self._with_those_left(groups, gone)
         sets = []
         for own, left in parts:
@@ -395,7 +408,18 @@ class _Extension:
                 one = replace(one, stability=NOT_SETTLED, evidence=stability.BY_NOTHING)
             sets.append(one)
         self.sets = yield from self._joined(sets, [own for own, _ in parts], has_stayed)
-        return not is_sure or any(one.stability == NOT_SETTLED for one in self.sets)
+        return len(going) < len(on_sets) or not is_sure or any(one.stability == NOT_SETTLED for one in self.sets)
+
+    def _grows(self, course: Course) -> bool:
+        return Escape.of(course.extension, self.geometry) is not None
+
+    def end_growing(self) -> None:
+        """Finish the trajectories that grow to the end of the extension."""
+        growing = [course for course in self.courses if course.goes_on and self._grows(course)]
+        for course in growing:
+            course.end, course.is_leaving = GROWS, True
+        if growing and all(one.stability in (ATTRACTS, NEUTRAL) for one in self.sets):
+            self.ran_out = False
 
     def _joined(self, sets: list[BoundedSet], owns: list[list[Course]], has_stayed: bool) -> Work[list[BoundedSet]]:
         """Join tori that are the same: each trajectory on a torus may fill only one curve of it."""

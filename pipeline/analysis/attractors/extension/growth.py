@@ -9,6 +9,8 @@ always 0.
   exp(`GROWN`). The second condition excludes a shear, in which distances grow linearly with time.
 * A *torus* has a largest exponent of 0 by weighted Birkhoff averages, which converge faster than any power
   there (Das, Saiki, Sander and Yorke, Nonlinearity 30, 4111, 2017), and a section on closed curves.
+* A trajectory *grows* if it goes ever farther from where it began, and no more slowly: it recurs nowhere, so there is
+  no set on which it stays, and the growth of small distances shows no chaos.
 * A flow *preserves volume* if the mean logarithm of the change of a volume is 0. Then nothing attracts.
 """
 
@@ -45,11 +47,40 @@ GONE = -660.0
 CLEAR = 1e-2
 """Smallest modulus of an exponent and of a change of volumes that an integration at a loose tolerance shows."""
 
+WINDOWS, KEEPS_ON, BEYOND = 8, 0.9, 2.0
+"""Windows of a trajectory that is tested for growth, the least ratio of its late to its early gains, and the factor by
+which it must pass the unit of distances and the size of its first window."""
+
 Rates = Callable[[np.ndarray], np.ndarray]
 
 LOST, LOST_ERROR = 1e-6, 1e-3
 """Largest mean change of a volume's logarithm [per section] that counts as 0; and the largest error at which
 an interval around 0 counts as 0."""
+
+
+@dataclass(frozen=True)
+class Escape:
+    """How a trajectory grows that recurs nowhere."""
+
+    factor: float  # its distance from where it began, in its last window over that in its first
+    rate: float  # relative growth of this distance at the end [per section]
+    length: int  # number of sections
+
+    @classmethod
+    def of(cls, path: np.ndarray, geometry: Geometry) -> Escape | None:
+        """Return how section points (n, state) grow; None if they do not, or come to lie no farther than others do."""
+        straight = ~np.asarray(geometry.is_angle)
+        if len(path) < 4 * WINDOWS or not straight.any():
+            return None
+        scaled = path[:, straight] / np.asarray(geometry.scales)[straight]
+        windows = np.array_split(scaled, WINDOWS)
+        size = np.array([np.abs(window - windows[0].mean(axis=0)).max() for window in windows])
+        gained, half = np.diff(size), WINDOWS // 2
+        keeps_on = gained.min() > 0.0 and gained[half:].mean() >= KEEPS_ON * gained[:half].mean()
+        if not keeps_on or size[-1] < BEYOND * max(1.0, size[0]):
+            return None
+        rate = float(np.log(size[-1] / size[-2])) / len(windows[-1])
+        return cls(float(size[-1] / max(size[0], 1e-300)), rate, len(path))
 
 
 @dataclass(frozen=True)
