@@ -204,7 +204,7 @@ def _sampled_turns(
     )
     widest = np.zeros(len(states))
     if turning.of_section:
-        return _section_turns(found.states), widest, found.status
+        return section_turns(found.states), widest, found.status
     moved = np.diff(turning.angles(found.states), axis=1)
     if _is_plane(turning):
         moved = _wrapped(moved).reshape(len(states), -1, 2)
@@ -216,7 +216,7 @@ def _is_plane(turning: TurningState) -> bool:
     return len(turning.states) == 2 and not turning.of_section
 
 
-def _section_turns(points: np.ndarray) -> np.ndarray:
+def section_turns(points: np.ndarray) -> np.ndarray:
     """Return the turns of section points (cell, period + 1, 2) about their mean, in each period."""
     around = points - points.mean(axis=1, keepdims=True)
     moved = np.diff(np.arctan2(-around[..., 1], around[..., 0]), axis=1)

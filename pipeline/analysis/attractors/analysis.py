@@ -81,11 +81,11 @@ def attractors_table(ds: xr.Dataset) -> Table:
         shown, more = _largest(rows)
         lines += [*summary(ds, shown, dims, _id_summary, "attractor_id"), *more]
     else:
-        others = _others_lines(ds)
+        rest = _others_lines(ds)
         for i, (_, where) in enumerate(points_of(ds, dims)):
             shown, more = _largest([row for row in rows if all(row[k] == v for k, v in where.items())])
             table = point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, unit))
-            lines += [*table, *more, *others[i]]
+            lines += [*table, *more, *rest[i]]
     return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
 
 

@@ -92,7 +92,8 @@ Each row lists a *set* on which cells end. Only a set with the stability ``attra
 the orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
 `equilibria`), 7 diverged when it was extended (no id), 8 grows to the end of its extension (no id;
 `growth.Escape`); `assigning.decide` has the criteria. A cell that is not bounded (diverged, step limit,
-pending, unreached, or without a return and yet not at rest) has the id -1 and its own `status`. A bounded cell that belongs to no set has the id -1 and `decision` 0: it is not settled.
+pending, unreached, or without a return and yet not at rest) has the id -1 and its own `status`. A bounded
+cell that belongs to no set has the id -1 and `decision` 0: it is not settled.
 
 A run with a loose `closure_tolerance` (above 1e-4, which makes the default `tolerance` of `identify` exceed
 1e-3) is short, and closure proves little: sections also recur

@@ -59,7 +59,7 @@ def pitchfork(computed):
 
 @pytest.mark.slow
 def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
-    """+-sqrt(r) with the multiplier exp(-2 r), half of the cells each; 0 with exp(r); all cells at r = 0."""
+    """+-sqrt(r) with the multiplier exp(-2 r), two of five cells each; 0 with exp(r); all cells at r = 0."""
     shown = attractors_table(derive(pitchfork, "attractors"))
     rows = shown.rows
     told = {(row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows}
@@ -72,7 +72,7 @@ def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     }
     assert [row["evidence"] for row in rows if row["r"] == 0.0] == ["approach"]
     fractions = [row["fraction"] for row in rows if row["r"] > 0.0 and row["stability"] == "attracts"]
-    assert fractions == [0.5] * 4
+    assert fractions == [2 / 5] * 4
     assert all(np.isnan(row["fraction"]) for row in rows if row["stability"] == "unstable")
     sweep = 1.0 / np.hypot(1.0, 2.0 * np.pi)  # amplitude of y' = -y + cos(2 pi t)
     for row in rows[-3:]:

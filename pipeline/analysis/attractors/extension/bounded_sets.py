@@ -26,6 +26,7 @@ from magpend_core.status import Status
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.extension.clouds import OTHER, Cloud, is_stationary, mixing, thinned
 from pipeline.analysis.attractors.extension.courses import Course
+from pipeline.analysis.attractors.extension.curves import Curve
 from pipeline.analysis.attractors.extension.growth import Growth, growth_of, kind_of
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.points import Point
@@ -79,6 +80,12 @@ class BoundedSet:
     ended: dict[int, int]  # numbers of cells that left it, by `Course.end`
     closes_above: int = 0  # period with which it may close, longer than the search allows; 0 if none is seen
     dimension: int = 0  # dimension of a torus; 0 of any other set
+    curve: Curve | None = None  # on which the section points of a torus of two frequencies lie; None if none is seen
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether volumes shrink, and small distances neither grow nor shrink beyond doubt: the set may be a torus."""
+        return self.growth is not None and self.growth.may_be_torus
 
     @classmethod
     def neutral(cls) -> BoundedSet:
@@ -118,6 +125,8 @@ def describe(
         if kind != BOUNDED_SET or growth.contracts or growth.preserves_volume:
             break
     verdict, evidence = _verdict(left, growth, has_stayed)
+    curve = _curve_of(paths, growth, settings)
+    kind = kind if curve is None else TORUS
     dimension = _dimension(growth, kind, point)
     in_phase, is_doubtful = None, growth is not None and growth.may_preserve_volume
     if verdict == ATTRACTS and _is_in_family(pooled, dimension, point, settings):
@@ -131,7 +140,7 @@ def describe(
         kind = TORUS
     elif in_phase is not None:
         kind, verdict, evidence = BOUNDED_SET, NEUTRAL, stability.BY_MULTIPLIERS
-    elif verdict == ATTRACTS and (is_doubtful or not _are_stationary(paths, settings)):
+    elif verdict == ATTRACTS and (is_doubtful or not (curve or _are_stationary(paths, settings))):
         verdict, evidence = NOT_SETTLED, stability.BY_NOTHING
     return BoundedSet(
         np.array([c.cell for c in own], np.int64),
@@ -148,7 +157,21 @@ def describe(
         ends_of(left),
         _closes_above(own, growth, settings),
         dimension if kind == TORUS else 0,
+        curve,
     )
+
+
+def _curve_of(paths: Sequence[np.ndarray], growth: Growth | None, settings: Settings) -> Curve | None:
+    """Return the closed curve on which all section points of a dissipative set lie; None if there is none."""
+    if growth is None or not growth.may_be_torus:
+        return None
+    curve = Curve.fitted(paths[0], settings.geometry)
+    return curve if curve is not None and all(curve.holds(path, settings.geometry) for path in paths) else None
+
+
+def lie_on(curve: Curve | None, own: Sequence[Course], geometry: Geometry) -> bool:
+    """Return whether the section points of trajectories lie on a curve, and run round it as the curve's own do."""
+    return curve is not None and all(curve.holds(course.stayed, geometry) for course in own)
 
 
 def _are_stationary(paths: Sequence[np.ndarray], settings: Settings) -> bool:

@@ -191,4 +191,4 @@ def _members(point: Point, cells: np.ndarray, clouds: Sequence[Cloud]) -> np.nda
     for block in point.blocks():
         rows = np.flatnonzero(block.is_bounded)
         on[rows + block.cells.start] = members(block.section[rows], clouds)
-    return on[cells]
+    return np.asarray(on[cells])

@@ -20,7 +20,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, is_one_torus, left_behind, were_on
+from pipeline.analysis.attractors.extension.bounded_sets import (
+    BoundedSet,
+    describe,
+    is_one_torus,
+    left_behind,
+    lie_on,
+    were_on,
+)
 from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, GROWS, Course
 from pipeline.analysis.attractors.extension.growth import Escape
@@ -138,6 +145,12 @@ def sample_cells(point: Point, loose: np.ndarray, n: int, settings: Settings, kn
                 kept = block.section[row].copy()
                 best[key] = mark, Course(int(row) + block.cells.start, key, kept, kept[-1], step)
     return [course for _, course in sorted(best.values(), key=lambda item: item[0])[:n]]
+
+
+def _has_no_shape(one: BoundedSet) -> bool:
+    """Return whether a set may be a part of a torus, on no closed curve that was seen."""
+    settled = one.dimension > 0 and one.stability == ATTRACTS
+    return one.is_regular and one.curve is None and not one.n_left and not settled
 
 
 class _Extension:
@@ -408,7 +421,9 @@ class _Extension:
                 one = replace(one, stability=NOT_SETTLED, evidence=stability.BY_NOTHING)
             sets.append(one)
         self.sets = yield from self._joined(sets, [own for own, _ in parts], has_stayed)
-        return len(going) < len(on_sets) or not is_sure or any(one.stability == NOT_SETTLED for one in self.sets)
+        is_sure |= all(one.curve is not None for one in self.sets)
+        in_doubt = any(one.stability == NOT_SETTLED or _has_no_shape(one) for one in self.sets)
+        return len(going) < len(on_sets) or not is_sure or in_doubt
 
     def _grows(self, course: Course) -> bool:
         return Escape.of(course.extension, self.geometry) is not None
@@ -422,20 +437,43 @@ class _Extension:
             self.ran_out = False
 
     def _joined(self, sets: list[BoundedSet], owns: list[list[Course]], has_stayed: bool) -> Work[list[BoundedSet]]:
-        """Join tori that are the same: each trajectory on a torus may fill only one curve of it."""
-        k = 0
+        """Join tori that are the same: each trajectory on a torus may fill only a part of it."""
+        n_own, k = [len(own) for own in owns], 0
         while k < len(sets):
             for i in range(k):
-                attract = sets[i].stability == sets[k].stability == ATTRACTS
-                alike = sets[i].dimension == sets[k].dimension >= 2
-                if attract and alike and (yield from is_one_torus(owns[i][0], owns[k][0], self.geometry)):
+                if (yield from self._are_one_torus(sets[i], sets[k], owns[i], owns[k])):
                     owns[i] += owns.pop(k)
-                    sets.pop(k)
-                    sets[i] = yield from describe(owns[i], [], self.point, self.settings, has_stayed)
+                    sets.pop(k), n_own.pop(k)
                     break
             else:
                 k += 1
-        return sets
+        for i, n in enumerate(n_own):
+            if len(owns[i]) > n:
+                sets[i] = yield from describe(owns[i], [], self.point, self.settings, has_stayed)
+        return (yield from self._with_one_unsettled(sets, owns, has_stayed))
+
+    def _are_one_torus(
+        self, a: BoundedSet, b: BoundedSet, on_a: Sequence[Course], on_b: Sequence[Course]
+    ) -> Work[bool]:
+        """Return whether two sets are one torus, by their curve or by the states between them."""
+        if a.n_left or b.n_left:
+            return False
+        if a.is_regular and b.is_regular and (a.curve or b.curve):
+            return lie_on(a.curve, on_b, self.geometry) or lie_on(b.curve, on_a, self.geometry)
+        alike = a.dimension == b.dimension >= 2 and a.stability == b.stability == ATTRACTS
+        return alike and (yield from is_one_torus(on_a[0], on_b[0], self.geometry))
+
+    def _with_one_unsettled(
+        self, sets: list[BoundedSet], owns: list[list[Course]], has_stayed: bool
+    ) -> Work[list[BoundedSet]]:
+        """Join what may be parts of tori, and is not known apart, to one set that is not settled."""
+        parts = [k for k, one in enumerate(sets) if _has_no_shape(one)]
+        if len(parts) < 2:
+            return sets
+        own = [course for k in parts for course in owns[k]]
+        one = yield from describe(own, [], self.point, self.settings, has_stayed)
+        one = replace(one, stability=NOT_SETTLED, evidence=stability.BY_NOTHING)
+        return [one, *(other for k, other in enumerate(sets) if k not in parts)]
 
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]

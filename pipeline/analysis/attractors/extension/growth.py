@@ -127,6 +127,11 @@ class Growth:
         return bool(abs(self.weighted) <= ZERO and self.weighted_error <= 3.0 * ZERO)
 
     @property
+    def may_be_torus(self) -> bool:
+        """Whether volumes shrink, and small distances neither grow nor shrink beyond doubt."""
+        return not (self.is_chaotic or self.contracts or self.may_preserve_volume)
+
+    @property
     def may_preserve_volume(self) -> bool:
         """Whether no change of volumes is seen beyond doubt, so that the set need not attract."""
         return bool(abs(self.volume) <= N_SIGMA * self.volume_error)
