@@ -29,7 +29,10 @@ STEP = 1e-3
 """Step of the finite differences of an impact map, in units of the states' scales."""
 
 NEAR = 1e-12
-"""After an impact, an event function closer to zero than this (times rate and period) counts as zero."""
+"""An instant is resolved to this [steps that error control allows]: surfaces that are reached within it coincide."""
+
+GRAIN = 1e-14
+"""Relative rounding error of the terms of an event function."""
 
 AWAY = 1e-7
 """After a forcing edge, a switch further from zero than this (times rate and period) has left its surface."""
@@ -411,20 +414,109 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
         if HAS_DIVERGENCE:
             volume = log_volume(w, base + ROWS.slopes + lane)
             w[base + ROWS.state + (N - 1) * WIDTH + lane] += volume
-    # after the impact the state is on the side from which it came, unless the map puts it beyond the surface
-    side = -w[base + ROWS.side + event * WIDTH + lane]
-    moved = side * lane_pairs(w, base, lane, ZEROS)[2 * event]
-    bound = 4.0 * abs(value) + NEAR * abs(rate) * w[base + ROWS.period + lane]
-    for i in range(N_SWITCHES, N_EVENTS):
-        w[base + ROWS.side + i * WIDTH + lane] = 0.0
-    w[base + ROWS.side + event * WIDTH + lane] = -side if moved < -bound else side
     if HAS_CONTACTS:
         seat_contacts(w, base, lane, False)
-    if moved >= -bound and is_chatter(w, base, lane, k, DIRECTIONS[event] * rate):
+    now = lane_pairs(w, base, lane, ZEROS)[2 * event]
+    beyond = DIRECTIONS[event] * now > 4.0 * abs(value) + blur_of(w, base, lane, event, now, rate)
+    if not beyond and is_chatter(w, base, lane, k, DIRECTIONS[event] * rate):
         if STICKS[k] > 0:
             rest_on(w, base, lane, k)
         else:
             w[base + ROWS.event + lane] = CHATTERED
+
+
+def blur_of(w: Any, base: int, lane: int, event: int, value: float, rate: float) -> float:
+    """Return the size up to which the value of an event function may be rounding, at an instant at which its rate is
+    `rate`. Of a value that is larger in any case, return a lower bound.
+    """
+    blur = NEAR * abs(rate) * w[base + ROWS.wish + lane]
+    if abs(value) <= blur:
+        return blur
+    for i in range(N_BASE):
+        # the row is free between steps: a vector with the state number i alone
+        for j in range(N_BASE):
+            own = w[base + ROWS.state + i * WIDTH + lane] if j == i else 0.0
+            w[base + ROWS.trial + j * WIDTH + lane] = own
+        blur += GRAIN * abs(gradient_along(w, base, lane, event, lane_base(w, base + ROWS.trial + lane)))
+    return blur
+
+
+def rests(w: Any, base: int, lane: int, k: int) -> bool:
+    """Return whether the state rests on the surface of impact `k`."""
+    return HAS_CONTACTS and STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0
+
+
+def gather_impacts(w: Any, base: int, lane: int) -> bool:
+    """Return whether an impact happens at the end of the last step.
+
+    Surfaces that the state reaches at the same instant, up to rounding, and the section then count as reached, too:
+    which of them a step passes first is rounding.
+    """
+    hit, reached = False, False
+    for event in range(N_SWITCHES, N_EVENTS):
+        if w[base + ROWS.fired + event * WIDTH + lane] > 0.5:
+            reached = True
+            hit = hit or event < N_SWITCHES + N_IMPACTS
+    if not reached or N_EVENTS - N_SWITCHES == 1:
+        return hit
+    pairs = lane_pairs(w, base, lane, lane_rates(w, base, lane))
+    for event in range(N_SWITCHES, N_EVENTS):
+        armed = DIRECTIONS[event] * w[base + ROWS.side + event * WIDTH + lane] < 0.0
+        is_impact = event < N_SWITCHES + N_IMPACTS
+        value, rate = pairs[2 * event], pairs[2 * event + 1]
+        if not armed or DIRECTIONS[event] * rate <= 0.0 or (is_impact and rests(w, base, lane, event - N_SWITCHES)):
+            continue
+        if abs(value) <= blur_of(w, base, lane, event, value, rate):
+            w[base + ROWS.fired + event * WIDTH + lane] = 1.0
+            hit = hit or is_impact
+    return hit
+
+
+def strike(w: Any, base: int, lane: int) -> None:
+    """Carry out the impacts of an instant, in the order of the model; then arm their surfaces."""
+    before = lane_pairs(w, base, lane, lane_rates(w, base, lane))
+    jumped = False
+    for k in range(N_IMPACTS):
+        if w[base + ROWS.fired + (N_SWITCHES + k) * WIDTH + lane] > 0.5:
+            if rests(w, base, lane, k):
+                # a resting state lifts off: neither states nor rates jump
+                w[contact_row(base, lane, k)] = 1.0
+                w[base + ROWS.side + (N_SWITCHES + k) * WIDTH + lane] = STARTS[N_SWITCHES + k]
+            else:
+                jump(w, base, lane, k)
+                jumped = True
+    if jumped:
+        arm(w, base, lane, before)
+
+
+def arm(w: Any, base: int, lane: int, before: Any) -> None:
+    """Set after impacts on which side of each surface the state is. On a surface its side is the one to which the
+    rates carry it.
+
+    A surface that the state leaves beyond is not armed, so that its impact happens once at each passage.
+
+    Parameters
+    ----------
+    before
+        Values and rates of all event functions before the impacts.
+    """
+    after = lane_pairs(w, base, lane, lane_rates(w, base, lane))
+    for k in range(N_IMPACTS):
+        event = N_SWITCHES + k
+        if rests(w, base, lane, k):
+            continue
+        value, rate = after[2 * event], after[2 * event + 1]
+        fired = w[base + ROWS.fired + event * WIDTH + lane]
+        room = 4.0 * fired * abs(before[2 * event])
+        side = 1.0 if value > 0.0 else -1.0
+        if abs(value) <= room or abs(value) <= room + blur_of(w, base, lane, event, value, before[2 * event + 1]):
+            unclear = ELASTIC * max(abs(before[2 * event + 1]), abs(rate))
+            onward = DIRECTIONS[event] * rate
+            returns = onward < -unclear or (onward <= unclear and DIRECTIONS[event] * bend(w, base, lane, event) < 0.0)
+            side = STARTS[event] if returns else -STARTS[event]
+        w[base + ROWS.side + event * WIDTH + lane] = side
+    if HAS_SECTION:
+        w[base + ROWS.side + (N_EVENTS - 1) * WIDTH + lane] = 0.0
 
 
 def act_on_events(w: Any, base: int, lane: int) -> bool:
@@ -432,6 +524,7 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
     section.
     """
     on_section = False
+    hit = gather_impacts(w, base, lane) if HAS_IMPACTS else False
     if HAS_SECTION:
         on_section = section_counts(w, base, lane)
     fired = base + ROWS.fired + lane
@@ -440,22 +533,15 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
             if w[fired + k * WIDTH] > 0.5:
                 turn_switch(w, base, lane, k)
                 w[base + ROWS.fresh + lane] = 1.0
-    if HAS_IMPACTS:
-        for k in range(N_IMPACTS):
-            if w[fired + (N_SWITCHES + k) * WIDTH] > 0.5:
-                if HAS_CONTACTS and STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
-                    # a resting state lifts off: neither states nor rates jump
-                    w[contact_row(base, lane, k)] = 1.0
-                    w[base + ROWS.side + (N_SWITCHES + k) * WIDTH + lane] = STARTS[N_SWITCHES + k]
-                else:
-                    jump(w, base, lane, k)
-                w[base + ROWS.fresh + lane] = 1.0
+    if hit:
+        strike(w, base, lane)
+        w[base + ROWS.fresh + lane] = 1.0
     for k in range(N_EVENTS):
         w[fired + k * WIDTH] = 0.0
     return on_section
 
 
-INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row", "contact_row")
+INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row", "contact_row", "rests")
 """Templates of this module that are inlined into their callers. Callees come first; `CALLED` follows after them."""
 
 CALLED = (
@@ -474,7 +560,11 @@ CALLED = (
     "begin_events",
     "turn_switch",
     "jump_vectors",
+    "blur_of",
     "jump",
+    "gather_impacts",
+    "arm",
+    "strike",
     "act_on_events",
 )
 """Templates of this module that are compiled as functions of their own."""
