@@ -12,6 +12,9 @@ ENGINE = 1
 TEXT = 1
 """Number of the translation of text models into functions for the engine."""
 
+IMPACTS = 2
+"""Number of the results of text models with impacts. Since 2 an impact that a trajectory passes happens once."""
+
 DRIFT = 1
 """Number of the motion of parameters."""
 

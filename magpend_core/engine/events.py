@@ -12,7 +12,8 @@ at the ends allow this, the next attempt ends at the minimum of the cubic. But a
 the states: a ball flies along a parabola, which a step of any length follows, above a table that shakes. So the
 value in the middle of an attempt is compared with the cubic there. Where the difference is so large that two
 zeros may be hidden, the attempt is repeated with half the step. The check misses two zeros only if the
-excursion beyond zero is shorter than a step and does not include the step's middle.
+excursion beyond zero is shorter than a step and does not include the step's middle. A step turns the angle of a
+section by half a turn at most, whatever length the error control allows.
 
 Each event function has a stored sign, its *side*: +1 or -1 as of the last step, reversed where a step ends
 beyond zero. Right after an event the side, not the computed value (which is zero up to rounding), says where
@@ -46,7 +47,7 @@ from magpend_core.engine.simd import (
     where_less,
 )
 from magpend_core.engine.system import System
-from magpend_core.engine.vecmath import cos, sincos
+from magpend_core.engine.vecmath import TWO_PI, cos, sincos
 
 NARROW = 2e-15
 """Resolution of an event's instant, in units of the attempt that first passed it."""
@@ -130,6 +131,7 @@ def event_bindings(system: System) -> dict[str, Any]:
         "event_values": _events_of(system),
         "middle_of": _middle_of(system.known),
         "HAS_SURFACES": system.n_switches + system.n_impacts > 0,
+        "SECTION_TURNS": system.section is not None and system.is_angle[of],
     }
 
 
@@ -224,6 +226,13 @@ def hides_events(w: Any, base: int) -> Any:
         may = where_less(b, 0.0, 0.0, fires(w, base, k))
         hides = maximum(hides, where_less(least, off + off, where_less(size, off, may, 0.0), 0.0))
     return where_less(RESOLVED * load(w, base + ROWS.period), h, hides, 0.0)
+
+
+def turns_too_far(w: Any, base: int) -> Any:
+    """Return 1 where the angle of the section turns by more than half a turn within a step, which hides crossings."""
+    row = base + SECTION_OF * WIDTH
+    turn = absolute(load(w, row + ROWS.trial) - load(w, row + ROWS.state))
+    return where_less(0.5 * TWO_PI, turn, 1.0, 0.0)
 
 
 def judge_events(w: Any, base: int, failed: Any) -> Any:
@@ -345,5 +354,5 @@ def section_counts(w: Any, base: int, lane: int) -> bool:
 INLINE = ("cubic_dip", "may_dip", "cubic_root", "margin", "pair", "fires", "section_counts")
 """Templates of this module that are inlined into their callers. Callees come first; `CALLED` follows after them."""
 
-CALLED = ("turn_sides", "aim", "settle_events", "hides_events", "judge_events")
+CALLED = ("turn_sides", "aim", "settle_events", "hides_events", "turns_too_far", "judge_events")
 """Templates of this module that are compiled as functions of their own."""

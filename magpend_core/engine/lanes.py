@@ -370,6 +370,10 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
             hides = hides_events(w, base)
             next_wish = where_less(0.5, hides, minimum(next_wish, 0.5 * h), next_wish)
             rejected = maximum(rejected, hides)
+        if SECTION_TURNS:
+            far = turns_too_far(w, base)
+            next_wish = where_less(0.5, far, minimum(next_wish, 0.5 * h), next_wish)
+            rejected = maximum(rejected, far)
         verdict = judge_events(w, base, rejected)
         taken_back = where_less(absolute(verdict - TAKE_BACK), 0.5, 1.0, 0.0)
         # the length of an attempt that ends at an event does not tell which length error control allows

@@ -15,7 +15,7 @@ from magpend_core.models.text.derive import Derived, derive
 from magpend_core.models.text.generate import Source, source_of
 from magpend_core.models.text.graph import GraphError
 from magpend_core.models.text.scene import classifier_of, drawing_of
-from magpend_core.versions import TEXT, written
+from magpend_core.versions import IMPACTS, TEXT, written
 
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
@@ -79,7 +79,8 @@ class TextModel(Model):
         engine.
         """
         # the source, too: what is found at the default parameters, edges say, is in it
-        parts = written("text", TEXT), self.definition.meaning(), self.source.text
+        numbers = [written("text", TEXT)] + [f"impacts {IMPACTS}"] * bool(self.definition.impacts)
+        parts = (*numbers, self.definition.meaning(), self.source.text)
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
     @cached_property

@@ -122,6 +122,15 @@ def test_section__of_an_angle_is_crossed_modulo_a_turn_and_one_way():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("speed", [1e3, 1e5, 1e7])
+def test_section__of_an_angle_sees_each_turn_where_steps_could_be_longer(speed):
+    # so fast that the weight changes less than the tolerance: nothing else bounds the steps
+    section = Crossing("th", 1.0, "up", 1.0)
+    found = returns(ROTOR, [0.0, 0.0], [0.5, speed], section, n_transient=20, n_keep=40, rtol=1e-5)
+    assert found.return_time == pytest.approx(2.0 * math.pi / speed, rel=1e-4)
+
+
+@pytest.mark.slow
 def test_section__counts_a_pair_within_a_step_and_not_the_crossing_at_the_start():
     # x = cos t, v = -sin t falls through v = 0 at the start and a period later
     section = Crossing("v", 0.0, "down")
