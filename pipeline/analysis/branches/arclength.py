@@ -116,13 +116,22 @@ Stop = Callable[[list[Point]], str]
 """A check of the points so far; it returns the reason to end the trace, or an empty text."""
 
 
+Across = Callable[[Point], "Steps[tuple[Point, Point] | None]"]
+"""A way on where no step is short enough: the last point in other unknowns and the next point, or None."""
+
+
 def trace(
-    problem: Problem, start: Point, settings: Settings, stop: Stop | None = None, between: Between | None = None
+    problem: Problem,
+    start: Point,
+    settings: Settings,
+    stop: Stop | None = None,
+    between: Between | None = None,
+    across: Across | None = None,
 ) -> Steps[Trace]:
     """Follow a solution curve from a start point along its tangent.
 
     `between` may refuse a step, which is then tried with half the length; `stop` is asked after every
-    point. The start is the first of the points.
+    point, but not where the unknowns jump (`across`). The start is the first of the points.
     """
     found = Trace([start])
     step = settings.first_step
@@ -133,9 +142,14 @@ def trace(
         is_near = there is not None and _is_near(here, there, step, settings)
         if there is None or not is_near or (between and not (yield from between(here, there))):
             step *= 0.5
-            if step < settings.shortest_step:
+            if step >= settings.shortest_step:
+                continue
+            pair = (yield from across(here)) if across else None
+            if pair is None or (between and not (yield from between(*pair))):
                 found.end = "stuck"
                 return found
+            found.points.append(pair[1])
+            step = settings.first_step
             continue
         found.points.append(there)
         found.end = stop(found.points) if stop else ""

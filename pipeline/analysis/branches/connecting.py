@@ -25,6 +25,7 @@ from scipy.sparse import csr_array
 
 from magpend_core.ordering import canonical_order
 from pipeline.analysis.branches.sheets import ENDED, GOING, LONGEST, NEAR, OPEN, UNTRIED, Array, Grid, Orbits, Values
+from pipeline.analysis.branches.strobe import other_side
 from pipeline.analysis.tolerances import SAME_CONNECTED
 from pipeline.products.reporting import report
 
@@ -297,11 +298,30 @@ class _Flood(Orbits):
         beyond = np.minimum(beyond, np.abs(w["end"] - w["u"]))
         w["limit"][halves] = (w["u"] + w["way"] * beyond)[halves]
         w["stage"][halves], w["tries"][halves] = _HALVE, 0
-        ends = (stuck & ~halves) | lost
+        ends = ((stuck & ~halves) | lost) & ~self._beyond_strobe(w, first & w["has_moved"] & ~fold & ~halves, tried)
         self._mark(w[ends & w["is_fold"]], ENDED)
         self._mark(w[ends & ~w["is_fold"]], OPEN)
         self.walk = w[~ends & ~arrived]
         self._add(w[arrived], v, np.flatnonzero(arrived))
+
+    def _beyond_strobe(self, w: Any, stuck: Array, tried: Array) -> Array:
+        """Let orbits go on beyond an impact that coincides with the strobe; return which do."""
+        passes = np.zeros(len(w), bool)
+        for row in np.flatnonzero(stuck & (2.0 * tried < np.abs(w["end"] - w["u"]))):
+            one, states = w[row : row + 1], []
+            for move in one["way"] * tried[row] * np.array([[0.0], [-1.0]]):
+                place, u = self.nodes["place"][one["origin"]], one["u"] + move
+                packed, frequency = self.grid.parameters(place, one["axis"], u)
+                here = (one["z"] + one["slope"] * move)[0] * self.scales
+                states.append(other_side(self.grid.system, here, packed[0], float(frequency[0]), int(one["period"][0])))
+            if states[0] is None or states[1] is None:
+                continue
+            passes[row] = True
+            one["z"] = states[0] / self.scales + 2.0 * self._difference(states[0], states[1])
+            one["u"] += 2.0 * tried[row] * one["way"]
+            one["h"], one["stage"], one["tries"] = 4.0 * one["shortest"], _SETTLE, 0
+            one["has_moved"], one["is_ending"], one["is_rough"] = False, False, True
+        return passes
 
     def _add(self, w: Any, v: Values, rows: Array) -> None:
         """Add the orbits that arrived, unless they are known, and link them with those from which they came."""

@@ -14,6 +14,7 @@ from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstab
 from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem, Problem
+from pipeline.analysis.branches.strobe import other_side
 
 ENDS = (
     *("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section"),
@@ -31,6 +32,9 @@ that crosses]."""
 CROSSING_STEPS, NEAR_CROSSING = (1.0, 5.0, 25.0, 0.2, 0.04, 0.008), 5.0
 """First steps from a branch point onto its second branch, in units of `first_step`, tried in turn, and the largest
 distance of the first orbit from the point, in units of the step."""
+
+ACROSS = 100.0
+"""Step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step."""
 
 REST = 0.5
 """At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""
@@ -192,7 +196,10 @@ def half_branch(
     """
     problem = problem_of(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
-    found = yield from trace(problem, start, settings, _Stop(family, low, high, settings.beyond), watch.between)
+    stop = _Stop(family, low, high, settings.beyond)
+    found = yield from trace(
+        problem, start, settings, stop, watch.between, lambda here: beyond_strobe(problem, here, settings)
+    )
     n_last = len(found.points) - 2
     if found.end == "bound":
         yield from _cut(problem, found, low, high, settings)
@@ -209,6 +216,33 @@ def half_branch(
         # the last step repeats the first one
         watch.found = [b for b in watch.found if b.after < n_last or not _is_known(b, watch.found)]
     return Half(found, watch.found)
+
+
+def beyond_strobe(problem: OneParameter, here: Point, settings: Settings) -> Steps[tuple[Point, Point] | None]:
+    """Return the last point of a branch and the next one, both on the other side of an impact that coincides with the
+    strobe; None if there is no such impact.
+    """
+    behind = here.u - ACROSS * settings.shortest_step * here.tangent
+    beyond = [_other_unknowns(problem.family, u) for u in (here.u, behind)]
+    if beyond[0] is None or beyond[1] is None:
+        return None
+    along = beyond[0] - beyond[1]
+    # the instant of the impact must be passed, by as short a step as can be
+    for longer in range(1, round(settings.first_step / np.linalg.norm(along)) + 1):
+        guess = beyond[0] + longer * along
+        found = yield from correct(problem, guess, along / np.linalg.norm(along), settings)
+        if found is not None and np.linalg.norm(found.u - guess) < 0.5 * longer * np.linalg.norm(along):
+            return Point(beyond[0], here.tangent, here.value, 0), found
+    return None
+
+
+def _other_unknowns(family: Family, u: np.ndarray) -> np.ndarray | None:
+    """Return the unknowns of an orbit with its section point on the other side of an impact at the strobe."""
+    if not family.period:
+        return None
+    rows = family.rows(u[None])
+    state = other_side(family.system, rows.states[0], rows.parameters[0], float(rows.frequency_hz[0]), family.period)
+    return None if state is None else family.unknowns(state, family.values(u))
 
 
 def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
