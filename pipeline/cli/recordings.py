@@ -71,9 +71,7 @@ def spectrum(
     taper: Annotated[str, typer.Option(help="Window of each segment, by its name in scipy.signal.")] = "hann",
     nperseg: Annotated[
         int | None,
-        typer.Option(
-            min=4, help="Samples of a segment; by default a sixteenth of all, and more for a slow motion."
-        ),
+        typer.Option(min=4, help="Samples of a segment; by default a sixteenth of all, and more for a slow motion."),
     ] = None,
     scaling: Annotated[
         Literal["density", "spectrum"], typer.Option(help="Power per hertz, or power; as in scipy.signal.welch.")

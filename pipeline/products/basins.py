@@ -36,7 +36,6 @@ BASINS = Analysis(
     needs=f"{_ROOM}:needs_starts",
     builds_on=("attractors",),
     figure="basins",
-    version=2,
     by_point=True,
-    version=2,
+    version=3,
 )

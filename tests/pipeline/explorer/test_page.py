@@ -83,7 +83,7 @@ def test_broken_lines__draw_nothing_across_the_circle():
 def test_holding__a_diagram_shows_all_of_its_branches_and_marks():
     """Points in [0, 1] x [-1, 1]; a branch up to y = 3, x = 1.2; a mark at x = -1. A null is a gap."""
     segments = json.dumps([{"x": [0.2, 1.5], "y": [0, None]}, {"x": [0.5, 1.2], "y": [3, 0.5]}])
-    found = f'{{ branches: [{{ segments: {segments} }}], points: [{{ x: -1, y: [0.2] }}] }}'
+    found = f"{{ branches: [{{ segments: {segments} }}], points: [{{ x: -1, y: [0.2] }}] }}"
     low, high, bottom, top = evaluated("branches.js", f"m.holding([0, 1, -1, 1], {found})")
     assert -1.1 < low < -1.0
     assert 1.2 < high < 1.3
