@@ -102,7 +102,7 @@ GREYS = {
     "on an unstable orbit or equilibrium": "#6b5d4f",
     "on a neutral set": "#acbfd2",
     "diverged": "0.0",
-    "growing": "#2f2a26",
+    "growing": "#ccb3a0",
     "failed": "0.45",
     "no return": "0.17",
     "chatter": "#320836",
@@ -110,7 +110,7 @@ GREYS = {
 }
 """Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`.
 
-Two are tinted: between twelve colours there are not eight greys that can be told apart.
+Three are tinted: between twelve colours there are not ten greys that can be told apart.
 """
 
 SETS = {

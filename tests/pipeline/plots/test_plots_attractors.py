@@ -384,12 +384,14 @@ def test_plot_gallery__orbits_and_paths_of_the_largest_shares():
 def test_greys__every_cell_without_an_attractor_has_one():
     """Whatever became of a cell, and on whatever set that does not attract it is."""
     assert all(getattr(vocabulary, status.name) == status for status in Status)
-    status = np.array([*Status, PERIODIC, PERIODIC, BOUNDED, BOUNDED], np.int8)
-    ids = np.array([*np.full(len(Status), -1), 0, 1, 2, 3], np.int32)
+    status = np.array([*Status, PERIODIC, PERIODIC, BOUNDED, BOUNDED, BOUNDED], np.int8)
+    ids = np.array([*np.full(len(Status), -1), 0, 1, 2, 3, -1], np.int32)
     ds = make_attractors(ids, ("initial_condition",), status=status)
     ds["stability"][:] = [vocabulary.NOT_SETTLED, vocabulary.TRANSIENT, vocabulary.UNSTABLE, vocabulary.NEUTRAL]
+    ds["decision"][-1] = vocabulary.GROWS
     found = palette.other_cells(ds)
     assert found.keys() == palette.GREYS.keys()
+    assert found["growing"].tolist() == [False] * (len(ids) - 1) + [True]
     assert np.sum(list(found.values()), axis=0).tolist() == [1] * len(ids)
     for code, name in {
         Status.DIVERGED: "diverged",
