@@ -89,11 +89,11 @@ def share(run: Callable[[np.ndarray, int], None], n_rows: int, n_lanes: int) -> 
         return
     n_lanes = min(n_lanes, WIDTH * max(n_groups // (2 * n_threads), 1))
     helpers = []
-    for _ in range(n_threads - 1):
-        context = copy_context()  # with the listeners to progress and compilation
-        context.run(_number.set, 1)
-        helpers.append(_pool(number_of_threads()).submit(context.run, run, queue, n_lanes))
     try:
+        for _ in range(n_threads - 1):
+            context = copy_context()  # with the listeners to progress and compilation
+            context.run(_number.set, 1)
+            helpers.append(_pool(number_of_threads()).submit(context.run, run, queue, n_lanes))
         run(queue, n_lanes)
         # a helper that has not begun is not needed any more
         for helper in helpers:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.model import Mirror, Model, Preset, Quantity, State
-from magpend_core.models.parameters import BOUNDS, Parameter, ParameterError
+from magpend_core.models.parameters import BOUNDS, Parameter, ParameterError, has_controls
 
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
@@ -206,6 +206,7 @@ def _outer_problems(table: Mapping[str, Any]) -> list[str]:
     known = (KEY, *_TEXTS, *_TABLES, "autonomous", "is_map", "mirror")
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]
+    problems += [f"{key}: has control characters." for key in _TEXTS if has_controls(str(table.get(key)))]
     problems += [
         f"{key}: must be a table."
         for key in _TABLES

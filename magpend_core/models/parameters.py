@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from unicodedata import category
 
 import numpy as np
 
@@ -77,6 +78,13 @@ class Parameter:
         if not BOUNDS[self.bound](float(value)):
             return f"{self.name} = {reprlib.repr(value)} is out of bounds: it must be {self.bound}."
         return None
+
+
+def has_controls(text: str) -> bool:
+    """Return whether a text has characters that control a terminal or belong in no file; spaces and line breaks do not
+    count.
+    """
+    return not all(c.isprintable() or c in "\n\t" or category(c) == "Zs" for c in text)
 
 
 def near_names(name: str, known: Iterable[str], what: str) -> str:

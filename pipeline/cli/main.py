@@ -116,7 +116,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
 
 
 def _complain(error: BaseException) -> None:
-    lines: list[Any] = getattr(error, "problems", None) or [str(error)]
+    lines: list[Any] = getattr(error, "problems", None) or [_shortage(error) or str(error)]
     head = "magpend: " if len(lines) == 1 else f"magpend: {len(lines)} problems\n  "
     text = _short(head + "\n  ".join(map(str, lines)))
     if LOG.handlers:
@@ -186,7 +186,19 @@ def _leave_quietly() -> None:
 def _exit_code(error: Exception) -> Exit:
     if isinstance(error, stopping.InterruptedRunError):
         return Exit(128 + error.signal_number)
+    if _shortage(error):
+        return Exit.FAILED
     return next((code for kinds, code in _codes() if isinstance(error, kinds)), Exit.BUG)
+
+
+def _shortage(error: BaseException) -> str:
+    """Return a sentence about an error that says that the system has no more memory or threads; else an empty text."""
+    text = " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return f"memory ran out{f' ({text})' if text else ''}. Free some, or raise its limit (ulimit -v)."
+    if isinstance(error, RuntimeError) and "can't start new thread" in text:
+        return f"{text}: raise the limits on processes and memory (ulimit -u, -v)."
+    return ""
 
 
 if __name__ == "__main__":

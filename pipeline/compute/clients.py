@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import platform
 import re
@@ -248,6 +249,7 @@ def connected(where: Where, echo: Echo = print) -> Iterator[Any]:
 
     target = where.resolved()
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_without_tracebacks())
         stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}))
         if isinstance(target, Address):
             ask(target)
@@ -263,6 +265,18 @@ def connected(where: Where, echo: Echo = print) -> Iterator[Any]:
             echo(f"dashboard: {client.dashboard_link}")
         _check(client, where.place)
         yield client
+
+
+@contextlib.contextmanager
+def _without_tracebacks() -> Iterator[None]:
+    """Keep dask's client from logging; what it logs of a lost scheduler also comes as an error of ours."""
+    logger = logging.getLogger("distributed.client")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _client(scheduler: Any, security: Any) -> Any:

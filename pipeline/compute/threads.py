@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Collection, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextvars import ContextVar
 from functools import partial
 from multiprocessing.pool import ThreadPool
@@ -20,6 +20,7 @@ from typing import Any
 
 from dask.threaded import get
 
+from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
 
 Task = Callable[[int], dict[str, Any]]
@@ -68,6 +69,20 @@ def writing_results() -> contextlib.AbstractContextManager[None]:
     return _gate.get() or contextlib.nullcontext()
 
 
+@contextlib.contextmanager
+def starting(n_threads: int) -> Iterator[None]:
+    """Turn errors of the system in this context, which starts threads, into `SchedulerError`."""
+    try:
+        yield
+    # multiprocessing stumbles over threads that did not start: its own error is an AttributeError
+    except (OSError, RuntimeError, MemoryError, AttributeError) as error:
+        raise SchedulerError(
+            f"{n_threads} threads could not be started here ({why(error.__context__ or error)}). Raise the limits on "
+            "open files, processes and memory (ulimit -n, -u, -v), or give fewer --workers; 0 needs no thread. "
+            "Committed results stay, and the same command continues."
+        ) from None
+
+
 def in_threads(
     task: Task, indices: Sequence[int], after: Predecessor | None, order: Order, n_threads: int
 ) -> Generator[dict[str, Any], None, None]:
@@ -78,7 +93,7 @@ def in_threads(
     books of the same tasks: failed ones are tried again alone, at the end. Raise `TaskFailedError` as soon as so many
     tasks have failed that the cause cannot lie in single tasks.
     """
-    ended: SimpleQueue[dict[str, Any] | TaskFailedError | None] = SimpleQueue()
+    ended: SimpleQueue[dict[str, Any] | BaseException | None] = SimpleQueue()
     gate, books = Gate(), threading.Lock()
     tried: set[int] = set()
 
@@ -113,19 +128,23 @@ def in_threads(
         for index in chosen:
             before = after(index) if after else None
             graph[f"task {index}"] = (partial(attempt, index), *[f"task {before}"] * (before in chosen))
-        # its threads are daemons: the end of Python does not wait for a kernel
-        with contextlib.closing(ThreadPool(n_threads)) as pool:
-            try:
+        try:
+            with starting(n_threads):
+                pool = ThreadPool(n_threads)  # its threads are daemons: the end of Python does not wait for a kernel
+            with contextlib.closing(pool):
                 get(graph, list(graph), pool=pool)
-            finally:
-                ended.put(None)
+        except BaseException as error:  # the run must not wait for ever
+            ended.put(error)
+        else:
+            ended.put(None)
 
     chosen: Collection[int] = set(indices)
     try:
         while chosen:
-            threading.Thread(target=compute, args=(chosen,), daemon=True).start()
+            with starting(n_threads):
+                threading.Thread(target=compute, args=(chosen,), daemon=True).start()
             while (end := ended.get()) is not None:
-                if isinstance(end, TaskFailedError):
+                if isinstance(end, BaseException):
                     raise end
                 yield end
             chosen = _rest(order, tried)

@@ -171,11 +171,14 @@ HOST = "127.0.0.1"
 MOST_BODY, MOST_HEADERS = 64 * 1024, 16 * 1024
 """Bytes of a request."""
 
+MOST_SILENCE_S = 60.0
+"""Longest time that a connection may send no request, take nothing of an answer, or answer no ping [s]."""
+
 LIMITS: dict[str, Any] = {
     "max_body_size": MOST_BODY,
     "max_header_size": MOST_HEADERS,
     "max_buffer_size": MOST_BODY + MOST_HEADERS,
-    "idle_connection_timeout": 300.0,
+    "idle_connection_timeout": MOST_SILENCE_S,
     "body_timeout": 20.0,
 }
 """What a connection may take."""
@@ -260,6 +263,17 @@ class Handler(web.RequestHandler):
         self.set_status(status)
         self.set_header("Content-Type", "application/json; charset=utf-8")
         self.finish(json.dumps({"error": sentence}))
+
+    def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> asyncio.Future[None]:
+        """Send the answer, and close the connection if its client does not take it in time."""
+        loop, sent = IOLoop.current(), super().finish(chunk)
+        late = loop.call_later(MOST_SILENCE_S, self._leave)
+        sent.add_done_callback(lambda _: loop.remove_timeout(late))
+        return sent
+
+    def _leave(self) -> None:
+        LOG.warning("a client does not take its answer; its connection is closed")
+        self.request.connection.stream.close()  # type: ignore[union-attr]
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Answer a request that failed, without internal details."""
@@ -361,6 +375,7 @@ def application(service: Service) -> web.Application:
         default_handler_class=NothingHandler,
         default_handler_args=shared,
         service=service,
+        websocket_ping_interval=MOST_SILENCE_S,
         compress_response=False,
         log_function=lambda handler: None,
     )

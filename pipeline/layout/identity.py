@@ -29,24 +29,35 @@ def identity_of(spec: Spec, plan: Plan) -> dict[str, Any]:
     The title, the source of a function and ``[execution]`` are left out; the chunks that follow from ``[execution]``
     are included. So is a digest of the coordinates, the numbers that ranges and seeds stand for.
     """
-    tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
-    if spec.drive is not None:  # the file's name does not matter, and its digest stands for its text
-        tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in ("file", "text")}
-    if isinstance(tables["model"], dict):  # the function from which the equations were read, for readers
-        tables["model"] = {k: v for k, v in tables["model"].items() if k != "function"}
-    for table in tables.get("drift", {}).values():
-        for key in ("file", "text"):
-            table.pop(key, None)
     return {
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
         "versions": versions_of(spec),
-        "spec": tables,
+        "spec": identity_tables(spec.as_dict()),
         "model_digest": spec.model.digest,
         "parameter_values": spec.values.as_dict(),
         "coordinates": _coordinates_digest(spec),
         "chunks": {v.name: list(plan.chunks(v)) for v in plan.variables},
     }
+
+
+def identity_tables(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of a specification, as plain data, that belong to a run's identity."""
+    found = {k: v for k, v in tables.items() if k not in ("title", "execution")}
+    # a digest stands for a file's text, and its name does not matter; the function is for readers alone
+    for name, without in (("drive", ("file", "text")), ("model", ("function",))):
+        if isinstance(found.get(name), Mapping):
+            found[name] = {k: v for k, v in found[name].items() if k not in without}
+    if "drift" in found:
+        drift = found["drift"].items()
+        found["drift"] = {name: {k: v for k, v in table.items() if k not in ("file", "text")} for name, table in drift}
+    return found
+
+
+def foreign_keys(identity: Mapping[str, Any], tables: Mapping[str, Any]) -> list[str]:
+    """Return the keys in which an identity differs from a specification with these tables, which are plain data."""
+    lines = differences(identity_tables(identity["spec"]), identity_tables(tables))
+    return [line.partition(": ")[0] for line in lines]
 
 
 def _coordinates_digest(spec: Spec) -> str:

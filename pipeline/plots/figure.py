@@ -17,6 +17,7 @@ import xarray as xr
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from magpend_core.models.parameters import has_controls
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place, select_points, snap
 from pipeline.layout.vocabulary import split_dims, told_by
@@ -114,6 +115,8 @@ def _dpi(fig: Figure, suffix: str) -> float:
 
 
 def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
+    # XML has no place for control characters, which a dataset of others may have
+    attrs = {k: "".join(c for c in v if not has_controls(c)) if isinstance(v, str) else v for k, v in attrs.items()}
     title, source = str(attrs.get("title", "")), str(attrs.get("source", "magpend"))
     rest = {k: v for k, v in attrs.items() if isinstance(v, str | int | float) and k not in ("title",)}
     about = "; ".join(f"{key}: {value}" for key, value in rest.items()).replace("\n", ", ")

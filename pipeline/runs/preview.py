@@ -18,7 +18,7 @@ from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here, ready
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
-from pipeline.store.commits import read_commits
+from pipeline.store.checking import whole_records
 from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory
 from pipeline.store.setup import check
@@ -224,7 +224,7 @@ def preview(
     parsed = ready(parsed, files)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
-    done = read_commits(info, plan) if info else {}
+    done = whole_records(info, plan) if info else set()
     check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
     return Preview(parsed, plan, files.name, info is not None, frozenset(done), workers)
 

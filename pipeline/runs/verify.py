@@ -35,13 +35,14 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
     UnreadableError
         If a file exists and cannot be read; nothing is changed.
     LockedError
-        With `repair`, if a run is writing to the directory.
+        With `repair`, if something is damaged and a run is writing to the directory.
     """
     info = read_run(directory)
     spec = info.parsed_spec()
     plan = make_plan(spec)
-    if not repair:
-        return verify(info, plan)
+    found = verify(info, plan)
+    if found.sound or not repair:  # an intact run may lie where nobody may write
+        return found
     with info.files.lock():
         found = verify(info, plan)
         for key in found.odd:

@@ -87,6 +87,12 @@ def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Recor
     return records, damaged | {name_of(index): problem for index, problem in found.items()}
 
 
+def whole_records(info: RunInfo, plan: Plan) -> frozenset[int]:
+    """Return the tasks with a valid commit record whose files all exist with their sizes."""
+    records, damaged = damaged_records(info, plan, contents=False)
+    return frozenset(index for index in records if name_of(index) not in damaged)
+
+
 def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
     cube, found = info.files.below(CUBE), {}
     for n, index in enumerate(records):

@@ -168,19 +168,30 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 def read_commits(info: RunInfo, plan: Plan) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
-    If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this check
-    would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of
-    chunks.
+    If no record is packed, a record's files must all exist with their sizes. In larger runs this check would take as
+    long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of chunks.
 
-    Raise `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending,
-    since a failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
+    Raise `DamagedError` if a file of a record is missing or has another size: its task is done, and not pending. Raise
+    `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending, since a
+    failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
     records, _ = scan(info, plan, copies=info.files.local is None)
-    if not records.packs:  # a small run: listing its files takes little time
-        absent = absent_objects(info, records)
-        whole = {index: commit for index, commit in records.items() if index not in absent}
-        records = Records(info.files, info.digest, whole)
+    if not records.packs and absent_objects(info, records):
+        # another process may have withdrawn a record before its files: look at both again
+        records, _ = scan(info, plan)
+        absent = {} if records.packs else absent_objects(info, records)
+        if absent:
+            more = f" (and files of {len(absent) - 1} more tasks)" if len(absent) > 1 else ""
+            raise DamagedError(f"{info.name}/{CUBE}/{next(iter(absent.values()))}{more}. {remedy(info.name)}")
     return records
+
+
+def remedy(name: str) -> str:
+    """Return the sentence that says what to do about damaged chunks of the run with a name."""
+    return (
+        "Give the command that made the run again: it computes what is damaged; or look at all of it with: "
+        f"magpend verify {name}"
+    )
 
 
 def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, str]:

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 from pipeline.layout.plan import Plan, check_plan, make_plan
 from pipeline.specification.spec import Spec
 from pipeline.store.commits import cube_digest, read_commits
-from pipeline.store.files import Files
+from pipeline.store.errors import DamagedError
+from pipeline.store.files import RUN_FILE, Files
 from pipeline.store.records import Records
-from pipeline.store.runfile import RunInfo, read_run
-from pipeline.store.skeleton import check_skeleton
+from pipeline.store.runfile import RunInfo, read_run, remade
+from pipeline.store.skeleton import check_skeleton, lacking
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,6 +70,9 @@ class RunDirectory:
         spec = info.parsed_spec()
         plan = make_plan(spec)
         check_plan(plan)
+        if absent := lacking(info, spec, plan):
+            place = info.files.below(RUN_FILE).name
+            raise DamagedError(f"{place}: damaged (skeleton has no {', '.join(absent[:3])}); {remade(info.name)}")
         return cls(info, spec, plan, read_commits(info, plan), known)
 
     @property

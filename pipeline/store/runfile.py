@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.layout.identity import digest_of
+from pipeline.layout.identity import digest_of, foreign_keys
 from pipeline.layout.schema import FORMAT
 from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, shown
@@ -85,9 +85,12 @@ def read_run(place: str | Path | Files) -> RunInfo:
         info = RunInfo(files=files, **parsed(StoredRun, data)) if whole else None
         whole = info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
+        raise DamagedError(f"{path}: damaged ({error}); {remade(directory)}") from None
     if info is None or not whole:
-        raise DamagedError(f"{path}: damaged (its checksum does not fit); {_remedy(directory)}")
+        raise DamagedError(f"{path}: damaged (its checksum does not fit); {remade(directory)}")
+    if keys := foreign_keys(info.identity, info.spec):
+        named = ", ".join(keys[:3])
+        raise DamagedError(f"{path}: damaged (its identity is of another specification: {named}); {remade(directory)}")
     return info
 
 
@@ -102,7 +105,8 @@ def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
         )
 
 
-def _remedy(directory: str) -> str:
+def remade(directory: str) -> str:
+    """Return the clause that says how a damaged ``run.json`` of the run in a directory is made again."""
     return (
         f"give the command that made it again (magpend run SPEC --out {directory}): "
         "it is rebuilt, and committed results stay."

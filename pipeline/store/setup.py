@@ -18,7 +18,14 @@ from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, 
 from pipeline.store.local import is_note, run_around
 from pipeline.store.objects import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
-from pipeline.store.skeleton import entries_of, skeleton_files, skeleton_keys, skeleton_problems, write_skeleton
+from pipeline.store.skeleton import (
+    entries_of,
+    lacking,
+    skeleton_files,
+    skeleton_keys,
+    skeleton_problems,
+    write_skeleton,
+)
 from pipeline.store.stored_json import fits
 
 Echo = Callable[[str], None]
@@ -198,6 +205,8 @@ def establish(
     for key in odd_keys(files, skeleton_keys(spec, plan)):
         echo(f"{key}: {ODD}; moved to {files.move_aside(key)}")
     info = check(files, identity)
+    if info is not None and lacking(info, spec, plan):
+        info = None
     names = _names(files)
     if alone:  # else another process may be writing these files now
         left = (f".{RUN_FILE}.", f".{HOLDER}.", f".{RECORD_COPY}.")

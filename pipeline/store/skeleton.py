@@ -81,6 +81,14 @@ def _attributes(plan: Plan, found: Iterable[Coordinate], described: bool) -> dic
     return conventional_attributes(entries) if described else {n: dict(entry.attrs) for n, entry in entries.items()}
 
 
+def lacking(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
+    """Return the keys of files of variables and coordinates that ``run.json`` should name, and does not."""
+    found = [f"{v.name}/{METADATA}" for v in plan.variables]
+    for coordinate in (*coordinates(spec), _labels(spec)[0]):
+        found += [f"{coordinate.name}/{end}" for end in (METADATA, ".".join(["c", *["0"] * len(coordinate.dims)]))]
+    return [key for key in found if key not in info.skeleton]
+
+
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
     """Return the keys of the metadata files of all variables and coordinates of the result cube."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]

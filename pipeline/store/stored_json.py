@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from magpend_core.models.parameters import has_controls
 from pipeline.specification.problems import problems_of
 from pipeline.store.arrays import METADATA
 
@@ -81,6 +82,13 @@ def _group_first(entries: dict[str, Any]) -> dict[str, Any]:
     return entries
 
 
+def _printable(text: str) -> str:
+    if has_controls(text):
+        raise ValueError("has control characters")
+    return text
+
+
+Line = Annotated[str, AfterValidator(_printable)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 CellCounts = dict[Annotated[str, Field(pattern="^[a-z_]+$")], Count]
 
@@ -133,11 +141,11 @@ class StoredRun(Stored):
 
     digest: str
     identity: StoredIdentity
-    title: str
+    title: Line
     spec: dict[str, Any]
     spec_text: str
-    versions: dict[str, str]
-    provenance: dict[str, str]
+    versions: dict[Line, Line]
+    provenance: dict[Line, Line]
     skeleton: Annotated[Entries, AfterValidator(_group_first)]
 
 

@@ -21,6 +21,7 @@ from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
 from pipeline.store.arrays import Declared
+from pipeline.store.commits import remedy
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files
 from pipeline.store.keys import Owners
@@ -137,10 +138,7 @@ class CommittedStore(WrapperStore[Store]):
 
     def _damaged(self, key: str, problem: str) -> DamagedError:
         name = self._files.name
-        return DamagedError(
-            f"{name}/{CUBE}/{key}: {problem}. Give the command that made the run again: it computes "
-            f"what is damaged; or look at all of it with: magpend verify {name}"
-        )
+        return DamagedError(f"{name}/{CUBE}/{key}: {problem}. {remedy(name)}")
 
     def arrays(self) -> list[str]:
         """Return the names of the arrays in the result cube."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from magpend_core.models.parameters import near_names
+from magpend_core.models.parameters import has_controls, near_names
 from magpend_core.models.text.grammar import GrammarError, Tree, name_problem, names, parse, parse_condition, unknown
 
 MAX_TEXT = 2000
@@ -67,6 +67,9 @@ class Reader:
             return default
         if len(value) > most:
             self.report(f"{place}.{key}", f"has {len(value)} characters; {most} are the most.")
+            return default
+        if has_controls(value):
+            self.report(f"{place}.{key}", f"{ascii(value)[:SHOWN]} has control characters; remove them.")
             return default
         return value
 

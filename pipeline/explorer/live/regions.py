@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import KEY
 from pipeline.explorer import RequestError
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.verticals import vertical
 from pipeline.explorer.live.jobs import PATIENCE_S, Job
 from pipeline.explorer.live.messages import Region, RunRequest
 from pipeline.layout.cells import parameter_axes
@@ -47,6 +49,7 @@ _PACKAGES = Path(__file__).parents[3]
 
 def zoomed(run: RunDirectory, region: Region) -> tuple[Spec, list[str]]:
     """Return the specification for a selected region, and notes on the parts of it that lie outside the run."""
+    ExploredRun.of(run).check_axes(region.at)
     return zoom(run.spec, changes_of(run, region))
 
 
@@ -95,6 +98,8 @@ def _names(run: RunDirectory, region: Region, swept: list[str]) -> tuple[str, st
     if len(given) < 2 or given[1] == first:
         return first, None
     # a state over a parameter is the diagram's vertical axis, not a range of starts
+    if given[1] not in (*known, *states):
+        vertical(ExploredRun.of(run), names[1])
     fits = given[1] in known and (given[1] in swept or first in states)
     return first, given[1] if fits else None
 

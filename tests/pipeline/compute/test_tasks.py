@@ -67,6 +67,33 @@ def test_threads__two_at_a_time_and_failed_ones_alone():
     assert alone[1] == 1
 
 
+@pytest.mark.parametrize("n_started", range(5))
+def test_threads__that_do_not_start_are_an_error_and_no_wait(monkeypatch, n_started):
+    """The system refuses a thread (``ulimit -u``): the run must not wait for what nobody computes."""
+    start, left, ended, begin = threading.Thread.start, [n_started], [], threading.Event()
+
+    def refused(thread):
+        left[0] -= 1
+        if left[0] < 0:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    def work():
+        assert begin.wait(60)
+        try:
+            ended.extend(run_tasks(lambda index: {"task": index}, range(4), workers=3))
+        except SchedulerError as error:
+            ended.append(error)
+
+    worker = threading.Thread(target=work, daemon=True)
+    worker.start()
+    monkeypatch.setattr(threading.Thread, "start", refused)
+    begin.set()
+    worker.join(20)
+    assert "3 threads could not be started here (RuntimeError: can't start new thread)" in str(ended[-1])
+    assert "--workers; 0 needs no thread" in str(ended[-1])
+
+
 # ---- the end of a run, with tasks still running --------------------------------------------------------
 
 
@@ -334,15 +361,17 @@ def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, s
 
 
 @pytest.mark.slow
-def test_workers__scheduler_dies(faulty, processes, scheduler_file, worker, tmp_path):
-    """A scheduler that is killed: an error in one sentence, soon."""
+def test_workers__scheduler_dies(faulty, processes, scheduler_file, worker, tmp_path, capfd):
+    """A scheduler that is killed: an error in one sentence, soon, and none of dask's own beside it."""
     (tmp_path / "log").mkdir()
     worker()
     results = run_tasks(partial(faulty.slow, str(tmp_path / "log")), range(1000), scheduler=str(scheduler_file))
     next(results)
+    capfd.readouterr()
     processes.started[0].kill()
     with pytest.raises(SchedulerError, match=r"is gone\. Committed results stay"):
         list(results)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_limits__learn_from_what_finished():

@@ -68,7 +68,7 @@ class Client:
         asyncio.set_event_loop(self.loop)
 
         async def begin():
-            served = application(self.service)
+            served = self.web = application(self.service)
             routes = (rule.target_kwargs for rule in served.wildcard_router.rules)
             self.pages = next((given["others"] for given in routes if "others" in given), set())
             self.server = HTTPServer(served, **server.LIMITS)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import queue
+import socket
 import threading
+import time
 from urllib.parse import urlencode
 
 import pytest
@@ -238,6 +241,43 @@ def test_socket__bounds_rate_and_number_of_pages(client, monkeypatch):
         assert (await answer_to(second, 7, "done", "error"))[1]["kind"] == "done"
 
     client.talk(conversation())
+
+
+def test_socket__refuses_axes_that_the_run_does_not_have(client):
+    async def conversation():
+        page = await client.page()
+        region = {"do": "run", "x": [0.0, 1.0], "axes": None}
+        for number, (key, value) in enumerate((("at", {"nonsense": 0}), ("axes", ["x_0", "nonsense"]))):
+            await page.write_message(json.dumps({**region, key: value, "id": number}))
+            assert "nonsense" in (await answer_to(page, number, "done", "error"))[1]["error"]
+
+    client.talk(conversation())
+
+
+def test_socket__a_page_that_answers_no_ping_is_left(client):
+    """Half open: the page's process is suspended, or gone without a word."""
+    client.web.settings["websocket_ping_interval"] = 0.2
+    address = f"/ws?token={client.guard.token}"
+    said = (
+        f"GET {address} HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\nOrigin: http://127.0.0.1:{client.port}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MTIz\r\n\r\n"
+    )
+    assert b"101 Switching" in client.raw(said.encode())  # which reads until the server closes
+    client.talk(until(lambda: not client.pages))
+
+
+def test_api__a_client_that_takes_no_answer_is_left(client, monkeypatch):
+    monkeypatch.setattr(sockets, "MOST_SILENCE_S", 0.2)
+    monkeypatch.setattr(client.service, "static", {"explorer.js": (bytes(2**26), "text/javascript")})
+    said = f"GET /static/explorer.js HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", client.port), timeout=60) as one:
+        one.sendall(said.encode())
+        time.sleep(1.0)
+        found = 0
+        with contextlib.suppress(ConnectionError):
+            while chunk := one.recv(2**20):
+                found += len(chunk)
+    assert 0 < found < 2**26
 
 
 def test_socket__a_page_that_leaves_cancels_its_jobs(client):

@@ -14,6 +14,7 @@ from magpend_core.models import load_model
 from pipeline.analysis.selection import place
 from pipeline.plots import Frame, draw_figure, save_data, save_figure
 from pipeline.plots.bifurcation import plot_bifurcation
+from pipeline.plots.figure import _metadata
 from pipeline.plots.palette import motions_of
 from pipeline.plots.style import GREY, PALETTE
 from pipeline.products.product import Options, default_of
@@ -181,6 +182,13 @@ def test_draw_figure__provenance_beside_and_inside(tmp_path):
     for suffix in (".png", ".svg"):
         written = save_figure(figure, tmp_path / f"a{suffix}").read_bytes()
         assert all(text in written for text in (b"node7", b"d" * 64, b"bifurcation diagram"))
+
+
+def test_metadata__have_no_characters_that_are_no_xml():
+    """A forged version of magpend, with escapes for a terminal, made an SVG that nothing could read."""
+    found = _metadata({"title": "a\x1b[31m\x00b", "source": "magpend \x1b[2J\ud800", "host": "n\x07"}, ".svg")
+    assert (found["Title"], found["Source"]) == ("a[31mb", "magpend [2J")
+    assert found["Description"].endswith("host: n")
 
 
 @pytest.mark.slow

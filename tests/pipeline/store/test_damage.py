@@ -28,6 +28,7 @@ from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.objects import open_files
 from pipeline.store.products import write_product
 from pipeline.store.run import RunDirectory
+from pipeline.store.runfile import read_run
 from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import contents, duffing, finished, quietly, silent
 
@@ -508,6 +509,8 @@ def test_forged__is_one_error_that_names_the_place_or_nothing_wrong_is_read(key,
         (("skeleton", "a\0b"), {"size": 1, "sha256": "0" * 64}, "is not the path of a file"),
         (("spec", "axes"), float("nan"), "axes"),
         (("versions",), "NESTED", ""),
+        (("versions", "magpend"), "1\x1b[31m", "versions.magpend"),
+        (("spec", "integration", "n_keep"), 77, "its identity is of another specification: integration.n_keep"),
     ],
 )
 def test_forged_run_file__the_command_names_what_is_wrong(whole, main, key, value, named):
@@ -519,3 +522,18 @@ def test_forged_run_file__the_command_names_what_is_wrong(whole, main, key, valu
         assert code == 5
         assert f"{path}: " in err
         assert named in err
+
+
+def test_forged_run_file__arrays_that_it_does_not_name(whole, sound, main, bytes_of):
+    directory = whole()
+    path = directory / "run.json"
+    for key in ("section/zarr.json", "x_0/zarr.json", "x_0/c.0", "state/c.0"):
+        data = unseal(path.read_bytes())
+        del data["skeleton"][key]
+        path.write_text(seal(json.dumps(data)))
+        code, _, err = main("status", directory)
+        assert code == 5
+        assert f"{path}: damaged (skeleton has no {key})" in err
+        assert run(sound.spec, directory, workers=0, echo=silent).complete
+        assert bytes_of(directory) == bytes_of(sound.run)
+        assert key in read_run(directory).skeleton

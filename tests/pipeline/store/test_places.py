@@ -13,10 +13,10 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pipeline.compute import execute, task
+from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import prune
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
@@ -27,6 +27,7 @@ from pipeline.store.files import RECORD_COPY
 from pipeline.store.local import writer_lock
 from pipeline.store.products import open_product
 from pipeline.store.run import RunDirectory, open_run
+from pipeline.store.runfile import read_run
 from pipeline.store.setup import check, establish
 from pipeline.store.stored_json import seal, unseal
 from tests.pipeline.factories import contents, duffing, quietly, silent
@@ -158,12 +159,69 @@ def test_open_run__links_are_not_followed_out(place, tmp_path, what):
     opened = open_run(place)
     path.rename(tmp_path / "outside")
     path.symlink_to(tmp_path / "outside")
-    if what == "chunk":  # nothing vouches for a link: its cells are pending
-        assert np.isnan(open_run(place).section.values[0]).all()
-        return
-    use = open_run if what in ("zarr.json", "folder") else lambda _: open_product(product)
+    use = open_run if what in ("zarr.json", "folder", "chunk") else lambda _: open_product(product)
     with pytest.raises((StoreError, OSError), match=r"link|is missing"):
         opened.section.load() if what == "chunk later" else use(place)
+
+
+# ---- chunks that are gone ----------------------------------------------------------------------
+
+COMMANDS = (
+    "status RUN",
+    "analyse attractors RUN",
+    "plot bifurcation RUN",
+    "report RUN",
+    "explore RUN --no-browser",
+    "extend RUN --axis amplitude=0.2:0.4:5 --out wider",
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_lost_chunk__is_damage_and_not_pending(place, main, command):
+    """A file that a commit record names is gone: no command goes on with the other cells."""
+    chunk = place / "cube.zarr/section/c.1.0.0.0.0"
+    chunk.unlink()
+    code, _, err = main(*(str(place) if word == "RUN" else word for word in command.split()))
+    assert code == 5, err
+    assert f"{chunk} is missing or has another size" in err
+    assert f"magpend verify {place}" in err
+    assert not (place.parent / "wider").exists()
+
+
+def test_lost_chunk__is_left_to_compute_in_a_dry_run_and_a_run(place, main):
+    before = (place / "cube.zarr/status/c.1.0.0").read_bytes()
+    (place / "cube.zarr/status/c.1.0.0").unlink()
+    code, out, _ = main("run", place.with_name("spec.toml"), "--out", place, "--dry-run")
+    assert code == 0
+    assert "cells, 2 done" in out
+    assert main("run", place.with_name("spec.toml"), "--out", place, "--workers", 0)[0] == 0
+    assert (place / "cube.zarr/status/c.1.0.0").read_bytes() == before
+
+
+def test_lost_chunk__of_a_record_that_another_process_withdraws_meanwhile(place, monkeypatch):
+    info, absent_objects = read_run(place), commits.absent_objects
+    asked = []
+
+    def meanwhile(*arguments):
+        if not asked:
+            (place / marker_key(1)).unlink()
+            (place / "cube.zarr/status/c.1.0.0").unlink()
+        asked.append(1)
+        return absent_objects(*arguments) if asked[1:] else {1: "status/c.1.0.0 is missing"}
+
+    monkeypatch.setattr(commits, "absent_objects", meanwhile)
+    assert set(read_commits(info, make_plan(info.parsed_spec()))) == {0, 2}
+
+
+def test_verify__repairs_nothing_of_an_intact_run_that_it_may_not_write_to(place, main, monkeypatch):
+    def refused(*arguments):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(place))
+
+    monkeypatch.setattr(local.LocalFiles, "lock", refused)
+    code, out, _ = main("verify", "--repair", place)
+    assert (code, "3 of 3 tasks committed and intact" in out) == (0, True)
+    (place / marker_key(1)).write_text("torn")
+    assert main("verify", "--repair", place)[0] == 4
 
 
 def test_prune__links_are_not_followed(place, tmp_path):
