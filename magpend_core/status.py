@@ -31,7 +31,8 @@ _SENTENCES = {
     Status.BOUNDED: "bounded, and not closed within the periods integrated and the longest period looked "
     "for: chaotic, quasi-periodic, or still on the way to an orbit",
     Status.DIVERGED: "a state left the bounds of the system or is not a number",
-    Status.STEP_LIMIT: "one period needed more steps than max_steps_per_period; raise it, or loosen rtol",
+    Status.STEP_LIMIT: "one period needed more steps than max_steps_per_period; raise it, or loosen rtol; "
+    "neither helps where impacts or switches follow one another without end: change these",
     Status.STEP_UNDERFLOW: "the step size fell below the resolution of time; loosen rtol and atol",
     Status.UNREACHED: "the branch ended at an earlier point of its path, so this point was not computed",
     Status.INFERRED: "not integrated: in a refined grid all integrated cells around it closed on one orbit, "

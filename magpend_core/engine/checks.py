@@ -382,24 +382,37 @@ class _Motion:
         return None if values is None else np.array(values)
 
     def _check_angles(self, rates: np.ndarray) -> None:
-        size = np.abs(rates[:, np.isfinite(rates).all(axis=0)]).max(axis=1)
-        for i, name in enumerate(self.system.state_names):
-            if not self.system.is_angle[i]:
-                continue
-            turned = self.y.copy()
-            turned[i] += 2.0 * np.pi
-            after = self._rates(turned)
-            assert after is not None
-            change = np.abs(after - rates)
-            if self.system.is_map:  # an angle may go round with the angle before it
-                angles = np.asarray(self.system.is_angle)
-                change[angles] = np.abs(np.remainder(change[angles] + np.pi, 2.0 * np.pi) - np.pi)
-            changed = change > 1e-6 * size[:, None]
-            for k in np.flatnonzero(changed.sum(axis=1) >= TWICE):
+        names = self.system.state_names
+        angles = [i for i in range(len(names)) if self.system.is_angle[i]]
+        changes = {i: self._change_by_turn(rates, i) for i in angles}
+        broken = [i for i in angles if changes[i].any()]
+        for i in broken:
+            partners = [j for j in broken if j != i and not self._change_by_turn(rates, i, j).any()]
+            remedy = (
+                f"; it may with {names[partners[0]]}: take their difference as a state, which is no angle, in place of "
+                "one of them"
+                if partners
+                else ""
+            )
+            for k in np.flatnonzero(changes[i]):
                 self.functions.problems.append(
-                    f"is_angle: {name} is declared an angle, but the rate of {self.system.state_names[k]} "
-                    f"changes by {change[k].max():g} when it goes round by 2 pi."
+                    f"is_angle: {names[i]} is declared an angle, but the rate of {names[k]} "
+                    f"changes by {changes[i][k]:g} when it goes round by 2 pi{remedy}."
                 )
+
+    def _change_by_turn(self, rates: np.ndarray, *turning: int) -> np.ndarray:
+        """Return by how much each rate changes when some states go round by 2 pi together; 0 up to rounding."""
+        size = np.abs(rates[:, np.isfinite(rates).all(axis=0)]).max(axis=1)
+        turned = self.y.copy()
+        turned[list(turning)] += 2.0 * np.pi
+        after = self._rates(turned)
+        assert after is not None
+        change = np.abs(after - rates)
+        if self.system.is_map:  # an angle may go round with the angle before it
+            angles = np.asarray(self.system.is_angle)
+            change[angles] = np.abs(np.remainder(change[angles] + np.pi, 2.0 * np.pi) - np.pi)
+        changed = (change > 1e-6 * size[:, None]).sum(axis=1) >= TWICE
+        return np.where(changed, change.max(axis=1), 0.0)
 
     def _check_jacobian(self, rates: np.ndarray) -> None:
         """Compare the Jacobian with finite differences of the rates. Differences with two step sizes bound their own

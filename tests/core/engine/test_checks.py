@@ -17,6 +17,7 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import TWO_PI, sincos
 from magpend_core.models import load_model, model_names
+from tests.core.flows import table
 
 FREQUENCY = 0.16
 DUFFING = [0.15, -1.0, 1.0, 0.2]
@@ -303,3 +304,18 @@ def test_plain__goes_down_to_modules_closures_and_itself():
     assert function(values) == pytest.approx(3.0 * np.sin(values) + 9.0)
     assert plain(math.sin) is math.sin
     assert accelerations is plain(accelerations)
+
+
+def test_check_system__names_the_difference_of_angles_that_turn_together():
+    def problems(rates):
+        states = {name: {"on_circle": True} for name in rates}
+        system = load_model(table("turning", rates, states=states)).system
+        return found(system, [[]], 1.0, np.linspace(0.3, 0.9, len(rates))[None])
+
+    told = problems({"a": "1 - 0.3*(a - b)", "b": "1.3 + 0.3*(a - b)", "c": "sin(c - a) + sin(b)"})
+    assert len(told) == 4  # two rates of each
+    assert all("take their difference as a state" in line for line in told)
+    # alone it may not turn either, and nothing turns with it
+    told = problems({"a": "-a", "b": "sin(a)"})
+    assert told
+    assert not any("difference" in line for line in told)
