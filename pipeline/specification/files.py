@@ -173,7 +173,8 @@ def _shipped() -> dict[str, Path]:
 
 def default_directory(spec_path: Path, smoke: bool) -> Path:
     """Return the default run directory of a specification file: ``runs/NAME``."""
-    return Path("runs") / (spec_path.stem + ("-smoke" if smoke else ""))
+    # a dot in a name such as fail_0.05.toml begins no suffix
+    return Path("runs") / (spec_path.name.removesuffix(".toml") + ("-smoke" if smoke else ""))
 
 
 def check_new_file(path: str | Path, suffixes: Sequence[str]) -> Path:

@@ -14,7 +14,7 @@ import os
 import pathlib
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from types import CellType, CodeType, FunctionType, MethodType, TracebackType
@@ -28,6 +28,7 @@ from magpend_core.models.text.grammar import parse
 from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.models.text.reading import MAX_FUNCTION, read_definition
 from magpend_core.models.text.spelling import spelled
+from magpend_core.models.text.tables import shown
 from magpend_core.models.text.tracing import (
     BUILT_IN,
     MOST_PATHS,
@@ -109,11 +110,13 @@ def read_function(
     ModelError
         If the text of a model cannot say what the function does; the message has the line and the remedy.
     """
-    states = tables.get("states") or {}
-    states = dict(states) if isinstance(states, Mapping) else dict.fromkeys(states, "1")
-    if not states:
-        raise ModelError(['states: name the states of the function in the order of y: states=("x", "v").'])
-    parameters = {**(tables.get("parameters") or {}), **values}
+    states = _names_of(tables.get("states"))
+    parameters = tables.get("parameters") or {}
+    if not isinstance(parameters, Mapping):
+        raise ModelError(
+            [f'parameters = {shown(parameters)}: must be values by name, such as parameters={{"k": 2.0}}.']
+        )
+    parameters = {**parameters, **values}
     own = {key: value for key, value in parameters.items() if key != drive}
     head = {"name": _name_of(function), **tables, "states": states, "parameters": own}
     definition = _check(
@@ -140,6 +143,21 @@ def read_function(
         table["function"] = source
     call.compare(table, found)
     return table
+
+
+def _names_of(states: Any) -> dict[str, Any]:
+    """Return the entries of a function's states by name, from a table or from their names alone."""
+    if isinstance(states, Mapping):
+        found = dict(states)
+    elif isinstance(states, Iterable):
+        found = dict.fromkeys([states] if isinstance(states, str) else states, "1")
+    elif states is None:
+        found = {}
+    else:
+        raise ModelError([f'states = {shown(states)}: must be names, in the order of y: states=("x", "v").'])
+    if not found:
+        raise ModelError(['states: name the states of the function in the order of y: states=("x", "v").'])
+    return found
 
 
 def _no_rates(states: Mapping[str, Any]) -> dict[str, str]:

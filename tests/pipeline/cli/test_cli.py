@@ -209,6 +209,15 @@ def test_simulate__series_figure_and_data_with_provenance(main, tmp_path):
     assert not (tmp_path / "trajectory.png").exists()
 
 
+def test_default_directory__keeps_dots_in_a_name(tmp_path):
+    for name in ("fail_0.05", "fail_0.005"):
+        path = tmp_path / f"{name}.toml"
+        path.write_text('kind = "sweep"\nmodel = "duffing"\n')
+        assert files.default_directory(path, smoke=False) == Path("runs") / name
+        assert files.default_directory(path, smoke=True) == Path("runs") / f"{name}-smoke"
+        assert files.default_directory(Path(name), smoke=False) == Path("runs") / name
+
+
 def test_find_spec__of_the_gallery_by_its_folder_and_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = "gallery/ueda-attractor"

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import magpend
 from magpend_core.models import ModelError
+from magpend_core.models.text.functions import read_function
 from magpend_core.models.text.numeric import rates_of
 from magpend_core.models.text.tracing import RULES
 from pipeline.layout.identity import identity_of
@@ -378,6 +379,19 @@ def test_model__refuses_in_words(function, given, words):
     with pytest.raises(ModelError) as caught:
         made(function, "x v", values, values.pop("drive", None))
     assert re.search(words, str(caught.value)), caught.value
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"states": 40}, "states = 40: must be names, in the order of y"),
+        ({}, "states: name the states of the function"),
+        ({"states": ("x",), "parameters": 4}, "parameters = 4: must be values by name"),
+    ],
+)
+def test_model__of_a_function_refuses_other_tables_in_words(tables, words):
+    with pytest.raises(ModelError, match=words):
+        read_function(lambda t, y: [-y[0]], tables, {})
 
 
 def test_model__drive_belongs_to_functions():
