@@ -14,7 +14,7 @@ from magpend_core.models.model import Model
 from magpend_core.sampling import Drive
 from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.measured_orbits import MeasuredTable, first_orbits
-from pipeline.rig.identify.problem import PHASE, ZERO, Free, Piece, Problem, steady_drive
+from pipeline.rig.identify.problem import DRIFT, PHASE, ZERO, Free, Piece, Problem, steady_drive
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
 from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth, summary
 from pipeline.specification.problems import SpecError
@@ -96,7 +96,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
     problem = Problem(
         model=spec.model,
         fixed=spec.values,
-        free=free_of(spec, channels),
+        free=free_of(spec, recordings),
         channels=channels,
         pieces=tuple(kept),
         tied=spec.tied,
@@ -228,8 +228,10 @@ def _hold_out_problems(i: int, table: RecordingTable, cut: _Cut) -> list[str]:
     return []
 
 
-def free_of(spec: IdentificationSpec, channels: Sequence[str]) -> tuple[Free, ...]:
-    """Return the unknowns in the order of the specification: parameters, zero offsets of sensors, phases of drives."""
+def free_of(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> tuple[Free, ...]:
+    """Return the unknowns in the order of the specification: parameters, zero offsets of sensors with their drifts,
+    phases of drives.
+    """
     found, n_recordings = [], len(spec.recordings)
     for u in spec.unknowns:
         p = spec.model.parameter(u.name)
@@ -241,7 +243,12 @@ def free_of(spec: IdentificationSpec, channels: Sequence[str]) -> tuple[Free, ..
         for i in range(n_recordings):
             suffix = f".{i}" if n_recordings > 1 else ""
             meaning = f"zero offset of {name}" + (f" in recording {i}" if suffix else "")
+            spread, seconds = float(np.nanstd(recordings[i][name])), float(np.ptp(recordings[i]["time"]))
             found.append(Free(f"{ZERO}.{name}{suffix}", 0.0, -bound, bound, state.unit, meaning))
+            if name in spec.sensors.drift:
+                unit = "1/s" if state.unit == "1" else f"{state.unit}/s"
+                rate = Free(f"{ZERO}.{name}{suffix}.{DRIFT}", 0.0, unit=unit, meaning=f"drift of the {meaning}")
+                found.append(replace(rate, typical=spread / seconds))
     for i, table in enumerate(spec.recordings):
         if table.drive == "known" and table.phase is None:
             meaning = f"phase of the drive at time 0 of recording {i}, in drive periods"

@@ -18,6 +18,7 @@ from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
 from pipeline.rig.identify.build import Built, build, read_all
 from pipeline.rig.identify.directory import Outcomes, Source
+from pipeline.rig.identify.drifts import drift_warnings
 from pipeline.rig.identify.identifiability import Curvature, Profile, estimate_frequencies, following, profile
 from pipeline.rig.identify.judgement import judge, judge_fit
 from pipeline.rig.identify.local import Fit, fit_local
@@ -249,7 +250,10 @@ def _sizes(problem: Problem, best: Fit) -> np.ndarray:
     if problem.pieces:
         measured = np.concatenate([p.measured for p in problem.pieces])
         spread = dict(zip(problem.channels, np.nanstd(measured, axis=0), strict=True))
-    sensed = [spread[f.name.split(".")[1]] if f.name.startswith(f"{ZERO}.") else f.typical for f in problem.free]
+    sensed = [
+        spread[f.name.split(".")[1]] if f.name.startswith(f"{ZERO}.") and np.isnan(f.typical) else f.typical
+        for f in problem.free
+    ]
     return identifiability.sizes_of(best.theta, problem.start, problem.lower, problem.upper, np.array(sensed))
 
 
@@ -266,6 +270,7 @@ def _warnings(found: reports.Finding, profiles: Mapping[str, Profile]) -> list[s
     sd = np.array([f.prior_sd for f in problem.free])
     lines = identifiability.warnings_of(problem.names, found.directions, found.covariance, sd, found.at_bound)
     lines += [w for f in found.frequencies if (w := f.warning)]
+    lines += drift_warnings(problem, found.best.residuals)
     lines += [
         f"the profile of {name} passes a better fit than the best; raise search.n_starts."
         for name, p in profiles.items()

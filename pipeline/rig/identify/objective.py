@@ -81,7 +81,7 @@ def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) ->
         blocks = [_block(problem, k, thetas[i], member, slopes) for k in range(len(problem.pieces))]
         blocks += _gaps(problem, starts[i], member, slopes)
         residuals = tuple(
-            p.measured - _read(problem, k, member.states[k]) - problem.zeros[p.recording] @ thetas[i]
+            p.measured - _read(problem, k, member.states[k]) - problem.offsets(p) @ thetas[i]
             for k, p in enumerate(problem.pieces)
         )
         orbits = of_orbits[i]
@@ -221,13 +221,13 @@ def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: boo
     if member.failed[k]:
         rows = np.full(min(int(given.sum()), n_own + 1) if slopes else int(given.sum()), LOST)
         return k, rows, np.zeros((len(rows), n_own))
-    offset = problem.zeros[piece.recording] @ theta
-    z = ((piece.measured - _read(problem, k, member.states[k]) - offset) / problem.noise)[given]
+    offsets = problem.offsets(piece)
+    z = ((piece.measured - _read(problem, k, member.states[k]) - offsets @ theta) / problem.noise)[given]
     rows, factor = _robust(z, problem)
     if not slopes:
         return k, rows, np.zeros((len(rows), n_own))
     jacobian = np.zeros((len(rows), n_own))
-    zero = -problem.zeros[piece.recording] / problem.noise[:, None]
+    zero = -offsets / problem.noise[:, None]
     jacobian[:, :n_free] = np.broadcast_to(zero, (*given.shape, n_free))[given]
     moved = -_read(problem, k, member.slopes[:, k]) / problem.noise
     jacobian[:, [*problem.sloped, *range(n_free, n_own)]] += moved[:, given].T

@@ -20,6 +20,9 @@ from pipeline.analysis.branches.carrying import OrbitData, Solution
 ZERO = "zero"
 """Prefix of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
 
+DRIFT = "drift"
+"""End of the name of the rate at which a sensor's zero moves: ``zero.CHANNEL.drift``."""
+
 PHASE, DETUNING = "phase", "detuning"
 """Prefixes of the names of a known drive's unknowns: ``phase.RECORDING`` at the recording's time 0 [drive periods], and
 ``detuning.RECORDING``, its frequency less the stated one [Hz]."""
@@ -40,8 +43,8 @@ def steady_drive(
 class Free:
     """Unknown of the fit: a parameter of the model, the zero offset of a sensor, or the phase of a known drive."""
 
-    # name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one;
-    # ``phase.RECORDING``
+    # name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one, and with
+    # ``.drift`` after it the rate at which this zero moves; ``phase.RECORDING``
     name: str
     # first guess and bounds [SI]
     start: float
@@ -183,15 +186,28 @@ class Problem:
         return 1 + max([*named, *(p.recording for p in self.pieces)], default=0)
 
     @cached_property
-    def zeros(self) -> np.ndarray:
-        """Derivatives of each channel's offset by the unknowns (0 or 1), shape (recording, n_channels, n_free)."""
-        found = np.zeros((self._n_recordings, len(self.channels), len(self.free)))
+    def _zeros(self) -> np.ndarray:
+        """Derivatives of each channel's offset at time 0, and of its rate, by the unknowns (0 or 1), shape
+        (2, recording, n_channels, n_free).
+        """
+        found = np.zeros((2, self._n_recordings, len(self.channels), len(self.free)))
         for i, f in enumerate(self.free):
             word, *rest = f.name.split(".")
             if word == ZERO:
-                which = slice(None) if len(rest) == 1 else int(rest[1])
-                found[which, self.channels.index(rest[0]), i] = 1.0
+                moves = rest[-1] == DRIFT and len(rest) > 1
+                which = int(rest[1]) if len(rest) > 1 + moves else slice(None)
+                found[int(moves), which, self.channels.index(rest[0]), i] = 1.0
         return found
+
+    def offsets(self, piece: Piece) -> np.ndarray:
+        """Return the derivatives of the channels' offsets by the unknowns at the samples of a piece.
+
+        Shape (n, n_channels, n_free), with n = 1 if no zero drifts.
+        """
+        constant, rate = self._zeros[:, piece.recording]
+        if not rate.any():
+            return np.asarray(constant[None])
+        return np.asarray(constant + (piece.begin_s + piece.time)[:, None, None] * rate)
 
     @cached_property
     def state_noise(self) -> np.ndarray:
@@ -246,7 +262,7 @@ class Problem:
             f.name not in held and f.name in fixed for f in self.free
         ]
         pieces = tuple(
-            replace(p, measured=p.measured - self.zeros[p.recording] @ offset).turned(*self.turns[p.recording] @ offset)
+            replace(p, measured=p.measured - self.offsets(p) @ offset).turned(*self.turns[p.recording] @ offset)
             for p in self.pieces
         )
         return replace(self, fixed=self.fixed.replace(**held), free=kept, pieces=pieces)

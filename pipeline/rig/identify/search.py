@@ -314,14 +314,14 @@ def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
     t = piece.time[window] - piece.time[at]
     state = np.array(piece.start)
     names = problem.model.state_names
-    zeros = problem.zeros[piece.recording] @ problem.start
+    zeros = problem.offsets(piece) @ problem.start
     for k, name in enumerate(problem.channels):
         x = piece.measured[window, k]
         good = np.isfinite(x)
         if good.sum() < 4:
             continue
         value, rate = np.polynomial.polynomial.polyfit(t[good], x[good], min(3, int(good.sum()) - 1))[:2]
-        state[names.index(name)] = value - zeros[k]
+        state[names.index(name)] = value - zeros[min(at, len(zeros) - 1), k]
         rate_name = problem.model.state(name).rate
         if rate_name and rate_name not in problem.channels:
             state[names.index(rate_name)] = rate

@@ -274,6 +274,9 @@ class SensorsTable(Table):
     zero: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         (), description="Channels whose zero is unknown: one offset per recording"
     )
+    drift: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        (), description="Channels of zero whose zero also moves at a constant unknown rate: one per recording"
+    )
 
 
 class RecordingTable(Table):
@@ -404,7 +407,7 @@ class IdentificationSpec:
                 for u in self.unknowns
             },
             "tied": {name: [factor, other] for name, (factor, other) in self.tied.items()},
-            "sensors": self.sensors.model_dump(mode="json"),
+            "sensors": self.sensors.model_dump(mode="json", exclude=set() if self.sensors.drift else {"drift"}),
             "recordings": [r.model_dump(mode="json", exclude_none=True) for r in self.recordings],
             "orbits": [t.model_dump(mode="json", exclude_none=True) for t in self.orbits],
             "fit": self.fit.model_dump(mode="json"),
@@ -555,6 +558,7 @@ def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable 
     """Return problems with channels that are not states of the model."""
     named = {
         "sensors.zero": sensors.zero if sensors is not None else (),
+        "sensors.drift": sensors.drift if sensors is not None else (),
         "fit.channels": fit.channels if fit is not None else (),
         "fit.noise": tuple(fit.noise) if fit is not None else (),
     }
@@ -564,6 +568,11 @@ def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable 
         for key, names in named.items()
         for name in names
         if name not in known
+    ]
+    problems += [
+        f"sensors.drift: {name!r} is not among sensors.zero; its zero at time 0 is unknown as well: add it there."
+        for name in (sensors.drift if sensors is not None else ())
+        if name in known and name not in (sensors.zero if sensors is not None else ())
     ]
     if fit is not None and sensors is not None and fit.channels:
         problems += [

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 
 from magpend_core.models import load_model
 from magpend_core.sampling import Drive
+from pipeline.rig.identify.drifts import drift_warnings
 from pipeline.rig.identify.local import fit_local, fit_starts
 from pipeline.rig.identify.objective import _steps, evaluate
 from pipeline.rig.identify.problem import Free, Piece, Problem
@@ -155,6 +156,62 @@ def test_fit_local__holds_what_is_fixed():
     some = fit_local(problem, problem.start, fixed={"cubic": 0.9, "zero.x": ZERO})
     assert some.theta[problem.names.index("cubic")] == 0.9
     assert some.cost > 100 * fit.cost
+
+
+RATE = 2e-3
+"""Rate at which the zero of the made sensor moves [1/s]."""
+
+
+def drifting():
+    """The problem with a zero that moves, in pieces that begin at 0, 10 and 20 s."""
+    problem = make_problem(NOISE)
+    pieces = [
+        replace(p, begin_s=10.0 * k, measured=p.measured + RATE * (10.0 * k + p.time)[:, None])
+        for k, p in enumerate(problem.pieces)
+    ]
+    return replace(problem, pieces=tuple(pieces))
+
+
+def test_offsets__of_a_zero_that_drifts_follow_the_recordings_clock():
+    problem = drifting()
+    assert problem.offsets(problem.pieces[1]).shape == (1, 1, 5)
+    both = replace(problem, free=(*problem.free, Free("zero.x.drift", 0.0, typical=0.01)))
+    theta = np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.1])
+    np.testing.assert_allclose((both.offsets(both.pieces[1]) @ theta)[:, 0], 0.5 + 0.1 * (10.0 + both.pieces[1].time))
+    assert both.sloped == (0, 1, 2, 3)
+    # what is held is taken from the measured values
+    held = both.without({"zero.x": 0.5, "zero.x.drift": 0.1})
+    gone = both.pieces[1].measured - held.pieces[1].measured
+    np.testing.assert_allclose(gone[:, 0], 0.5 + 0.1 * (10.0 + both.pieces[1].time))
+    # of several recordings each has its own
+    own = replace(problem, free=(Free("zero.x.0", 0.0), Free("zero.x.0.drift", 0.0)))
+    np.testing.assert_allclose(own.offsets(own.pieces[2])[:, 0, 1], 20.0 + own.pieces[2].time)
+
+
+@pytest.mark.slow
+def test_fit_local__a_zero_that_drifts_is_found_and_told():
+    problem = drifting()
+    without = fit_local(problem, problem.start)
+    (told,) = drift_warnings(problem, without.residuals)
+    assert 'sensors.drift = ["x"]' in told
+    both = replace(problem, free=(*problem.free, Free("zero.x.drift", 0.0, typical=0.01)))
+    fit = fit_local(both, both.start)
+    assert fit.converged
+    assert fit.theta[-1] == pytest.approx(RATE, rel=0.05)
+    assert fit.rms[0] == pytest.approx(NOISE, rel=0.1)
+    assert drift_warnings(both, fit.residuals) == []
+
+
+def test_drift_warnings__noise_and_a_swing_are_no_drift():
+    problem = drifting()
+    noise = [np.random.default_rng(k).normal(size=(161, 1)) for k in range(3)]
+    swing = [np.sin(3.0 * p.time)[:, None] for p in problem.pieces]
+    for residuals in (noise, swing):
+        assert drift_warnings(problem, residuals) == []
+    moved = [n + 0.2 * (p.begin_s + p.time)[:, None] for n, p in zip(noise, problem.pieces, strict=True)]
+    (told,) = drift_warnings(problem, moved)
+    assert told.startswith("the residuals of x drift by +5.")
+    assert "over 28 s" in told
 
 
 def test_fit_starts__finds_each_start_by_itself():

@@ -91,6 +91,7 @@ def test_tied__is_a_number_times_a_name(parse, text, tie):
         ("mean = 1.0, sd = 0.1", "mean = 1.0", ("identify.linear.prior.sd", "missing")),
         ("mean = 1.0, sd = 0.1", "mean = 1.0, sd = 0", ("identify.linear.prior.sd", "greater than 0")),
         ('zero = ["x"]', 'zero = ["y"]', ("sensors.zero", "'y' is not a state")),
+        ('zero = ["x"]', 'drift = ["x"]', ("sensors.drift: 'x' is not among sensors.zero",)),
         ("hold_out = [1]", "hold_out = [1, 1]", ("hold_out", "twice")),
         ("hold_out = [1]", "window_s = [3.0, 1.0]", ("window_s", "empty")),
         ('file = "a.csv"', 'file = "b.csv"', ("recordings[0].file", "no such file")),
