@@ -117,7 +117,7 @@ def plot_response(
 
 
 def _stored(ds: xr.Dataset, points: xr.Dataset | None) -> xr.Dataset:
-    measured = {} if points is None else {f"measured_{name}": v.variable for name, v in points.variables.items()}
+    measured = {} if points is None else {f"measured_{name}": v for name, v in points.variables.items()}
     return style.storable(ds, "frequency response").assign(measured)
 
 

@@ -243,7 +243,7 @@ def free_of(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> tuple
         for i in range(n_recordings):
             suffix = f".{i}" if n_recordings > 1 else ""
             meaning = f"zero offset of {name}" + (f" in recording {i}" if suffix else "")
-            spread, seconds = float(np.nanstd(recordings[i][name])), float(np.ptp(recordings[i]["time"]))
+            spread, seconds = float(np.nanstd(recordings[i][name].values)), float(np.ptp(recordings[i]["time"].values))
             found.append(Free(f"{ZERO}.{name}{suffix}", 0.0, -bound, bound, state.unit, meaning))
             if name in spec.sensors.drift:
                 unit = "1/s" if state.unit == "1" else f"{state.unit}/s"
