@@ -50,6 +50,12 @@ def values(one: xr.Dataset, *names: str) -> Row:
     return {n: words_of(one[n])[v] if "flag_meanings" in one[n].attrs else v for n, v in found.items()}
 
 
+def state_columns(names: Iterable[str], taken: Iterable[str]) -> dict[str, str]:
+    """Return the column of each state beside other columns: ``state_NAME`` where one of these has the state's name."""
+    others = set(taken)
+    return {name: f"state_{name}" if name in others else name for name in names}
+
+
 def counted(n: int, noun: str) -> str:
     """Format a number with its noun, in the plural unless the number is 1."""
     return f"{n} {noun}{'' if n == 1 else 's'}"

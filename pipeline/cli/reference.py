@@ -246,7 +246,10 @@ def identification() -> str:
     return "\n\n".join(_keys(*part) for part in parts)
 
 
-_STATES = "Give each state of the model under its own name: {}. For an angle or its rate, `NAME_deg` takes degrees."
+_STATES = (
+    "Give each state of the model under its own name: {}. For an angle or its rate, `NAME_deg` takes degrees. "
+    "States may also stand in a table `states = {{ NAME = ... }}`, and one with the name of a key of this table must."
+)
 
 
 def products() -> str:

@@ -16,7 +16,15 @@ from pipeline.specification.files import check_new_file, find_spec, merged, nest
 from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.spec import Spec
-from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
+from pipeline.specification.starts import (
+    GridStarts,
+    ListStarts,
+    RandomStarts,
+    degrees_key,
+    put_start,
+    state_keys,
+    state_of_key,
+)
 from pipeline.specification.tables import FREQUENCY, RATES, Range
 from pipeline.store.local import refuse_place
 
@@ -188,7 +196,8 @@ def _old(spec: Spec, key: str) -> tuple[Any, float]:
     if state is None:
         return spec.axes.get(FREQUENCY if is_rate(spec, key) else key), 1.0
     for name in (state, degrees_key(state)):
-        value = getattr(spec.initial_conditions, name, None)
+        starts = spec.initial_conditions
+        value = None if isinstance(starts, ListStarts) else starts.of(name)
         if value is not None:
             same = name == key
             return value, 1.0 if same else (math.pi / 180 if name != state else 180 / math.pi)
@@ -221,9 +230,8 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
     """Set the value or range of a state or parameter in the plain data (dicts) of a specification."""
     state = _state(spec, key)
     if state is not None:
-        data["initial_conditions"].pop(state, None)
-        data["initial_conditions"].pop(degrees_key(state), None)
-        data["initial_conditions"][key] = value
+        assert not isinstance(spec.initial_conditions, ListStarts)
+        put_start(data["initial_conditions"], key, value, spec.initial_conditions)
         return
     table = data["parameters"] if is_rate(spec, key) else data["parameters"]["overrides"]
     for name in RATES if is_rate(spec, key) else (key,):

@@ -25,7 +25,7 @@ from pipeline.specification.parameters import parameter_problems, size_problems
 from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
 from pipeline.specification.recorded_drive import HOW, DriveTable, recorded, run_problems
 from pipeline.specification.section import SectionTable, section_of, seen_through
-from pipeline.specification.starts import STARTS, Starts, refine_problems, starts_model
+from pipeline.specification.starts import STARTS, STATES, Starts, refine_problems, starts_model, state_below
 from pipeline.specification.tables import (
     FREQUENCY,
     RANGES,
@@ -297,7 +297,13 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
             f"instead of {kind!r}."
         )
         table = {key: value for key, value in table.items() if key != "refine"}
-    starts: Starts | None = checked(starts_model(kind, model), table, "initial_conditions", problems)
+    own: list[str] = []
+    starts: Starts | None = checked(starts_model(kind, model), table, "initial_conditions", own)
+    hidden = [name for name in model.state_names if kind != "list" and name in (*STARTS[kind].model_fields, STATES)]
+    for problem in own:
+        words = problem.replace(":", " ").split(maxsplit=1)[0]
+        key = words.removeprefix("initial_conditions.")
+        problems.append(f"{problem} To start the state, give {state_below(key)}." if key in hidden else problem)
     return starts
 
 

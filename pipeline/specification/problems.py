@@ -187,7 +187,7 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
     if len([part for part in location if not str(part).startswith(_TAG)]) == 1:
-        return list(model.model_fields)
+        return [field.alias or name for name, field in model.model_fields.items()]
     nested = getattr(model, "nested_model", None)
     return list(nested.model_fields) if nested is not None else []
 

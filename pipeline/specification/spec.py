@@ -45,7 +45,7 @@ from pipeline.specification.parsing import TABLES, valid_tables
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.recorded_drive import DriveTable, RecordedDrive, recorded
 from pipeline.specification.section import SectionTable, seen_through
-from pipeline.specification.starts import GridStarts, Starts
+from pipeline.specification.starts import STATES, GridStarts, Starts
 from pipeline.specification.table_methods import TableMethod, knows_its_keys
 from pipeline.specification.tables import (
     FREQUENCY,
@@ -330,7 +330,12 @@ class Spec:
 
     @knows_its_keys
     def with_start_grid(
-        self, *, refine: int | None = None, **states: float | tuple[float, float, int] | Numbers | Mapping[str, Any]
+        self,
+        /,
+        *,
+        refine: int | None = None,
+        states: Mapping[str, Any] | None = None,
+        **named: float | tuple[float, float, int] | Numbers | Mapping[str, Any],
     ) -> Self:
         """Start on a grid of initial states.
 
@@ -339,10 +344,13 @@ class Spec:
         refine
             Stride of the cells that are computed first: 2, 4, 8, 16, 32, 64.
         states
+            States whose names are keywords here, such as ``states={"refine": (-1, 1, 11)}``; or any others.
+        named
             States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number, ``(start, stop,
             num)``, a list of values, or a table with the keys of `with_axis`. States not given are 0.
         """
-        return self._replaced("initial_conditions", {"kind": "grid", "refine": refine, **states})
+        own = {"kind": "grid", "refine": refine, "states": states and {k: _range(v) for k, v in states.items()}}
+        return self._replaced("initial_conditions", {**own, **{k: _range(v) for k, v in named.items()}})
 
     @knows_its_keys
     def with_start_list(self, points: Rows | None = None, points_deg: Rows | None = None) -> Self:
@@ -358,7 +366,15 @@ class Spec:
         return self._replaced("initial_conditions", {"kind": "list", "points": points, "points_deg": points_deg})
 
     @knows_its_keys
-    def with_start_random(self, *, n: int, seed: int | None = None, **states: float | tuple[float, float]) -> Self:
+    def with_start_random(
+        self,
+        /,
+        *,
+        n: int,
+        seed: int | None = None,
+        states: Mapping[str, float | tuple[float, float]] | None = None,
+        **named: float | tuple[float, float],
+    ) -> Self:
         """Start from random initial states in a box.
 
         Parameters
@@ -368,9 +384,12 @@ class Spec:
         seed
             Seed of the random numbers; 0 or more.
         states
+            States whose names are keywords here, such as ``states={"n": (-1, 1)}``; or any others.
+        named
             States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number or ``(low, high)``.
         """
-        return self._replaced("initial_conditions", {"kind": "random", "n": n, "seed": seed, **states})
+        own = {"kind": "random", "n": n, "seed": seed, "states": states and dict(states)}
+        return self._replaced("initial_conditions", {**own, **named})
 
     with_parameters = TableMethod(ParametersTable, "Set values of the model's parameters.")
     with_section = TableMethod(SectionTable, "Take sections where a state crosses a level.")
@@ -439,7 +458,7 @@ class Spec:
             table = getattr(self, name)
             if table is not None:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
-        tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
+        tables["initial_conditions"] = self.initial_conditions.plain()
         tables["products"] = {name: options.plain() for name, options in self.products.items()}
         if self.drift:
             tables["drift"] = {name: table.plain() for name, table in self.drift.items()}
@@ -505,8 +524,7 @@ class Spec:
         return self._of(merged(self.tables, _below(path, plain_tables(given))), self._folder)
 
     def _replaced(self, path: str, keys: Table) -> Self:
-        is_grid = keys.get("kind") == "grid"
-        given = {key: _range(value) if is_grid else value for key, value in keys.items() if value is not None}
+        given = {key: value for key, value in keys.items() if value is not None}
         outer, _, name = path.partition(".")
         table, others = plain_tables(given), self.tables.get(outer)
         kept = others if name and isinstance(others, dict) else {}
@@ -523,16 +541,21 @@ def _problems_and_tables(tables: Table, folder: str | Path | None) -> tuple[list
 def _ends_of_ranges(data: dict[str, Any]) -> dict[str, Any]:
     """Return a valid specification with the ends of each axis and range of states, and at most two other starts."""
     starts = dict(data["initial_conditions"])
-    starts.pop("refine", None)
-    for key, value in starts.items():
-        if isinstance(value, dict):
-            starts[key] = _ends(value)
-        elif key in ("points", "points_deg"):
-            starts[key] = value[:2]
-    if "n" in starts:
+    kind = starts.get("kind")
+    if kind == "grid":
+        starts.pop("refine", None)
+        below = {STATES: _grid_ends(starts[STATES])} if STATES in starts else {}
+        starts = {**_grid_ends(starts), **below}
+    elif kind == "list":
+        starts |= {key: starts[key][:2] for key in ("points", "points_deg") if key in starts}
+    elif "n" in starts:
         starts["n"] = min(starts["n"], 2)
     axes = {name: _ends(axis) for name, axis in data.get("axes", {}).items()}
     return {**data, "initial_conditions": starts, **({"axes": axes} if axes else {})}
+
+
+def _grid_ends(states: dict[str, Any]) -> dict[str, Any]:
+    return {key: _ends(value) if isinstance(value, dict) and key != STATES else value for key, value in states.items()}
 
 
 def _ends(values: dict[str, Any]) -> dict[str, Any]:

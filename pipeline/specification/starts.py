@@ -6,13 +6,21 @@ name. The pydantic model of each table is created for each `Model`.
 
 from __future__ import annotations
 
+from collections.abc import Container, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, Discriminator, Field, Tag, create_model, model_validator
 
 from magpend_core.models.model import Model
+from pipeline.specification.problems import shown
 from pipeline.specification.tables import MAX_POINTS, Integration, Range, Table
+
+STATES = "states"
+"""Key of the table of states below the table of initial conditions."""
+
+BELOW = f"{STATES}."
+"""Beginning of the aliases of its entries."""
 
 STRIDES = (2, 4, 8, 16, 32, 64)
 IN_DEGREES = ("rad", "rad/s")
@@ -65,20 +73,76 @@ def state_of_key(key: str, model: Model) -> str | None:
 
 
 class _PerState(Table):
-    """Base class of tables with a value or range per state; `starts_model` adds the fields."""
+    """Base class of tables with a value or range per state; `starts_model` adds the fields.
+
+    A state's key stands beside the table's own keys, or in the table ``states`` below it: there under any name, so that
+    a state may be called as one of the table's own keys. Fields have neutral names, and the keys as aliases.
+    """
 
     system: ClassVar[Model]
+    fields_by_key: ClassVar[Mapping[str, str]] = {}  # fields of the states, by state key
+    own_keys: ClassVar[tuple[str, ...]] = ()  # keys of the table that set no state
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, table: Any) -> Any:
+        """Move the entries of the table ``states`` to their aliases."""
+        below = table.get(STATES) if isinstance(table, Mapping) else None
+        if below is None:
+            return table
+        if not isinstance(below, Mapping):
+            raise ValueError(f"{STATES} = {shown(below)}: must be a table of states, such as {STATES} = {{x = 0.5}}.")
+        if twice := [key for key in below if key in table and key not in cls.own_keys]:
+            raise ValueError(f"{twice[0]} and {STATES}.{twice[0]} are both given; keep one.")
+        beside = {key: value for key, value in table.items() if key != STATES}
+        return beside | {alias_of(key, cls.own_keys, cls.fields_by_key): value for key, value in below.items()}
 
     @model_validator(mode="after")
     def _one_unit(self) -> _PerState:
+        given = self.given
         for name in self.system.state_names:
-            if self.of(name) is not None and getattr(self, degrees_key(name), None) is not None:
+            if name in given and degrees_key(name) in given and degrees_key(name) not in self.system.state_names:
                 raise ValueError(f"{name} and {degrees_key(name)} are both given; keep one.")
         return self
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Values that are given, by state key: the name of a state, or the name with ``_deg``."""
+        values = {key: getattr(self, field) for key, field in self.fields_by_key.items()}
+        return {key: value for key, value in values.items() if value is not None}
+
     def of(self, key: str) -> Any:
         """Return the value given for a state key, such as ``x`` or ``x_deg``; None if it is not given."""
-        return getattr(self, key, None)
+        return self.given.get(key)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the table as plain values, as it stands in a specification."""
+        found = self.model_dump(mode="json", exclude_none=True, by_alias=True)
+        own = {key: value for key, value in found.items() if not key.startswith(BELOW)}
+        below = {key.removeprefix(BELOW): value for key, value in found.items() if key.startswith(BELOW)}
+        return {**own, **({STATES: below} if below else {})}
+
+
+def alias_of(key: str, own: Sequence[str], known: Container[str] = ()) -> str:
+    """Return the alias of a state's key in the table of initial conditions: below `STATES` if a key of the table has
+    the name, or if the key is not known.
+    """
+    return key if key in known and key not in own else BELOW + key
+
+
+def put_start(table: dict[str, Any], key: str, value: Any, starts: GridStarts | RandomStarts) -> None:
+    """Set the value or range of a state in the plain table of initial conditions, in place of what it has of this
+    state.
+    """
+    below = dict(table.pop(STATES, {}))
+    state = state_of_key(key, starts.system)
+    for name in [one for one in state_keys(starts.system) if state_of_key(one, starts.system) == state]:
+        below.pop(name, None)
+        if name not in starts.own_keys:
+            table.pop(name, None)
+    (below if key in starts.own_keys else table)[key] = value
+    if below:
+        table[STATES] = below
 
 
 def _power_of_two(stride: int) -> int:
@@ -103,7 +167,7 @@ class GridStarts(_PerState):
     @property
     def ranges(self) -> dict[str, Range]:
         """Ranges that span the grid, by state key (the name of a state, or the name with ``_deg``)."""
-        return {key: value for key, value in self if isinstance(value, Range)}
+        return {key: value for key, value in self.given.items() if isinstance(value, Range)}
 
 
 class ListStarts(Table):
@@ -134,6 +198,10 @@ class ListStarts(Table):
                 raise ValueError(f"row {i} has {len(row)} numbers; give {wanted}.")
         return self
 
+    def plain(self) -> dict[str, Any]:
+        """Return the table as plain values, as it stands in a specification."""
+        return self.model_dump(mode="json", exclude_none=True)
+
 
 def positions(model: Model) -> tuple[str, ...]:
     """Return the names of the states before the velocities. A row in a list of initial conditions may give these states
@@ -154,7 +222,7 @@ class RandomStarts(_PerState):
 
     @model_validator(mode="after")
     def _boxes(self) -> RandomStarts:
-        for key, value in self:
+        for key, value in self.given.items():
             if isinstance(value, tuple):
                 try:
                     _rising(value)
@@ -180,22 +248,32 @@ def starts_model(kind: str, model: Model) -> type[Starts]:
     """
     base = STARTS[kind]
     annotation: Any = {"grid": Extent | None, "random": Interval | None}.get(kind)
-    fields: Any = {} if annotation is None else dict.fromkeys(state_keys(model), (annotation, None))
+    keys = () if annotation is None else state_keys(model)
+    own = (*base.model_fields, STATES)
+    fields: Any = {f"state_{i}": (annotation, Field(None, alias=alias_of(k, own, keys))) for i, k in enumerate(keys)}
     made: type[Starts] = create_model(base.__name__, __base__=base, __module__=__name__, **fields)
     made.system = model
+    if issubclass(made, _PerState):
+        made.fields_by_key, made.own_keys = dict(zip(keys, fields, strict=True)), own
     return made
 
 
 def start_remarks(starts: Starts) -> list[str]:
     """Return a line that names the states whose start is not given, with the start taken; empty if all are given."""
-    states = starts.system.states
+    states, own = starts.system.states, () if isinstance(starts, ListStarts) else starts.own_keys
     if isinstance(starts, ListStarts):
         left = states[min(map(len, starts.points or starts.points_deg or ())) :]
     else:
-        given = {state_of_key(key, starts.system) for key, value in starts if value is not None}
+        given = {state_of_key(key, starts.system) for key in starts.given}
         left = tuple(state for state in states if state.name not in given)
     taken = ", ".join(f"{state.name} = 0 {state.unit}".rstrip() for state in left)
-    return [f"starts not given, so taken as 0: {taken} (set in initial_conditions)"] if left else []
+    hidden = "".join(f"; {state_below(state.name)}" for state in left if state.name in own)
+    return [f"starts not given, so taken as 0: {taken} (set in initial_conditions{hidden})"] if left else []
+
+
+def state_below(name: str) -> str:
+    """Say where a state is given whose name is that of a key of the table of initial conditions."""
+    return f"the state {name} in its table {STATES} = {{{name} = ...}}"
 
 
 def refine_problems(kind: str, starts: Starts | None, integration: Integration | None, model: Model) -> list[str]:

@@ -26,6 +26,7 @@ from pipeline.analysis.tabular import (
     point_table,
     points_of,
     ranges,
+    state_columns,
     summary,
     with_interval,
     words_of,
@@ -250,7 +251,7 @@ def _attractor_words(row: Row, n_points: int, unit: str) -> Words:
     decided = [f"{n} {plain(k.removeprefix('by_'))}" for k, n in row.items() if k.startswith("by_") and n]
     flow = "eigenvalue_real" in row  # returns of a flow differ in length
     open_set = row["kind"] in ("torus", "chaotic_set", "bounded_set")
-    return {
+    words = {
         "id": str(row["attractor_id"]),
         "kind": _kind(row),
         "stability": plain(row["stability"]),
@@ -266,10 +267,11 @@ def _attractor_words(row: Row, n_points: int, unit: str) -> Words:
         "mirror": _known(row["mirror_partner"]) if "mirror_partner" in row else None,
         "letter": letter(row["attractor_id"]),
         "id by": plain(row["match_basis"]) if n_points > 1 and "match_basis" in row else None,
-        **_place(row),
-        "decided": ", ".join(decided),
-        "shown by": _shown_by(row),
     }
+    last = {"decided": ", ".join(decided), "shown by": _shown_by(row)}
+    place = _place(row)
+    columns = state_columns(place, [*words, *last])
+    return {**words, **{columns[name]: text for name, text in place.items()}, **last}
 
 
 def _place(row: Row) -> Words:

@@ -24,7 +24,7 @@ from pipeline.analysis.branches.problems import state_units
 from pipeline.analysis.branches.starting_orbits import parameters_at, sections_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
-from pipeline.analysis.tabular import Row, Words, aligned, counted
+from pipeline.analysis.tabular import Row, Words, aligned, counted, state_columns
 from pipeline.layout.vocabulary import (
     model_attribute,
     model_of,
@@ -158,13 +158,14 @@ def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
 
 def _row(one: xr.Dataset, at_rest: bool, is_crossing: bool) -> Row:
     values = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
+    columns = state_columns(map(str, one["state"].values), [*_COLUMNS, "unstable", "multiplier", "hits", "seconds"])
     return {
         "period": 0 if at_rest else int(one["orbit_period"]),
         **({"period_s": float(one["period_s"])} if is_crossing else {}),
         "n_unstable": int(one["n_unstable"]),
         "multiplier_real": float(values[0].real),
         "multiplier_imag": float(values[0].imag),
-        **{str(name): float(v) for name, v in zip(one["state"].values, one["section"].values[0], strict=True)},
+        **dict(zip(columns.values(), one["section"].values[0].tolist(), strict=True)),
         "n_hits": int(one["n_hits"]),
         "index": int(one["index"]),
     }
