@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magpend_core.models import load_model
-from magpend_core.models.text.definition import Definition
+from magpend_core.models.text.definition import OMEGA, Definition
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.sizes import natural_size
@@ -91,10 +91,19 @@ def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping
                     name,
                     f"model.equations.{name} = {definition.table['equations'][name]!r}: does not repeat after a period "
                     f"of the drive, 1/f, at {at}. Time must enter with this period: write 2*pi*f*t, or phase, and give "
-                    "the drive's rate as frequency_hz.",
+                    f"the drive's rate as frequency_hz.{_hiding(model, name)}",
                 )
     if problems:
         raise SpecError(list(problems.values()))
+
+
+def _hiding(model: TextModel, name: str) -> str:
+    """Say that ``omega`` in an equation is a state or parameter of the model, if it is."""
+    definition = model.definition
+    if OMEGA not in definition.used([definition.equations[name]]):
+        return ""
+    own = {**dict.fromkeys(model.parameter_names, "parameter"), **{s.name: "state" for s in definition.states}}
+    return f" Here {OMEGA} is a {own[OMEGA]} of the model, which hides the drive's." if OMEGA in own else ""
 
 
 def _rates(model: TextModel, states: np.ndarray, point: Mapping[str, Any], late: float) -> dict[str, np.ndarray]:

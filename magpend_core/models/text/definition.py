@@ -13,6 +13,9 @@ from magpend_core.models.parameters import Parameter
 from magpend_core.models.text.grammar import Tree, names
 from magpend_core.models.text.writing import written
 
+OMEGA = "omega"
+"""The drive's angular frequency, in a text that uses time and gives the name no other meaning."""
+
 
 @dataclass(frozen=True)
 class Impact:
@@ -117,10 +120,17 @@ class Definition:
     @property
     def autonomous(self) -> bool:
         """Whether it is a flow, of which neither equations nor impacts depend on time or frequency."""
-        return not self.is_map and not {"t", "f", "phase"} & set(self.used(self.dynamics))
+        return not self.is_map and not self.has_drive
+
+    @property
+    def has_drive(self) -> bool:
+        """Whether an expression of the equations or the impacts depends on time or on the drive's frequency."""
+        return bool({"t", "f", "phase"} & set(self.used(self.dynamics)))
 
     def remarks(self) -> list[str]:
-        """Return a sentence for each parameter and each definition that no expression uses."""
+        """Return a sentence for each parameter and each definition that no expression uses, and for a state with the
+        name of the drive's angular frequency.
+        """
         trees = [*self.dynamics, *self.quantities.values()]
         if self.drawing is not None:
             trees += [t for pair in (*self.drawing.points.values(), *self.drawing.fixed.values()) for t in pair]
@@ -128,7 +138,13 @@ class Definition:
             trees += self.classifier.words.values()
         used = set(self.used(trees))
         own = {**{p.name: "parameters" for p in self.parameters}, **dict.fromkeys(self.define, "define")}
-        return [
+        hidden = [
+            f"model.states.{s.name}: this state hides the drive's angular frequency, for which {s.name} stands "
+            f"elsewhere; write 2*pi*f for that of the drive, or rename the state, such as {s.name}_."
+            for s in self.states
+            if s.name == OMEGA and self.has_drive
+        ]
+        return hidden + [
             f"model.{table}.{name}: nothing uses it; {_suggestion(name, table, used)}"
             for name, table in own.items()
             if name not in used

@@ -13,7 +13,7 @@ from typing import Any
 
 from magpend_core.models.model import Mirror, Quantity, State
 from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
-from magpend_core.models.text.definition import Definition, Impact
+from magpend_core.models.text.definition import OMEGA, Definition, Impact
 from magpend_core.models.text.grammar import Tree, names
 from magpend_core.models.text.latex import symbol_of
 from magpend_core.models.text.scene import mirror_problem
@@ -22,8 +22,6 @@ from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsRead
 from magpend_core.sizes import MAX_STATES
 
 MAX_DEFINED = 200
-OMEGA = "omega"
-"""The drive's angular frequency, in a text that uses time and gives the name no other meaning."""
 ESCAPE = 1e9
 """Bound beyond which a trajectory has diverged, if the text gives none."""
 MAX_FUNCTION = 20_000

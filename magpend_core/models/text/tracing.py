@@ -36,6 +36,10 @@ _PLAIN = (
     "a plain number is needed here, and this value changes with the state, the time or a parameter; use numpy's "
     "functions, such as np.sin, and np.zeros_like(y) for an array of rates"
 )
+_REAL = (
+    "states, parameters and rates are real; write the real and the imaginary part on their own, z = x + i*y as two "
+    "states x and y, and cos(a) and sin(a) in place of exp(1j*a)"
+)
 _COUNTS = (
     "a whole number is needed here, as an index or a count; give it as a constant of the program and not as a parameter"
 )
@@ -161,7 +165,10 @@ class Traced(NDArrayOperatorsMixin):
     def __index__(self) -> int:
         raise UntraceableError(_COUNTS)
 
-    __int__ = __round__ = __trunc__ = __floor__ = __ceil__ = __complex__ = __float__
+    def __complex__(self) -> complex:
+        raise UntraceableError(f"a complex number is made here; {_REAL}")
+
+    __int__ = __round__ = __trunc__ = __floor__ = __ceil__ = __float__
 
 
 class TracedArray(np.ndarray):
@@ -198,7 +205,7 @@ def number(value: Any) -> Traced:
     if isinstance(value, Traced):
         return where(value, 1.0, 0.0) if value.is_condition else value
     if not isinstance(value, numbers.Real | np.bool):
-        raise UntraceableError(f"{value!r} is no real number; states, parameters and rates are real")
+        raise UntraceableError(f"{value!r} is no real number; {_REAL}")
     plain = float(value)
     if not math.isfinite(plain):
         raise UntraceableError(f"{plain} is no finite number")

@@ -97,7 +97,7 @@ def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     cube, attractors = (select_points(ds, options.at, purpose=PURPOSE) for ds in (run.cube(), whole))
     dims, starts = split_dims(attractors["attractor_id"])
     here = attractors.isel(dict.fromkeys(dims, 0))
-    between = _ids_of(here, options.between)
+    between = ids_of(here, options.between)
     (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
     ((_, there),) = destinations_at(cube, attractors, points)
     untold = [name for name, number in zip(options.between, between, strict=True) if number not in there.told]
@@ -116,14 +116,21 @@ def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     return _dataset(there, pairs, on_paths, here).assign_attrs(attrs)
 
 
-def _ids_of(here: xr.Dataset, names: tuple[str, str]) -> tuple[int, int]:
-    """Return the ids of two attractors from their letters; raise ValueError if the point has no such attractors."""
+def ids_of(here: xr.Dataset, names: tuple[str, str]) -> tuple[int, int]:
+    """Return the ids of two attractors from their letters; raise ValueError if the point has no such attractors, or if
+    one of them is a limit cycle that is seen at even times.
+    """
     known = {letter(i): i for i in np.flatnonzero(here["stability"].values == ATTRACTS).tolist()}
     for name in names:
         if name not in known:
             raise ValueError(
                 f"attractor {name} is not at the parameter point; it has {', '.join(known) or 'none'} "
                 "(magpend analyse attractors)."
+            )
+        if here["kind"].values[known[name]] == PERIODIC_ORBIT and not here["orbit_period"].values[known[name]]:
+            raise ValueError(
+                f"--between {' '.join(names)}: attractor {name} is a limit cycle seen at even times, and edge needs "
+                "its crossings to tell what ends on it. Give a new run a table [section], with of, value and direction."
             )
     return known[names[0]], known[names[1]]
 

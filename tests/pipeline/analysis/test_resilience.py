@@ -4,15 +4,16 @@ import json
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.linalg import expm
 
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.resilience.analysis import resilience_table
-from pipeline.analysis.resilience.edge import edge_table
+from pipeline.analysis.resilience.edge import edge_table, ids_of
 from pipeline.analysis.resilience.shocks import Asked, Bases, search_together
-from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, KINDS, PERIODIC_ORBIT
 from pipeline.plots.basins import plot_edge
 from pipeline.plots.resilience import plot_resilience
 from pipeline.products.resilience import ResilienceOptions
@@ -351,6 +352,17 @@ def test_edge__between_sections(computed):
 def test_resilience__refuses(wells, name, options, message):
     with pytest.raises(SpecError, match=message):
         wells.derive(name, **options)
+
+
+def test_edge__needs_a_section_for_a_limit_cycle_at_even_times():
+    """Without crossings it has no period; an equilibrium, an orbit with a period and a chaotic set can be told."""
+    kinds = [EQUILIBRIUM, PERIODIC_ORBIT, PERIODIC_ORBIT, KINDS.index("chaotic_set")]
+    columns = {"kind": kinds, "orbit_period": [0, 0, 2, 0], "stability": [ATTRACTS] * 4}
+    here = xr.Dataset({name: ("attractor", np.array(values)) for name, values in columns.items()})
+    assert ids_of(here, ("A", "C")) == (0, 2)
+    assert ids_of(here, ("A", "D")) == (0, 3)
+    with pytest.raises(ValueError, match=r"attractor B is a limit cycle seen at even times.* a table \[section\]"):
+        ids_of(here, ("A", "B"))
 
 
 @pytest.mark.slow

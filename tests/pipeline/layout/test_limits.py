@@ -155,6 +155,15 @@ ODD = [
 ]
 
 
+def test_commands__name_a_state_that_hides_the_rate_of_the_drive(main, write_spec):
+    text = OWN.format(drive="A*cos(omega*t)").replace("omega = 3.141592653589793\n", "")
+    for old in ("v = {}", '"v"', 'v = "-x - v'):
+        text = text.replace(old, old.replace("v", "omega"))
+    code, _, err = main("run", write_spec(text), "--dry-run")
+    assert code == 2
+    assert "Here omega is a state of the model, which hides the drive's." in err
+
+
 @pytest.mark.parametrize("drive", ODD)
 def test_commands__refuse_other_periods_before_anything_is_created(main, write_spec, tmp_path, drive):
     spec = write_spec(OWN.format(drive=drive))

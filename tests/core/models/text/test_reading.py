@@ -391,6 +391,15 @@ def test_remarks__name_parameters_and_definitions_that_nothing_uses():
     assert {name: load_model(name).remarks for name in model_names() if load_model(name).remarks} == {}
 
 
+@pytest.mark.parametrize(("force", "n"), [("cos(2*pi*f*t)", 1), ("square(phase, 0.5)", 1), ("sin(x)", 0)])
+def test_remarks__name_a_state_that_hides_the_drive(force, n):
+    """A drive's angular frequency is called omega; without a drive the name is free."""
+    equations = {"x": "omega", "omega": f"-x + {force}"}
+    found = read_model({"name": "own", "states": {"x": "1", "omega": "1"}, "equations": equations}).remarks
+    assert [line for line in found if "this state hides the drive's angular frequency" in line] == list(found[:n])
+    assert len([line for line in found if "hides" in line]) == n
+
+
 def turning(rates, more=(), **states):
     """A pendulum-like model by its rates; a state is declared by its table, if it is given one."""
     own = {name: states.get(name, {}) for name in rates}
