@@ -20,6 +20,9 @@ RATE_LEFT, RATE_ROUNDING = 1e-8, 1e-14
 in units of the state's scale and of the Jacobian's norm.
 """
 
+AT_REST = 1e-5
+"""Scaled length of a Newton step up to which the rates themselves vanish at an equilibrium."""
+
 
 @dataclass(frozen=True, eq=False)
 class Equilibria:
@@ -128,3 +131,18 @@ def find_equilibria(system: System, states: np.ndarray, packed: np.ndarray, *, m
         values = np.linalg.eigvals(jacobians[row])
         eigenvalues[row] = values[np.lexsort((values.imag, -values.real))]
     return Equilibria(found, eigenvalues, residual, converged, jacobians)
+
+
+def can_hold(system: System) -> bool:
+    """Return whether states of a system can slide on a switch, or rest on the surface of an impact."""
+    return any(system.slides) or any(system.sticks)
+
+
+def is_held(system: System, state: np.ndarray, packed: np.ndarray) -> bool:
+    """Return whether an equilibrium (n_states,) is one at which a switch or a contact holds the state: the rates do not
+    vanish there, but those along the surface do.
+    """
+    if not can_hold(system):
+        return False
+    steps, _, vanishes = newton_steps(system, state[None], packed)
+    return not (vanishes[0] and np.abs(steps[0] / np.asarray(system.scales)).max() <= AT_REST)

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
+from magpend_core.equilibria import is_held
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import scaled_distance
 from pipeline.analysis.branches.deflation import search_orbits
@@ -54,10 +55,13 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
         frequency, packed = parameters_at(one, parameters)
         number, kind, period = (int(one[name]) for name in ("attractor", "kind", "orbit_period"))
         start = None
-        if int(one["is_polished"]) and (period >= 1 or kind == EQUILIBRIUM):
-            family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
+        system, is_rest = parameters.model.system, kind == EQUILIBRIUM
+        if is_rest and system.section is None and is_held(system, points[0], packed):
+            period = 1  # its rates do not vanish, but the map at instants leaves it in place
+        if int(one["is_polished"]) and (period >= 1 or is_rest):
+            family = family_of(system, period, frequency, packed, parameter, scale)
             start = Start(family, points[0], value_of(family, frequency, packed), number)
-        yield Listed(number, where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period)
+        yield Listed(number, where, period, start, is_rest, kind == PERIODIC_ORBIT and not period)
 
 
 def attracting(

@@ -19,6 +19,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from magpend_core.engine.variational import with_tangents
+from magpend_core.equilibria import is_held
 from magpend_core.models.model import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import jacobian
@@ -65,8 +66,11 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
     """
     kind, model = int(one["kind"]), parameters.model
     if kind == EQUILIBRIUM:
-        state = bases_of(one, parameters, frequency, 1).states
-        matrix = _scaled(jacobian(0.0, state, of_flow(parameters), frequency), scales)[0]
+        state, flow = bases_of(one, parameters, frequency, 1).states, of_flow(parameters)
+        if is_held(flow.model.system, state[0], flow.pack()):  # its surface, not the rates' Jacobian, rules there
+            slowest = float(one["eigenvalue_real"].values[0])
+            return Local(return_time=-1.0 / slowest if slowest < 0.0 else np.inf)
+        matrix = _scaled(jacobian(0.0, state, flow, frequency), scales)[0]
         slowest = float(np.linalg.eigvals(matrix).real.max())
         return Local(_growth(matrix), *amplification_at_rest(matrix), -1.0 / slowest if slowest < 0.0 else np.inf)
     n_points = int(one["orbit_period"])

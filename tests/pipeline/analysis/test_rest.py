@@ -4,9 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.attractors.finding.equilibria import _path_to, _settled
+from pipeline.analysis.attractors.finding.held import SHARES, rates_shown
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.sets import Geometry
 from pipeline.runs.derive import derive
@@ -49,3 +51,32 @@ def test_attractors__two_rests_closer_than_a_tenth(computed):
     )
     rows = attractors_table(derive(computed(spec), "attractors")).rows
     assert [(row["kind"], row["n_cells"]) for row in rows] == [("equilibrium", 5), ("equilibrium", 25)]
+
+
+def test_rates_shown__turns_are_counted_and_a_direction_that_vanishes_at_once_has_no_finite_rate():
+    """A focus that turns by 8 radians in the longest time, in a plane onto which the third direction falls."""
+    focus, onto = np.array([[-1.0, -2.0, 0.0], [2.0, -1.0, 0.0], [0.0, 0.0, 0.0]]), np.diag([1.0, 1.0, 0.0])
+    onto[:2, 2] = 0.3, -0.7
+    matrices = np.array([expm(focus * t) @ onto for t in 4.0 * SHARES])
+    eigenvalues, jacobian, time = rates_shown(4.0 * SHARES, matrices)
+    assert eigenvalues[:2] == pytest.approx([-1.0 - 2.0j, -1.0 + 2.0j], rel=1e-9)
+    assert eigenvalues[2].real == -np.inf
+    np.testing.assert_allclose(expm(jacobian * time), expm(focus * time) @ onto, atol=1e-8)
+
+
+def test_rates_shown__nothing_where_even_the_shortest_time_is_too_long():
+    assert rates_shown(np.array([1.0]), np.array([[[0.01]]])) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "seen", [{"frequency_hz": 0.25}, {"section": {"of": "c", "value": 5.0, "direction": "up", "longest": 100.0}}]
+)
+def test_attractors__rest_on_a_switch_is_an_equilibrium_of_the_sliding_flow(computed, seen):
+    """The rates of c are 1 below its bound and -2 above; on it a and b spiral to 0 with the eigenvalues -1 +- 2i."""
+    rates = {"a": "-a - 2*b", "b": "2*a - b", "c": "1 + a - where(c > bound, 3, 0)"}
+    starts = [[0.3, 0.1, 0.0], [-0.2, 0.4, 1.5], [0.1, -0.3, 0.7]]
+    spec = sweep(table("held", rates, {"bound": 0.7}), starts, lengths=(20, 10), **seen)
+    (row,) = attractors_table(derive(computed(spec), "attractors")).rows
+    assert (row["kind"], row["stability"], row["n_cells"]) == ("equilibrium", "attracts", 3)
+    assert (row["eigenvalue_real"], abs(row["eigenvalue_imag"])) == pytest.approx((-1.0, 2.0), rel=1e-6)

@@ -1,6 +1,7 @@
 """Find the equilibria of flows, and the trajectories (cells) that are at an equilibrium or approach one.
 
-Newton's method on the rates starts from the last states of cells, near or far. A cell belongs to a stable
+Newton's method on the rates starts from the last states of cells, near or far; `held` finds the equilibria at which a
+switch or a contact holds the state, where the rates do not vanish. A cell belongs to a stable
 equilibrium in two cases: it lies on it, within the tolerance of closed cells or, without a return, within the error
 of the integration; or its sections or states follow the linear flow towards it (`approaching`), since a
 trajectory crosses the section thousands of times around a slow focus. A cell belongs to any other
@@ -14,11 +15,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from magpend_core.equilibria import find_equilibria, newton_steps
+from magpend_core.equilibria import can_hold, find_equilibria, newton_steps
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from magpend_core.sizes import natural_size
 from magpend_core.status import Status
+from pipeline.analysis.attractors.finding.held import held_near, ways
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes, order_of_points
@@ -124,7 +126,10 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
     steps, _, _ = newton_steps(point.integrates, states, point.packed)
     length = np.abs(steps / np.asarray(geometry.scales)).max(axis=1, initial=0.0)
     # a state with a Newton step beyond twice its reach is unlikely to be within reach of an equilibrium
-    near = np.flatnonzero(length <= 2.0 * reach)
+    near = length <= 2.0 * reach
+    if can_hold(point.integrates):
+        near |= ways(point, states, _seconds(point), geometry) <= reach
+    near = np.flatnonzero(near)
     _, first = np.unique(geometry.boxes(states[near], SAME_EQUILIBRIUM), axis=0, return_index=True)
     _, other = np.unique(hashes(geometry.boxes(states, GUESS_BOX)), return_index=True)
     guesses = states[np.concatenate([near[first], other[:GUESSES]])]
@@ -145,9 +150,17 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
             kept.append(Equilibrium(found.states[i], found.eigenvalues[i], residual, jacobian, rate=rate))
         if len(kept) == MOST:
             break
+    for one in held_near(point, states, _seconds(point), geometry):
+        if len(kept) < MOST and all(geometry.distance(one.state, other.state) > SAME_EQUILIBRIUM for other in kept):
+            kept.append(one)
     if not kept:
         return []
     return [kept[i] for i in order_of_points(np.array([e.state for e in kept]), geometry)]
+
+
+def _seconds(point: Point) -> float:
+    """Return the order of magnitude of the time in which the flow changes the states [s]."""
+    return 1.0 / (point.frequency * (RATES if point.is_flow else 1.0))
 
 
 def _settled(point: Point, path: np.ndarray, waits: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
@@ -248,7 +261,8 @@ def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | 
     point.
     """
     steps, _, _ = newton_steps(point.integrates, state[None], point.packed)
-    if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME_EQUILIBRIUM:
+    is_near = np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME_EQUILIBRIUM
+    if not (is_near or can_hold(point.integrates)):
         return None
     for one in equilibria_near(point, state[None], geometry):
         if geometry.distance(one.state, state) <= 10.0 * SAME_EQUILIBRIUM:
