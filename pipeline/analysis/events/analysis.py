@@ -93,7 +93,7 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     crises = Crises(replace(scene, names=ids))
     stretches = stretches if options.orbits else crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
-    stretches, fates, names = _joined(stretches, _fates(scene, stretches))
+    stretches, fates, names = _joined(*_cut(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
@@ -191,6 +191,58 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
         else:
             fates[key] = follow(scene.located, found, -1), follow(scene.located, found, 1)
     return fates
+
+
+def _cut(scene: Scene, stretches: Sequence[Stretch]) -> tuple[list[Stretch], Fates]:
+    """Cut stretches where a bifurcation ends the branch of their first or last orbit: ids of orbits rest on distance,
+    so that one id may run over several stable pieces of branches.
+
+    Return also the fates of the orbits at the ends of each part.
+    """
+    kept: Fates = {}
+    asked = list(stretches)
+    while asked:
+        fates = _fates(scene, asked)
+        parts = [parts_of(scene, one, fates) for one in asked]
+        kept |= {(one, rises): fate for known, _ in parts for one, pair in known for rises, fate in enumerate(pair)}
+        asked = [one for _, others in parts for one in others]
+    return [one for one, rises in kept if rises], kept
+
+
+Known = tuple[Stretch, tuple[tuple[Fate, Fate], tuple[Fate, Fate]]]
+"""A stretch with the fates at its first and its last value."""
+
+
+def parts_of(scene: Scene, one: Stretch, fates: Fates) -> tuple[list[Known], list[Stretch]]:
+    """Return the parts of a stretch on the pieces of its first and its last orbit, and parts between them."""
+    first, last = fates[one, False], fates[one, True]
+    pieces = _piece(*first), _piece(*last)
+    along, near = scene.along[one.places[0] : one.places[1] + 1], AT_BRANCH_POINT * scene.scale
+    top, bottom = first[1].reach(np.inf), last[0].reach(-np.inf)
+    is_cut = along[0] - near <= top < along[-1] - near, along[0] + near < bottom <= along[-1] + near
+    n, is_one = len(along), pieces[0] == pieces[1] or not all(pieces)
+    if n > 1 and not is_one and (top > bottom + near or not any(is_cut)):
+        return [], [_part(scene, one, 0, n // 2), _part(scene, one, n // 2, n)]  # both pieces exist at some values
+    if not any(is_cut) or (is_one and all(pieces)):
+        return [(one, (first, last))], []
+    left = int((along <= top + near).sum()) if is_cut[0] else 0
+    right = max(int((along < bottom - near).sum()), left) if is_cut[1] else n
+    known = [(_part(scene, one, 0, left), (first, first))] if left else []
+    known += [(_part(scene, one, right, n), (last, last))] if right < n else []
+    return known, [_part(scene, one, left, right)] if right > left else []
+
+
+def _part(scene: Scene, one: Stretch, begin: int, end: int) -> Stretch:
+    """Return the part of a stretch from one of its values up to another one, which does not belong to it."""
+    places = one.places[0] + begin, one.places[0] + end - 1
+    if places == one.places:
+        return one
+    ds, rows = scene.attractors, rows_at(scene.attractors)
+    own = (
+        next(row for row in rows[(int(scene.order[place]),)] if ds["attractor"].values[row] == one.attractor)
+        for place in places
+    )
+    return replace(one, places=places, rows=(next(own), next(own)))
 
 
 def _joined(stretches: Sequence[Stretch], fates: Fates) -> tuple[list[Stretch], Fates, dict[tuple[int, int], int]]:

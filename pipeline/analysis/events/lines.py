@@ -55,6 +55,14 @@ class Fate:
     limit: str = ""  # kind of an end at which the period grows without bound, of `LIMITS`
     error: float = np.nan  # of its value
 
+    def reach(self, bound: float) -> float:
+        """Return the value up to which the orbit is known to be stable: `bound` if its branch has no end, NaN if its
+        end is not located.
+        """
+        if self.is_bound:
+            return bound
+        return self.value if self.bifurcation >= 0 or self.limit else np.nan
+
 
 def lines_of(ds: xr.Dataset, others: Mapping[str, float], geometry: Geometry) -> list[Line]:
     """Return the branches that have given values of the fixed parameters, as lines."""

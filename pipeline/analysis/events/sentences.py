@@ -142,7 +142,7 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
     at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
-    if row["period_after"] >= 0 and row["what"] in (*CRISES, BREAKUP):
+    if row["period_after"] == row["period"] or (row["period_after"] >= 0 and row["what"] in (*CRISES, BREAKUP)):
         return f"{who} changes at {at} as it {way}: {_reason(row, doublings)}{where}"
     if row["period_after"] >= 0:
         changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"

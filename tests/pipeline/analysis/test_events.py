@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
 import magpend
 from pipeline.analysis.branches.kinds import KINDS
+from pipeline.analysis.events.analysis import parts_of
 from pipeline.analysis.events.cascades import cascade_of
 from pipeline.analysis.events.lines import Fate, crossing_at, lines_of
+from pipeline.analysis.events.scene import Stretch
+from pipeline.analysis.ragged import ROW_SIZE
 from pipeline.analysis.sets import Geometry
 from pipeline.specification.problems import SpecError
 
@@ -25,6 +32,7 @@ HARD = magpend.model(
 CIRCLE = magpend.model(
     "x' = x*(1 - R) - y*(mu + x)\ny' = y*(1 - R) + x*(mu + x)\nR = x**2 + y**2", name="circle", mu=1.1
 )
+EXCHANGE = magpend.model("x' = x + mu*x - x**2", name="exchange", kind="map", mu=0.2)
 DUFFING = magpend.model("x'' = F*cos(omega*t) - c*x' - x - x**3", name="duffing", F=0.1, c=0.1)
 
 SUPER, SUB = "supercritical", "subcritical"
@@ -101,6 +109,10 @@ KNOWN = {
     ],
     # the multipliers of (a - 1)/a have the product a - 1
     "delayed": [("A", 1, "rises", "neimark_sacker", SUPER, 2.0)],
+    # 0 and mu exchange their stability, on one id
+    "exchange": [("A", 1, "rises", "transcritical", "unknown", 0.0)],
+    # of the delayed map, 0 and (a - 1)/a
+    "growth": [("A", 1, "rises", "transcritical", "unknown", 1.0)],
     "soft": [("A", 0, "rises", "hopf", SUPER, 0.0)],
     # cycles of the radius R with mu + R - R**2 = 0
     "hard": [("A", 0, "rises", "hopf", SUB, 0.0), ("B", 1, "falls", "fold", "unknown", -0.25)],
@@ -138,6 +150,10 @@ RUNS = {
     "delayed": lambda d: sweep(
         DELAYED, d, {"x": (0.3, 0.6), "y": (0.3, 0.6)}, {"n_transient": 6000, "n_keep": 400},
         a=[1.711, 1.961, 2.011, 2.021],
+    ),
+    "exchange": lambda d: sweep(EXCHANGE, d, {"x": (0.001, 0.3)}, LONG, mu=[-0.3, -0.2, -0.1, 0.1, 0.2, 0.3]),
+    "growth": lambda d: sweep(
+        DELAYED, d, {"x": (0.01, 0.3), "y": (0.01, 0.3)}, LONG, a=[0.85, 0.9, 0.95, 1.03, 1.06, 1.11]
     ),
     "soft": lambda d: sweep(
         SOFT, d, {"x": (-2, 2), "x_dot": (-2, 2)}, section={"of": "x_dot", "value": 0.0, "direction": "down"},
@@ -182,12 +198,41 @@ def test_events__closed_forms(name, tmp_path):
     assert sorted(events) == sorted(one[:5] for one in KNOWN[name])
     known = {one[:5]: one[5]() if callable(one[5]) else one[5] for one in KNOWN[name]}
     assert (np.abs(values - [known[one] for one in events]) <= errors).all()
-    assert (errors < (4e-7 if name == "cubic" else 2e-8)).all()
+    assert (errors < (4e-7 if name in ("cubic", "exchange", "growth") else 2e-8)).all()
     assert not (table["what"] == "not_decided").any(), table["evidence"].tolist()
     # unstable parts of branches tell nothing that these events need
     brief, full = run.branches(stable=True), run.branches()
     assert told(run.table("events", stable=True))[0] == events
     assert int(brief["n_points"].sum()) < int(full["n_points"].sum()) + (name in ("delayed", "soft", "lorenz"))
+
+
+def cut_at(along, up, down):
+    """Values of the parts of one stretch, given the fates of its first and its last orbit as these rise and fall."""
+    places = range(len(along))
+    sets = {"attractor": ("set", [0] * len(along)), ROW_SIZE: ("mu", [1] * len(along))}
+    scene = SimpleNamespace(along=np.array(along), scale=np.ptp(along), order=np.array(places), attractors=None)
+    scene.attractors = xr.Dataset(sets)
+    one, end = Stretch(0, 0, 0, (0, places[-1]), (0, places[-1])), Fate(np.nan, 7, is_bound=True)
+    fates = {(one, False): (replace(end, branch=up.branch), up), (one, True): (down, replace(end, branch=down.branch))}
+    known, others = parts_of(scene, one, fates)
+    cut = [part.places for part, _ in known], [part.places for part in others]
+    assert all(part.rows == part.places for part in [*(part for part, _ in known), *others])
+    return cut
+
+
+def test_parts_of__an_id_over_two_stable_pieces():
+    """They meet at 0, between two values or at one; apart, what lies between is asked anew; else both halves are."""
+    left, right = Fate(0.0, 1, 3, 0), Fate(0.0, 2, 4, 0)
+    whole, half = [-0.3, -0.1, 0.1, 0.3], [-0.2, 0.0, 0.2, 0.3]
+    assert cut_at(whole, left, right) == ([(0, 1), (2, 3)], [])
+    assert cut_at(half, left, right) == ([(0, 1), (2, 3)], [])
+    assert cut_at(whole, replace(left, value=-0.2), right) == ([(0, 0), (2, 3)], [(1, 1)])
+    assert cut_at(whole, replace(left, value=0.2), replace(right, value=-0.2)) == ([], [(0, 1), (2, 3)])
+    assert cut_at(whole, replace(left, value=0.5), replace(right, value=-0.5)) == ([], [(0, 1), (2, 3)])
+    # the last orbit lies on no branch; a bifurcation beyond the range; nothing known
+    assert cut_at(whole, left, Fate(np.nan)) == ([(0, 1)], [(2, 3)])
+    assert cut_at(whole, Fate(0.4, 1, 3, 0), Fate(np.nan)) == ([(0, 3)], [])
+    assert cut_at(whole, Fate(np.nan), Fate(np.nan)) == ([(0, 3)], [])
 
 
 @pytest.mark.slow
