@@ -65,7 +65,7 @@ IDENTIFIED = Analysis(
     "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
-    version=4,
+    version=5,
     by_point=True,
 )
 

@@ -91,3 +91,15 @@ def test_attractors_table__prints_the_largest_and_counts_the_others(computed):
     assert sum("0.2273" in line for line in printed) == 1  # ten of 44 cells, though its id is the last
     (others,) = [line for line in found.lines if "smaller ones" in line]
     assert others.strip() == "and 5 smaller ones: 5 equilibrium; all are in --csv and --json"
+
+
+@pytest.mark.slow
+def test_identify__a_circle_without_equilibria_is_one_orbit():
+    """The angle's rate is a - cos: below a = 1 rest, above it every start is on the orbit of 2 pi/sqrt(a**2 - 1)."""
+    model = table("turning", {"u": "a - cos(u)"}, {"a": 1.3}, states={"u": {"on_circle": True}})
+    seen = Crossing("u", 2.0, longest=60.0)
+    ds = flow_cube(model, np.array([[-2.0], [0.4], [2.9]]), crossing=seen, n_transient=10, n_keep=8)
+    found = identify(ds)
+    assert (found["kind"].values.tolist(), found["stability"].values.tolist()) == ([PERIODIC_ORBIT], [ATTRACTS])
+    assert found["n_cells"].values.tolist() == [3]
+    assert found["period_s"].values[0] == pytest.approx(2.0 * np.pi / np.sqrt(0.69), rel=1e-9)

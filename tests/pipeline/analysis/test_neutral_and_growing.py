@@ -1,5 +1,7 @@
 """Sets of maps that preserve volume, and trajectories that grow: no set, and no chaos."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from pipeline.analysis.attractors.extension.conservative import _split, conserva
 from pipeline.analysis.attractors.extension.courses import GROWS
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding.requests import Settings
+from pipeline.analysis.attractors.labelling import _preserves_volume
 from pipeline.analysis.sets import TWO_PI, Geometry
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, NEUTRAL
 
@@ -124,3 +127,10 @@ def test_split__a_constant_quantity_keeps_cells_apart(offset, size):
     assert _split(np.array([0, 0, 0, 1]), offset + size * energy).tolist() == [2, 1, 0, 3]
     assert _split(np.zeros(4, int), energy + 40.0 * drawn).tolist() == [0] * 4
     assert _split(np.zeros(4, int), np.full((4, 16), offset)).tolist() == [0] * 4
+
+
+def test_preserves_volume__not_asked_of_a_flow_with_one_state():
+    """On a circle without equilibria all starts are on one orbit: there is no volume beside it."""
+    with pytest.raises(StopIteration) as found:
+        next(_preserves_volume(SimpleNamespace(can_rest=True, n_states=1), None))
+    assert found.value.value is False
