@@ -19,6 +19,7 @@ from pipeline.analysis.events.dataset import dataset_of
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
+from pipeline.analysis.events.one_event import with_images
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -101,7 +102,7 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     if not options.orbits:
         breakups = Breakups(scene)
         named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
-    return dataset_of(scene, stretches, _merged(named))
+    return dataset_of(scene, stretches, _merged(with_images(scene, named)))
 
 
 def _scalars(part: xr.Dataset) -> list[tuple[str, float]]:

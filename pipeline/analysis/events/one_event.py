@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -11,8 +12,10 @@ from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate
-from pipeline.analysis.events.names import BREAKUP, CRISES
+from pipeline.analysis.events.names import BREAKUP, CRISES, RANGE_END, UNDECIDED
 from pipeline.analysis.events.scene import Event, Scene
+from pipeline.analysis.tolerances import SAME_ON_BRANCH
+from pipeline.layout.vocabulary import EQUILIBRIUM
 
 
 def same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
@@ -44,6 +47,39 @@ def same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
         for k in group:
             found[k] = lead
     return found
+
+
+def with_images(scene: Scene, named: Sequence[Event]) -> list[Event]:
+    """Give ends that are not decided the verdict of their mirror images, if these are decided."""
+    decided = [one for one in named if one.what not in (UNDECIDED, RANGE_END)]
+    found = []
+    for one in named:
+        image = next((i for i in decided if _is_image(scene, one, i)), None) if one.what == UNDECIDED else None
+        if image is not None:
+            fate = replace(image.fate, why=f"of its mirror image: {image.fate.why}")
+            born = image.born
+            if isinstance(born, Crisis) and born.twin == one.stretch.attractor:
+                born = replace(born, twin=image.stretch.attractor)
+            one = replace(one, what=image.what, error=image.error, fate=fate, born=born)
+        found.append(one)
+    return found
+
+
+def _is_image(scene: Scene, one: Event, other: Event) -> bool:
+    """Tell whether an attractor is the mirror image of another one where it ends, and both end for one reason.
+
+    The images of orbits share a branch, so the other one may be seen further on. Of other sets both end at one value.
+    """
+    ds, row, place = scene.attractors, one.stretch.rows[one.rises], one.stretch.places[one.rises]
+    mine, its = one.stretch, other.stretch
+    if "mirror_partner" not in ds or (mine.kind, mine.period, one.rises) != (its.kind, its.period, other.rises):
+        return False
+    if not mine.period and mine.kind != EQUILIBRIUM:
+        return _are_mirrored(scene, one, other) and _are_mirrored(scene, other, one)
+    partner = int(ds["mirror_partner"].values[row])
+    is_there = its.places[0] <= place <= its.places[1]
+    is_same = ds["mirror_distance"].values[row] <= SAME_ON_BRANCH
+    return bool(is_there and is_same and scene.names.get((place, partner), partner) == its.attractor)
 
 
 def _is_seen_from_elsewhere(ds: xr.Dataset, one: Event) -> bool:

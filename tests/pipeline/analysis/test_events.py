@@ -15,10 +15,13 @@ import magpend
 from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.events.analysis import parts_of
 from pipeline.analysis.events.cascades import cascade_of
+from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate, crossing_at, lines_of
-from pipeline.analysis.events.scene import Stretch
+from pipeline.analysis.events.one_event import with_images
+from pipeline.analysis.events.scene import Event, Stretch
 from pipeline.analysis.ragged import ROW_SIZE
 from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.specification.problems import SpecError
 
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mirror={"signs": {"x": -1}}, mu=0.5)
@@ -233,6 +236,42 @@ def test_parts_of__an_id_over_two_stable_pieces():
     assert cut_at(whole, left, Fate(np.nan)) == ([(0, 1)], [(2, 3)])
     assert cut_at(whole, Fate(0.4, 1, 3, 0), Fate(np.nan)) == ([(0, 3)], [])
     assert cut_at(whole, Fate(np.nan), Fate(np.nan)) == ([(0, 3)], [])
+
+
+@pytest.mark.parametrize("set_", ["periodic_orbit", "chaotic_set"])
+def test_with_images__gives_mirror_images_one_verdict(set_):
+    """A twin whose branch is not found ends as its image does: where both have cells, also if the image is seen on."""
+    partners = [1, 0, -1, 1, 0, -1, 1, 0, -1]  # three values, with the attractors A, its image B, and C
+    columns = {"attractor": [0, 1, 2] * 3, "mirror_partner": partners, "mirror_distance": [1e-9] * 9}
+    scene = SimpleNamespace(attractors=xr.Dataset({name: ("set", v) for name, v in columns.items()}), names={})
+    kind, period = SETS.index(set_), 5 if set_ == "periodic_orbit" else 0
+
+    def end(number, place, **more):
+        one = Stretch(number, kind, period, (0, place), (number, 3 * place + number))
+        return Event(one, True, Fate(np.nan if not more else 0.3, why="by it"), to={7: number}, **more)
+
+    known = {"what": "period_doubling", "error": 1e-9}
+    found = with_images(scene, [end(0, 1), end(1, 1, **known), end(2, 1)])
+    assert [one.what for one in found] == ["period_doubling", "period_doubling", "not_decided"]
+    assert (found[0].fate.value, found[0].error, found[0].fate.why) == (0.3, 1e-9, "of its mirror image: by it")
+    assert found[0].to == {7: 0}
+    later = with_images(scene, [end(0, 1), end(1, 2, **known)])
+    assert (later[0].what == "period_doubling") == (set_ == "periodic_orbit")
+    assert with_images(scene, [end(0, 1), end(1, 0, **known)])[0].what == "not_decided"
+    assert with_images(scene, [end(0, 1), end(1, 1, what="range_end")])[0].what == "not_decided"
+    merged = end(1, 1, what="attractor_merging", error=1e-9, born=Crisis("attractor_merging", "", twin=0))
+    assert with_images(scene, [end(0, 1), merged])[0].born.twin == 1
+    falls = replace(end(1, 1, **known), rises=False)
+    assert with_images(scene, [end(0, 1), falls])[0].what == "not_decided"
+
+
+def test_with_images__leaves_orbits_that_are_no_images():
+    """A partner is the nearest attractor, and it may be another orbit."""
+    columns = {"attractor": [0, 1], "mirror_partner": [1, 0], "mirror_distance": [0.1, 0.1]}
+    scene = SimpleNamespace(attractors=xr.Dataset({name: ("set", v) for name, v in columns.items()}), names={})
+    ends = [Stretch(k, SETS.index("periodic_orbit"), 1, (0, 0), (k, k)) for k in (0, 1)]
+    named = [Event(ends[0], True, Fate(np.nan)), Event(ends[1], True, Fate(0.3), "fold", 1e-9)]
+    assert with_images(scene, named)[0].what == "not_decided"
 
 
 @pytest.mark.slow
