@@ -24,6 +24,9 @@ const EVIDENCE = {
   approach: "trajectories on both sides come nearer", stayed: "all extended cells stayed",
   left: "extended cells left it", volume: "the flow preserves volume",
   one_side: "trajectories of one side come nearer, those of the other leave",
+  step_limit: "no orbit found: Newton's method met the step limit",
+  no_return: "no orbit found: a trajectory of Newton's method did not come back to the section",
+  no_convergence: "no orbit found: Newton's method did not converge",
 };
 
 /** Whether a set attracts and what shows it; of an orbit that the analysis does not know what its multipliers say. */
