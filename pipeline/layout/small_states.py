@@ -101,7 +101,7 @@ def _least(
         return none
     cell = cells.isel(dict(zip(starts, good[0], strict=True)))
     values = {**values, **{str(k): float(v) for k, v in cell.coords.items() if k in values and v.ndim == 0}}
-    frequency = frequency_of(model.flow, cell.coords)
+    frequency = frequency_of(model.flow, {str(k): v for k, v in cell.coords.items()})
     frequency = frequency if np.isfinite(frequency) else 1.0
     period = float(cell["return_time"].values[-1]) if "return_time" in cell else 1.0 / frequency
     path = _path(model.flow, values, frequency, cell["section"].values[-1], MOST_PERIODS * period, logs)

@@ -14,7 +14,7 @@ import xarray as xr
 from magpend_core import run_branches
 from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
-from magpend_core.precision import limits_at
+from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.rotation import CLOSED_TURNS, TurningState, rotation_numbers
 from pipeline.analysis.branches.analysis import interval_of, swept_axis, windows_of
 from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
@@ -94,7 +94,7 @@ class Search:
             turning=self.turning,
             n_periods=self.n_periods,
             orbit_period=closed,
-            **limits_at(TOLERANCE),
+            **tolerances_at(TOLERANCE),
         )
         return np.asarray(np.where(found.error <= CLOSED_TURNS, found.rotation, np.nan))
 

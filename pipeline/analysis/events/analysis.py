@@ -205,7 +205,12 @@ def _cut(scene: Scene, stretches: Sequence[Stretch]) -> tuple[list[Stretch], Fat
     while asked:
         fates = _fates(scene, asked)
         parts = [parts_of(scene, one, fates) for one in asked]
-        kept |= {(one, rises): fate for known, _ in parts for one, pair in known for rises, fate in enumerate(pair)}
+        kept |= {
+            (one, rises): fate
+            for known, _ in parts
+            for one, pair in known
+            for rises, fate in zip((False, True), pair, strict=True)
+        }
         asked = [one for _, others in parts for one in others]
     return [one for one, rises in kept if rises], kept
 

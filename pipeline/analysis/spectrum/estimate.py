@@ -183,13 +183,15 @@ def spectrum_of(
     whole = filled(series.pieces, series.apart)
     long = whole.pieces
     longest = max(map(len, long))
-    settings = {"window": window, "scaling": scaling}
     if not 4 <= (nperseg or longest) <= longest:
         raise ValueError(
             f"nperseg = {nperseg or longest}: must be at least 4, and at most the longest stretch of {channel} without "
             f"a gap, which has {longest} samples."
         )
-    found = _averaged(long, rate, nperseg, **settings) if nperseg else _resolved(long, rate, **settings)
+    if nperseg:
+        found = _averaged(long, rate, nperseg, window=window, scaling=scaling)
+    else:
+        found = _resolved(long, rate, window=window, scaling=scaling)
     drive_hz = drive_hz or ds.attrs.get("frequency_hz")
     unit = shown_unit(ds[channel].attrs, "1")
     both, frequency = ("spectrum", "bin"), found.frequency_hz[None]

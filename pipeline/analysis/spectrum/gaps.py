@@ -70,7 +70,7 @@ class _Fit:
 
     def suits(self, before: Array, after: Array) -> bool:
         half = self.weights.shape[1] // 2
-        return min(len(before), len(after)) >= half and abs(after[0] - before[-1]) <= self.most
+        return min(len(before), len(after)) >= half and bool(abs(after[0] - before[-1]) <= self.most)
 
     def between(self, before: Array, after: Array) -> Array:
         half = self.weights.shape[1] // 2

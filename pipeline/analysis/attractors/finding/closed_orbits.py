@@ -194,8 +194,8 @@ def polish(
         status[good] = [of_key.get(key, Status.BOUNDED) for key in keys]
     known.update(zip([keys[i] for i in once], orbits, strict=True))
     found: list[Orbit | None] = [None] * len(points)
-    for i, key in zip(good, keys, strict=True):
-        found[i] = known[key]
+    for place, key in zip(good.tolist(), keys, strict=True):
+        found[place] = known[key]
     return found
 
 
