@@ -117,7 +117,7 @@ def prepare(
     table, reasons = complete(choice.table, work)
     described = cluster_of(table)
     file = choice.file or folder / TABLE
-    name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', folder.name)}"
+    name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', folder.stem)}"
     command = _command(described, file, path, files.place, more)
     return Submission(
         name=files.name,
