@@ -458,8 +458,10 @@ class _Extension:
         """Return whether two sets are one torus, by their curve or by the states between them."""
         if a.n_left or b.n_left:
             return False
-        if a.is_regular and b.is_regular and (a.curve or b.curve):
-            return lie_on(a.curve, on_b, self.geometry) or lie_on(b.curve, on_a, self.geometry)
+        on_one_curve = lie_on(a.curve, on_b, self.geometry) or lie_on(b.curve, on_a, self.geometry)
+        if a.is_regular and b.is_regular and on_one_curve:
+            return True
+        # a trajectory may also fill a curve of the section of a torus of more frequencies
         alike = a.dimension == b.dimension >= 2 and a.stability == b.stability == ATTRACTS
         return alike and (yield from is_one_torus(on_a[0], on_b[0], self.geometry))
 
