@@ -263,20 +263,20 @@ def plot_waterfall(
         raise ValueError("no spectrum could be measured: every trajectory failed.")
     column, measure = _column(ds, axis), _measure(ds, degrees)
     x = np.unique(ds[along].values)
-    y, image = _image(data, along, x, column)
+    top = max(frame.ylim) if frame.ylim else max(_end(data.isel(spectrum=k), column) for k in range(len(x)))
+    y, image = _image(data, along, x, column, min(1.02 * top, float(np.nanmax(data[column]))))
     is_density = str(ds.attrs["scaling"]) == "density"
     image = image * measure.factor ** (2 if is_density else 1)
     fig = style.new_figure(4.4, data, frame)
     ax = fig.add_subplot()
     style.style_axes(ax, inside=False)
-    top = float(np.nanmax(image))
-    low = top * 10.0 ** -(DECADES_OF_COLOURS * (2 if is_density else 1))
-    norm = LogNorm(low, top)
+    brightest = float(np.nanmax(image))
+    low = brightest * 10.0 ** -(DECADES_OF_COLOURS * (2 if is_density else 1))
+    norm = LogNorm(low, brightest)
     shown = np.ma.masked_invalid(np.where(image < low, np.nan, image))
     ramp = colormaps[rcParams["image.cmap"]].reversed()  # faint values are light, as the paper beside them
     ax.pcolormesh(style.edges(x), style.edges(y), shown, norm=norm, cmap=ramp, rasterized=True, gid="waterfall")
-    top_shown = 1.02 * max(_end(data.isel(spectrum=k), column) for k in range(data.sizes["spectrum"]))
-    style.limits(ax, frame, None, (0.0, min(top_shown, float(y.max()))))
+    style.limits(ax, frame, None, (0.0, float(y.max())))
     coordinate = ds[along].rename(along.removeprefix("at_"))
     style.label_axes(ax, labels.parameter_label(coordinate), _label(ds, column))
     unit = power_unit(measure.unit, "density") if is_density else measure.unit
@@ -311,10 +311,12 @@ def _largest(ds: xr.Dataset, along: str) -> np.ndarray:
     return np.asarray(order[first])
 
 
-def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return places on the vertical axis, and the colour of each at each parameter value; NaN where there is none."""
+def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str, top: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return places on the vertical axis up to `top`, and the colour of each at each parameter value; NaN where there
+    is none.
+    """
     bins = data[column].values
-    y = (np.arange(ROWS) + 0.5) * np.nanmax(bins) / ROWS
+    y = (np.arange(ROWS) + 0.5) * top / ROWS
     image = np.full((ROWS, len(x)), np.nan)
     is_density = str(data.attrs["scaling"]) == "density"
     for k in range(data.sizes["spectrum"]):
@@ -332,7 +334,8 @@ def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str) -> tuple[np
         amplitude = one["amplitude"].values[: len(own)]
         shown = 0.5 * amplitude**2 / float(one["bandwidth_hz"]) if is_density else amplitude
         # of equal orders the same, in spite of rounding
-        rows = np.floor(own / np.nanmax(bins) * ROWS + 1e-6).astype(int)
+        rows = np.floor(own / top * ROWS + 1e-6).astype(int)
+        rows, shown = rows[rows <= ROWS], shown[rows <= ROWS]
         for thick in (-1, 0, 1):
             near = np.clip(rows + thick, 0, ROWS - 1)
             image[near, place] = np.fmax(image[near, place], shown)
