@@ -53,7 +53,20 @@ def with_section(system: System, of: str, direction: int) -> System:
     index = system.state_names.index(of)
     return dataclasses.replace(
         system,
-        name=f"{system.name}_section{index}_{'up' if direction > 0 else 'down'}",
+        name=system.name + _suffix(index, direction),
         parameter_names=(*system.parameter_names, LEVEL),
         section=(index, direction),
     )
+
+
+def without_section(system: System) -> System:
+    """Return a system as it was before `with_section`; its parameters end before the level."""
+    if system.section is None:
+        return system
+    name = system.name.removesuffix(_suffix(*system.section))
+    return dataclasses.replace(system, name=name, parameter_names=system.parameter_names[:-1], section=None)
+
+
+def _suffix(index: int, direction: int) -> str:
+    """Return the part of the name of a system that stands for its section."""
+    return f"_section{index}_{'up' if direction > 0 else 'down'}"

@@ -120,7 +120,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=5,
+    version=6,
 )
 
 CURVES = Analysis(

@@ -2,8 +2,8 @@
 
 Of orbits the coefficients need the second and third derivatives B and C of the section map along the critical
 eigenvectors. They are differences of its exact first derivative A at neighbours of the orbit. With A q = mu q,
-A^T p = conj(mu) p, |q| = 1, <p, q> = 1, all in scaled states (Kuznetsov, Elements of Applied Bifurcation Theory, 3rd
-ed., 2004, Sects. 5.4 and 9.1):
+A^T p = conj(mu) p, <p, q> = 1, all in scaled states (Kuznetsov, Elements of Applied Bifurcation Theory, 3rd ed., 2004,
+Sects. 5.4 and 9.1):
 
 =============== ====================================================================================
 fold            <p, B(q, q)> / 2; it vanishes at a cusp
@@ -14,10 +14,11 @@ pitchfork       <p, C(q, q, q) - 3 B(q, (A - 1)^+ B(q, q))> / 6; negative: super
 transcritical   <p, B(q, q)> / 2, which is 0 at a pitchfork
 =============== ====================================================================================
 
-q' is the conjugate of q, and ^+ the inverse on the complement of q. Each coefficient is computed with steps of
-many sizes. The one that changes least from size to size is taken; the change is its error. Those of equilibria are
-coefficients of the flow on the centre manifold (`center_manifold`), of a Hopf point the first Lyapunov coefficient;
-negative: supercritical.
+q' is the conjugate of q, and ^+ the inverse on the complement of q. Each coefficient is computed with |q| = 1 at the
+section point, and with steps of many sizes. The one that changes least from size to size is taken; the change is its
+error. Then q gets the norm of `critical_motion`, which does not depend on the section. Quadratic coefficients have no
+sign, since q has none. Those of equilibria are coefficients of the flow on the centre manifold (`center_manifold`), of
+a Hopf point the first Lyapunov coefficient; negative: supercritical.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import numpy as np
 from magpend_core.engine.system import System
 from pipeline.analysis.branches.bifurcations import CONTRADICTORY, WIDTH, Bifurcation
 from pipeline.analysis.branches.center_manifold import Rest, lyapunov, normal_form, null_vectors, solved
+from pipeline.analysis.branches.critical_motion import Critical, mean_squares
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import Ends, Family, Rows, Value
@@ -117,6 +119,28 @@ def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
         else:
             one.coefficient, one.coefficient_error, _ = settled(case.coefficients(FORMS[one.kind], matrices))
             _judge_sign(one)
+        _normalise(one, case)
+    for _, one in bifurcations:
+        if one.kind in (FOLD, TRANSCRITICAL):
+            one.coefficient = abs(one.coefficient)
+
+
+def _normalise(one: Bifurcation, case: Case) -> None:
+    """Convert the coefficient at an orbit to an eigenvector of unit norm round the orbit."""
+    means, errors = mean_squares(
+        Critical(
+            case.family.system,
+            case.family.rows(np.concatenate([case.u[None], case.neighbours()])),
+            case.steps,
+            one.point.value.seconds,
+        )
+    )
+    mean, error, k = settled(means)
+    degree = 1 if one.kind in (FOLD, TRANSCRITICAL) else 2
+    size = float(np.sqrt(mean)) ** degree
+    relative = 0.5 * degree * (error + errors[k]) / mean
+    one.coefficient_error = (one.coefficient_error + abs(one.coefficient) * relative) / size
+    one.coefficient /= size
 
 
 def _judge_rest(family: Family, one: Bifurcation) -> None:

@@ -40,6 +40,10 @@ def test_explore__fold_of_cycles():
     assert row["mu"] == pytest.approx(-0.25, abs=1e-10)
     assert float(ds["bifurcation_section"][0, 0, 0]) ** 2 == pytest.approx(0.5, abs=1e-4)
     assert row["period_s"] == pytest.approx(np.pi, rel=1e-10)
+    # the radius has the rate (3 r - 10 r^3) u^2 beside it, over a period of pi, whatever the section
+    assert row["normal_form"] == pytest.approx(np.sqrt(2.0) * np.pi, rel=1e-7)
+    (other,) = table_of(followed(BAUTIN, "y", [0.9, 0.4], "mu", -0.4, 0.2, mu=0.1, level=0.4))
+    assert other["normal_form"] == pytest.approx(np.sqrt(2.0) * np.pi, rel=1e-7)
     ends = str(ds["first_end"].attrs["flag_meanings"]).split()
     first, last = (ends[int(ds[name][0])] for name in ("first_end", "last_end"))
     assert {first, last} == {"equilibrium", "bound"}
@@ -71,6 +75,8 @@ def test_explore__torus():
     critical = complex(row["multiplier_real"], row["multiplier_imag"])
     assert critical == pytest.approx(np.exp(0.7j * np.pi), abs=1e-8)
     assert (row["unstable_below"], row["unstable_above"]) == ("0", "2")
+    # of the radius r' = -r^3, with r^2 = 2 |z|^2, over a period of pi
+    assert row["normal_form"] == pytest.approx(-2.0 * np.pi, rel=1e-7)
 
 
 HOMOCLINIC = table(
@@ -322,3 +328,6 @@ def test_explore__roessler_doublings():
         assert np.abs(multipliers - 1.0).min() < 1e-5
         assert np.abs(multipliers + 1.0).min() < 1e-4
     assert [w["period"] for w in windows_of(ds)][:2] == [1, 2]
+    # the first one is the same on another section
+    (row,) = table_of(followed(ROSSLER, "x", [1.0, -4.35, 0.07], "c", 2.6, 3.0, c=2.7, level=1.0))
+    assert row["normal_form"] == pytest.approx(rows[0]["normal_form"], rel=1e-7)

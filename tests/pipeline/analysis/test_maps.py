@@ -11,6 +11,9 @@ from scipy.optimize import fsolve
 
 import magpend
 from pipeline.analysis.branches.analysis import branches_table
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
+from pipeline.analysis.branches.problems import Family
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
@@ -139,6 +142,17 @@ def test_logistic__grid_values_on_bifurcations(tmp_path):
         # where branches cross Newton's method is as exact as the root of its residual
         assert [row["r"] for row in rows] == pytest.approx(list(known.values()), abs=1.5e-7)
         assert rows[-1]["r"] == pytest.approx(3.0, abs=1e-8)
+
+
+def test_logistic__normal_form_of_a_two_cycle():
+    """At r = 1 + sqrt(6) the coefficient of its doubling is 70 + 20 sqrt(6), whichever point of it comes first."""
+    r = 3.4
+    root = np.sqrt((r + 1.0) * (r - 3.0))
+    for x in (r + 1.0 + root, r + 1.0 - root):
+        family = Family(LOGISTIC.system, 2, 1.0, LOGISTIC.load(r=r).pack(), ("r",), (1.0,))
+        branches = explore([Start(family, np.array([x / (2.0 * r)]), r)], Scope(3.3, 3.5, 2, max_generations=1))
+        (one,) = [one for branch in branches for one in branch.bifurcations]
+        assert one.coefficient == pytest.approx(70.0 + 20.0 * np.sqrt(6.0), rel=1e-7)
 
 
 def test_logistic__orbits_near_a_start(tmp_path, command):
