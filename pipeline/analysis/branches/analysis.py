@@ -182,13 +182,15 @@ def branches_table(ds: xr.Dataset) -> Table:
     its small cycles. ``normal_form`` is the coefficient of the normal form (see
     `pipeline.analysis.branches.normal_forms`). ``unstable_below`` and ``unstable_above`` say how many
     multipliers are unstable on the two sides of the parameter; at a fold both orbits lie on one side, and the
-    other says ``none``.
+    other says ``none``. Two bifurcations that are mirror images of each other are one row; ``mirror_branch`` and
+    ``mirror_to_branch`` are the branches of the other one, -1 none.
     """
-    rows = table_of(ds)
+    rows = table_of(ds, once=True)
     if not ds.sizes["branch"]:
         lines = ["no branch: no closed orbit to begin with", *counted_lines(ds), *searched_lines(ds)]
         return Table(rows, [*lines, *_listed(ds, "left_out")], _why_none(ds))
     head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
+    head += ", mirror images counted once" if any(row.get("mirror_branch", -1) >= 0 for row in rows) else ""
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
     return Table(
         rows,
@@ -213,18 +215,21 @@ def _why_none(ds: xr.Dataset) -> str:
     return f"{head}. Attractors left out:{''.join(told)}" if told else f"{head}; no cell has an attractor."
 
 
-def table_of(ds: xr.Dataset) -> list[Row]:
+def table_of(ds: xr.Dataset, once: bool = False) -> list[Row]:
     """Return one table row per located bifurcation, and per end of a branch at which the period grows without bound,
     sorted by parameter value.
 
     At such an end ``bracket`` is the error of the value, and ``saddle_quantity`` the sum of the saddle's leading
     eigenvalues [1/s]. The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``.
     Parameters that have other values than the run's own follow, and ``side`` where the model has words for motions.
+    With `once` there is one row for two mirror images.
     """
     parameter = parameter_name(str(ds.attrs["parameter"]))
     rows = []
     for k in np.argsort(ds["value"].values, kind="stable"):
         one = ds.isel(bifurcation=int(k))
+        if once and "image" in ds and 0 <= int(one["image"]) < k:
+            continue
         branch, told = int(one["of_branch"]), values(one, "kind", "criticality", "bifurcation_side")
         below, above = _unstable(one, _turns(ds, int(k)))
         rows.append(
@@ -246,12 +251,22 @@ def table_of(ds: xr.Dataset) -> list[Row]:
                 **fixed_of(ds, branch),
                 "branch": branch,
                 "to_branch": int(one["to_branch"]),
+                **_branches_of_image(ds, one),
             }
         )
     if not (ends := limits_of(ds)):
         return rows
     rows = [{**row, "saddle_quantity": np.nan} for row in rows]
     return sorted([*rows, *(_limit_row(ds, *end) for end in ends)], key=lambda row: float(row[parameter]))
+
+
+def _branches_of_image(ds: xr.Dataset, one: xr.Dataset) -> dict[str, int]:
+    """Return the branches of a bifurcation's mirror image, -1 none; nothing if the model has no mirror."""
+    if "image" not in ds:
+        return {}
+    image = int(one["image"])
+    names = {"mirror_branch": "of_branch", "mirror_to_branch": "to_branch"}
+    return {name: int(ds[of].values[image]) if image >= 0 else -1 for name, of in names.items()}
 
 
 def limits_of(ds: xr.Dataset) -> list[tuple[int, int]]:
@@ -281,6 +296,7 @@ def _limit_row(ds: xr.Dataset, branch: int, end: int) -> Row:
         **fixed_of(ds, branch),
         "branch": branch,
         "to_branch": -1,
+        **({"mirror_branch": -1, "mirror_to_branch": -1} if "image" in ds else {}),
         "saddle_quantity": _saddle_quantity(ds, branch, end),
     }
 
@@ -358,7 +374,8 @@ def _unstable(one: xr.Dataset, turns: bool) -> tuple[str, str]:
 
 def _words(ds: xr.Dataset, row: Row) -> Words:
     name, unit = str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"])
-    to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
+    branches = [row["branch"], row["to_branch"]], [row.get(f"mirror_{of}branch", -1) for of in ("", "to_")]
+    one, image = (" -> ".join(str(branch) for branch in pair if branch >= 0) for pair in branches)
     return {
         name if unit == "1" else f"{name} {unit}".rstrip(): f"{row[parameter_name(name)]:.7f}",
         "label": row["label"],
@@ -371,7 +388,7 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
         "side": row.get("side"),
         "multiplier": _number(complex(row["multiplier_real"], row["multiplier_imag"]), row["period"]),
         "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
-        "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
+        "branch": f"{one}{_at(ds, row['branch'])}{f', and its mirror {image}' if image else ''}",
     }
 
 

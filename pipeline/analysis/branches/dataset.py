@@ -22,6 +22,7 @@ from pipeline.analysis.branches.bifurcations import (
     multipliers_of,
 )
 from pipeline.analysis.branches.following import ENDS, Branch
+from pipeline.analysis.branches.images import images_of
 from pipeline.analysis.branches.kinds import HOPF, KINDS
 from pipeline.analysis.branches.limits import stuck_ends
 from pipeline.analysis.branches.problems import FREQUENCY, parameter_units, state_units
@@ -76,6 +77,9 @@ def dataset_of(
     variables |= _per_branch(branches, events, n_angles, model) | _per_event(branches, events, sizes, units, states)
     variables |= _fixed(branches, parameter, parameters)
     variables |= _limits(branches, sizes, units, states)
+    if model is not None and model.flow.mirror is not None:
+        images = images_of([(branches[i].family, b) for i, b in events], model)
+        variables["image"] = ("bifurcation", *column(images, "int32", "bifurcation that is its mirror image, -1 none"))
     if words:
         variables |= _side_variables(side, events, words)
     angle_dim = "angle" if model is None else model.angle_dim

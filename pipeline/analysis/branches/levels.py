@@ -39,6 +39,7 @@ def at_levels(ds: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
     event_place[events] = np.arange(len(events))
     part = ds.isel(branch=kept, bifurcation=events)
     moved = {n: place for n in ("of_branch", "to_branch")} | {"origin": event_place}
+    moved |= {n: event_place for n in ("image",) if n in ds}
     if "jump" in ds.dims:
         part = part.isel(jump=np.flatnonzero(event_place[ds["jump_bifurcation"].values] >= 0))
         moved["jump_bifurcation"] = event_place

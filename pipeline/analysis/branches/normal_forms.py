@@ -177,8 +177,9 @@ def _tell_branch_point(one: Bifurcation, square: tuple[float, float], cubic: tup
     by_arms, one.criticality = one.criticality, ""
     if not np.isfinite(square[0] + size):
         return
-    # from where the point was located to where it is
-    error = square[1] + 3.0 * float(np.nan_to_num(abs(cubic[0]))) * WIDTH
+    # from where the point was located to where it is: two branches cross, so the residual grows as its square
+    away = max(WIDTH, float(np.sqrt(one.point.residual)))
+    error = square[1] + 3.0 * float(np.nan_to_num(abs(cubic[0]))) * away
     if abs(square[0]) > max(SAME * size, 3.0 * error):
         one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square[0], error
     elif error <= SAME * size or by_arms:
