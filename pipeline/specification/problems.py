@@ -160,7 +160,6 @@ _TYPES = {
     "string_type": "a text in quotes",
     "list_type": "a list in square brackets",
     "tuple_type": "a list in square brackets",
-    "model_type": "a table such as {start = 2.0, stop = 3.0, num = 101}",
     "dict_type": "a table",
     "finite_number": "a finite number",
 }
@@ -179,10 +178,21 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
     if kind in _BOUNDS:
         name, words = _BOUNDS[kind]
         return f"{path} = {shown(value)}: must be {words} {context[name]}."
+    if kind == "model_type":
+        return f"{path} = {shown(value)}: must be a table{_example(model, location)}."
     if kind in _TYPES:
         return f"{path} = {shown(value)}: must be {_TYPES[kind]}."
     message = item["msg"].removeprefix("Value error, ")
     return f"{path}: {message}"
+
+
+def _example(model: type[BaseModel], location: Sequence[int | str]) -> str:
+    """Return an example of a table that may have been meant, or its keys."""
+    fields = model.model_fields
+    if location or "start" in fields:
+        return " such as {start = 2.0, stop = 3.0, num = 101}"
+    required = [name for name, info in fields.items() if info.is_required()]
+    return f" with the key {required[0]}" if required else f" of {', '.join(fields)}; {{}} takes the defaults"
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:

@@ -402,6 +402,19 @@ class Spec:
     with_noise = TableMethod(NoiseTable, "Add white noise to equations.")
     with_integration = TableMethod(Integration, "Set tolerances, transient and kept sections.")
     with_execution = TableMethod(Execution, "Set the sizes of tasks, which change no number.")
+
+    @knows_its_keys
+    def with_products(self, **products: Table) -> Self:
+        """Ask for products of every cell, by name; those that were asked for before stay.
+
+        Parameters
+        ----------
+        products
+            Options of each product, such as ``lyapunov={}`` or ``extremes={"quantities": ["x"]}``: the keys of
+            `with_lyapunov`, `with_extremes` and `with_rotation`.
+        """
+        return self._of(merged(self.tables, {"products": plain_tables(products)}), self._folder)
+
     with_lyapunov = TableMethod(LyapunovOptions, LYAPUNOV.help, "products.lyapunov")
     with_extremes = TableMethod(ExtremesOptions, EXTREMES.help, "products.extremes")
     with_rotation = TableMethod(RotationOptions, ROTATION.help, "products.rotation")

@@ -49,7 +49,7 @@ class TableMethod(Generic[P]):
         replaces = bool(self.argument or required)
 
         def method(*args: Any, **kwargs: Any) -> Any:
-            given = made.__signature__.bind(*args, **kwargs).arguments
+            given = _bound(made.__signature__, args, kwargs, self.path.removesuffix(".{name}"))
             spec = given.pop("self")
             path = self.path.format(name=given.pop("name")) if self.argument else self.path
             keys = {fields[key].alias or key: value for key, value in given.items()}
@@ -69,11 +69,24 @@ class TableMethod(Generic[P]):
         made.__signature__ = inspect.Signature(parameters, return_annotation="Spec")
         notes = ([("name", self.argument)] if self.argument else []) + [(k, _note(i)) for k, i in fields.items()]
         made.__doc__ = "\n".join([self.summary, "", "Parameters", "----------", *_lines(notes)])
-        self.method = knows_its_keys(made)
+        self.method = knows_its_keys(made, "" if self.argument else self.path)
 
     def __get__(self, spec: S | None, owner: type[S]) -> Callable[P, S]:
         found: Callable[P, S] = self.method if spec is None else self.method.__get__(spec, owner)
         return found
+
+
+def _bound(signature: inspect.Signature, args: tuple[Any, ...], keys: dict[str, Any], path: str) -> dict[str, Any]:
+    """Return the arguments of a method by name; raise TypeError that names what is missing, or has no name."""
+    parameters = list(signature.parameters.values())
+    named = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    extra = args[len(parameters) - len(named) :]
+    if extra:
+        raise TypeError(f"{path}: {shown(extra[0])} has no key; give values by name, as in {named[0]}=...")
+    missing = [p.name for p in parameters[len(args) :] if p.default is p.empty and p.name not in keys]
+    if missing:
+        raise TypeError("\n".join(f"{path}.{name}: missing; add {name}=..." for name in missing))
+    return dict(signature.bind(*args, **keys).arguments)
 
 
 def _lines(notes: list[tuple[str, str]]) -> list[str]:
@@ -112,9 +125,12 @@ def bounds_in_words(info: Any) -> str:
     return ", ".join(word for word in words if word)
 
 
-def knows_its_keys(method: Callable[P, T]) -> Callable[P, T]:
-    """Wrap a method of `Spec` so that an unknown keyword raises a TypeError with the nearest known keys."""
-    path = method.__qualname__.removesuffix(".__init__").rpartition(".")[2].removeprefix(PREFIX)
+def knows_its_keys(method: Callable[P, T], path: str = "") -> Callable[P, T]:
+    """Wrap a method of `Spec` so that an unknown keyword raises a TypeError with the nearest known keys.
+
+    `path` is that of its table, by default the method's name.
+    """
+    path = path or method.__qualname__.removesuffix(".__init__").rpartition(".")[2].removeprefix(PREFIX)
 
     @wraps(method)
     def called(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -59,10 +59,13 @@ equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
         ),
         (lambda s: s.with_axis("A", stap=0.3), r"axis\.stap: unknown key; did you mean st"),
         (lambda s: type(s)("sweep", intergation={}), r"^Spec\.intergation: unknown key; did you mean integration or"),
-        (lambda s: s.with_extremes(quantites=["x"]), r"extremes\.quantites: unknown key; did you mean quantities\?"),
+        (lambda s: s.with_extremes(quantites=["x"]), r"products\.extremes\.quantites: unknown key; did you mean q"),
+        (lambda s: s.with_extremes(), r"^products\.extremes\.quantities: missing; add quantities=\.\.\.$"),
+        (lambda s: s.with_lyapunov(800), r"^products\.lyapunov: 800 has no key; give values by name, as in n_exp"),
+        (lambda s: s.with_drift(), r"^drift\.name: missing; add name=\.\.\.$"),
     ],
 )
-def test_methods__say_what_is_right_for_an_unknown_keyword(wrong, message):
+def test_methods__say_what_is_right_for_a_wrong_argument(wrong, message):
     with pytest.raises(TypeError, match=message):
         wrong(magpend.Spec("sweep"))
 
@@ -151,6 +154,34 @@ def test_spec__is_not_changed_by_its_methods():
     assert spec.toml() == before
     assert spec.with_start_list([[0.0, 0.0]]).tables["initial_conditions"] == {"kind": "list", "points": [[0.0, 0.0]]}
     assert spec.with_lyapunov().tables["products"] == {"extremes": {"quantities": ["x"]}, "lyapunov": {}}
+
+
+def test_products__can_be_asked_for_by_name_or_by_their_methods():
+    spec = built().with_products(lyapunov={"n_periods": 64}).with_products(rotation={}, lyapunov={"n_blocks": 4})
+    same = built().with_lyapunov(n_periods=64).with_lyapunov(n_blocks=4).with_rotation()
+    assert spec.tables["products"] == same.tables["products"]
+    assert set(spec.products) == set(CELL_PRODUCTS)
+    assert all(hasattr(Spec, f"with_{name}") for name in CELL_PRODUCTS)
+
+
+@pytest.mark.parametrize(
+    ("products", "message"),
+    [
+        ({"lyapunof": {}}, "products.lyapunof: unknown key; did you mean lyapunov?"),
+        ({"basins": {}}, "products.basins: is made of a finished run; drop it here, and use magpend analyse basins."),
+        ({"section": {}}, "products.section: is made of a finished run; drop it here, and use magpend plot section."),
+        (
+            {"rotation": True},
+            "products.rotation = True: must be a table of of, center, section, n_periods; {} takes the defaults.",
+        ),
+        ({"extremes": ["x"]}, "products.extremes = ['x']: must be a table with the key quantities."),
+    ],
+)
+def test_products__that_are_wrong(products, message):
+    for spec in (built().with_products(**products), magpend.Spec(**{**built().tables, "products": products})):
+        with pytest.raises(SpecError) as caught:
+            spec.check()
+        assert caught.value.problems == [message]
 
 
 def test_spec__reports_all_problems_at_once():
