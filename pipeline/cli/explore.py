@@ -11,6 +11,7 @@ import typer
 from pipeline.cli import console
 from pipeline.cli.common import Directory
 from pipeline.cli.options import FORCE
+from pipeline.cli.outputs import check_page
 
 
 def explore(
@@ -42,9 +43,11 @@ def explore(
 
 def export(
     directory: Directory,
-    page: Annotated[
+    out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.html", help="One file that opens by a double click. Default: NAME.html."),
+        typer.Option(
+            "--out", "--page", metavar="FILE.html", help="One file that opens by a double click. Default: NAME.html."
+        ),
     ] = None,
     folder: Annotated[
         Path | None,
@@ -68,18 +71,18 @@ def export(
     from pipeline.specification.problems import SpecError
     from pipeline.store.run import RunDirectory
 
-    if page is not None and folder is not None:
-        raise SpecError("--page and --folder: give one of them.")
-    if page is not None and page.suffix.lower() not in (".html", ".htm"):
-        raise SpecError(f"--page {page}: the suffix must be .html.")
+    if out is not None and folder is not None:
+        raise SpecError("--out and --folder: give one of them.")
     run, wanted = RunDirectory.open(directory), quantity or []
+    page = out or Path(f"{Path(run.name).resolve().name}.html")
+    if folder is None:
+        check_page(page, [run.info.digest], f" For a folder of files give --folder {page}.")
     with console.progress("exporting"):
         if folder is not None:
             written = export_folder(run, folder, force=force, quantities=wanted, most_orbits=orbits)
         else:
-            target = page or Path(f"{Path(run.name).resolve().name}.html")
             written = export_page(
-                run, target, force=force, quantities=wanted, most_orbits=orbits, most_bytes=round(megabytes * 1e6)
+                run, page, force=True, quantities=wanted, most_orbits=orbits, most_bytes=round(megabytes * 1e6)
             )
     for sentence in written.sentences:
         console.note(f"note: {sentence}")

@@ -70,6 +70,24 @@ def check_file(path: Path, option: str = "--out", within: str = "", digests: Col
             _refuse(path, option, "shows another run")
 
 
+def check_page(path: Path, digests: Collection[str] = (), remedy: str = "") -> None:
+    """Raise an error if the HTML page cannot be written, before anything is computed; see `check_file`.
+
+    `remedy` is a sentence on what to do where the name has another suffix.
+    """
+    from pipeline.specification.problems import SpecError
+    from pipeline.store.errors import RefusedError
+    from pipeline.store.local import unwritable
+
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise SpecError(f"--out {path}: the suffix must be .html.{remedy}")
+    if path.is_dir() or not path.parent.is_dir():
+        raise SpecError(f"--out {path}: must be a file in a folder that exists.")
+    check_file(path, digests=digests)
+    if problem := unwritable(path.parent):
+        raise RefusedError(f"{problem}; give another place for the page: --out FILE.")
+
+
 def check_table(path: Path, header: str) -> None:
     """Raise SpecError if a CSV file exists and has another header, since it may be another program's table.
 

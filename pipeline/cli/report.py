@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.outputs import check_file
+from pipeline.cli.outputs import check_page
 
 
 def report(
@@ -45,18 +44,3 @@ def report(
     page = make(directories, title=title, also=also or [], only_stored=only_stored, echo=console.note)
     write(page, out)
     console.result(f"report: {out} ({out.stat().st_size / 1e6:.1f} MB)")
-
-
-def check_page(path: Path, digests: Collection[str] = ()) -> None:
-    """Raise an error if the HTML page cannot be written, before anything is computed; see `check_file`."""
-    from pipeline.specification.problems import SpecError
-    from pipeline.store.errors import RefusedError
-    from pipeline.store.local import unwritable
-
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise SpecError(f"--out {path}: the suffix must be .html.")
-    if path.is_dir() or not path.parent.is_dir():
-        raise SpecError(f"--out {path}: must be a file in a folder that exists.")
-    check_file(path, digests=digests)
-    if problem := unwritable(path.parent):
-        raise RefusedError(f"{problem}; give another place for the page: --out FILE.")

@@ -106,7 +106,8 @@ def export_page(
 
 
 def _html(copied: Copied) -> bytes:
-    generator = f"magpend {copied.view['version']}"
+    # the digest says whose page this is: a page of the same run may be replaced
+    generator = f"magpend {copied.view['version']}, run {copied.run.info.digest}"
     return inline_html(copied.run.info.title, generator, finished(copied)).encode()
 
 

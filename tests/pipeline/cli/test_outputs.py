@@ -23,7 +23,7 @@ SIMULATE = ("simulate", "--model", "duffing", "--frequency", 0.2, "--periods", 2
 STATUS = ("status", "run", "--log")
 ANIMATE = ("animate", "--model", "duffing", "--frequency", 0.2, "--x", 0.1, "--seconds", 0.2, "--out")
 ZOOM = ("zoom", "run", "--amplitude", 0.2, 0.25, "--out")
-EXPORT = ("export", "run", "--page")
+EXPORT = ("export", "run", "--orbits", 0, "--out")
 
 COMMANDS = {
     "table.csv": ANALYSE,
@@ -60,7 +60,7 @@ def test_commands__write_into_no_run_directory_and_follow_no_link(whole, main, t
     assert contents(whole) == before
 
 
-@pytest.mark.parametrize("name", [n for n in COMMANDS if n not in ("film.gif", "copy.html", "new.toml")])
+@pytest.mark.parametrize("name", [n for n in COMMANDS if n not in ("film.gif", "new.toml")])
 def test_commands__replace_what_is_their_own_alone(whole, main, tmp_path, name):
     path = tmp_path / name
     # a table of other columns is a stranger's, too; a series may have any
@@ -114,8 +114,7 @@ def test_commands__never_replace_the_file_of_another_run(main, two, tmp_path):
         code, _, err = main(*command(one))
         assert code == 0, err
         before = (tmp_path / name).read_bytes()
-        if name != "first.html":  # an export never replaces a file without --force
-            assert main(*command(one))[0] == 0
+        assert main(*command(one))[0] == 0
         code, _, err = main(*command(other))
         assert code == Exit.REFUSED
         assert "--force" in err

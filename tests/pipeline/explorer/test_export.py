@@ -265,10 +265,14 @@ def test_export__command(main, run, tmp_path):
     assert "page: run.html" in out
     assert "cells were not computed" in err
     assert (tmp_path / "run.html").stat().st_size < 20e6
-    assert main("export", run.directory, "--orbits", 0)[0] == 2
-    assert main("export", run.directory, "--page", "a.html", "--folder", "b")[0] == 2
-    code, _, err = main("export", run.directory, "--page", "a.txt")
-    assert (code, "suffix" in err) == (2, True)
+    assert main("export", run.directory, "--orbits", 0)[0] == 0  # its own page is written again
+    assert main("export", run.directory, "--out", "a.html", "--folder", "b")[0] == 2
+    code, _, err = main("export", run.directory, "--out", "site")
+    assert (code, "--out site: the suffix must be .html. For a folder of files give --folder site." in err) == (2, True)
+    (tmp_path / "folder.html").mkdir()
+    for place in ("folder.html", "absent/a.html"):
+        code, _, err = main("export", run.directory, "--out", place)
+        assert (code, f"--out {place}: must be a file in a folder that exists." in err) == (2, True)
     code, out, err = main("export", run.directory, "--folder", "site", "--orbits", 0)
     assert code == 0, err
     assert "site/index.html" in out
