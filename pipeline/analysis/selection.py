@@ -9,8 +9,10 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.analysis.ragged import isel
+from pipeline.layout.own_words import axis_in_own_words, rate_of
 from pipeline.layout.vocabulary import split_dims
 from pipeline.specification.problems import unknown_name
+from pipeline.specification.tables import FREQUENCY
 
 Floats = npt.NDArray[np.float64]
 
@@ -55,21 +57,27 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     for name, value in (at or {}).items():
         allowed = [d for d in dims if d not in keep]
         if name not in allowed:
-            raise ValueError(unknown_name("axis", name, allowed))
-        ds = isel(ds, {name: place(ds[name], float(value))})
+            raise ValueError(unknown_name("axis", name, [axis_in_own_words(d, rate_of(ds))[0] for d in allowed]))
+        ds = isel(ds, {name: place(ds[name], float(value), rate_of(ds))})
     left = [d for d in ds["attractor_id"].dims if d not in keep]
     long = [str(d) for d in left if ds.sizes[d] > 1]
     if long:
-        axes = ", ".join(f"{d} ({ds.sizes[d]} values)" for d in long)
-        one = ds[long[0]].values[ds.sizes[long[0]] // 2] if long[0] in ds.coords else 0
-        raise ValueError(
-            f"{purpose}, and the dataset also has {axes}: choose a value of each, such as {long[0]}={one:.6g}"
-        )
+        raise ValueError(f"{purpose}, and the dataset also has {_left_over(ds, long)}")
     return isel(ds, dict.fromkeys(left, 0))
 
 
-def place(axis: xr.DataArray, value: float) -> int:
-    """Return the index of a value on an axis; ValueError if the axis does not have it.
+def _left_over(ds: xr.Dataset, long: list[str], option: str = "") -> str:
+    """Return the axes of which a value must be chosen, with an example, in the words of the specification."""
+    told = [(*axis_in_own_words(d, rate_of(ds)), d) for d in long]
+    axes = ", ".join(f"{name} ({ds.sizes[d]} values)" for name, _, d in told)
+    name, given, d = told[0]
+    one = float(given(ds[d].values[ds.sizes[d] // 2])) if d in ds.coords else 0.0
+    return f"{axes}: choose a value of each, such as {option}{name}={one:.6g}"
+
+
+def place(axis: xr.DataArray, value: float, rate: str = FREQUENCY) -> int:
+    """Return the index of a value on an axis; ValueError if the axis does not have it. `rate` is the specification's
+    word for the drive's rate, in which the error names values.
 
     Raises
     ------
@@ -80,13 +88,13 @@ def place(axis: xr.DataArray, value: float) -> int:
     index = int(np.abs(values - value).argmin())
     if abs(values[index] - value) <= _slack(values, index):
         return index
+    name, given = axis_in_own_words(str(axis.name), rate)
+    values, value = given(values), float(given(value))
     low, high = values.min(), values.max()
     if not low < value < high:
-        raise ValueError(f"{axis.name} = {value:.10g} lies off its axis, which runs from {low:.10g} to {high:.10g}")
+        raise ValueError(f"{name} = {value:.10g} lies off its axis, which runs from {low:.10g} to {high:.10g}")
     below, above = values[values < value].max(), values[values > value].min()
-    raise ValueError(
-        f"{axis.name} = {value:.10g} is not on its axis; the nearest values are {below:.10g} and {above:.10g}"
-    )
+    raise ValueError(f"{name} = {value:.10g} is not on its axis; the nearest values are {below:.10g} and {above:.10g}")
 
 
 def _slack(values: Floats, index: int) -> float:
@@ -126,14 +134,10 @@ def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: st
     dims, _ = split_dims(ds["status"])
     for name, value in (at or {}).items():
         if name not in dims:
-            raise ValueError(unknown_name("axis", name, map(str, dims)))
-        index = place(ds[name], float(value))
+            raise ValueError(unknown_name("axis", name, [axis_in_own_words(d, rate_of(ds))[0] for d in dims]))
+        index = place(ds[name], float(value), rate_of(ds))
         ds = isel(ds, {name: slice(index, index + 1)})
     long = [d for d in dims if ds.sizes[d] > 1]
     if purpose and long:
-        axes = ", ".join(f"{d} ({ds.sizes[d]} values)" for d in long)
-        one = float(ds[long[0]].values[ds.sizes[long[0]] // 2])
-        raise ValueError(
-            f"{purpose}, and the run also has {axes}: choose a value of each, such as --at {long[0]}={one:g}"
-        )
+        raise ValueError(f"{purpose}, and the run also has {_left_over(ds, long, '--at ')}")
     return ds

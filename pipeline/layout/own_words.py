@@ -55,6 +55,20 @@ def spelling_of(name: str, model: Model) -> tuple[str, Callable[[Any], Any]]:
     return axis_name(name), np.asarray
 
 
+def axis_in_own_words(name: str, word: str) -> tuple[str, Callable[[Any], Any]]:
+    """Return the name of an axis or parameter in a specification, and the function that converts its values to those
+    there: the drive's frequency has the name and unit of the rate's word.
+    """
+    if axis_name(name) != FREQUENCY_DIM:
+        return name, np.asarray
+    return (FREQUENCY, np.asarray) if word == FREQUENCY else (word, lambda hertz: _rounded(RATES[word].given(hertz)))
+
+
+def rate_of(ds: xr.Dataset) -> str:
+    """Return the word for the drive's rate in the specification of a dataset's run."""
+    return str(ds.attrs.get(RATE, FREQUENCY))
+
+
 def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:
     """Return the names of dims with that of the drive's frequency as the word of its rate."""
     return tuple(RATES[word].column if dim == FREQUENCY_DIM and word != FREQUENCY else dim for dim in dims)

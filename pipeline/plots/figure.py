@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from magpend_core.models.parameters import has_controls
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place, select_points, snap
+from pipeline.layout.own_words import axis_in_own_words, rate_of
 from pipeline.layout.vocabulary import split_dims, told_by
 from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.plots.looks import DPI, LOCK, VECTORS
@@ -35,7 +36,7 @@ def at_points(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
     _, starts = split_dims(ds["status"])
     given = dict(at or {})
     for name in [n for n in given if n in starts and n in ds.coords]:
-        ds = ds.isel({name: place(ds[name], float(given.pop(name)))})
+        ds = ds.isel({name: place(ds[name], float(given.pop(name)), rate_of(ds))})
     part = select_points(ds, given)
     return part.isel(dict.fromkeys(given, 0))
 
@@ -195,17 +196,18 @@ def values_of(run: OpenRun, options: FigureOptions | AnimationOptions) -> tuple[
     axes = [str(d) for d in cube["status"].dims if d in cube.coords]
     for name in given:
         if name not in axes:
-            raise ValueError(unknown_name("axis", name, axes))
+            raise ValueError(unknown_name("axis", name, [axis_in_own_words(d, rate_of(cube))[0] for d in axes]))
     if not options.nearest:
         for name, value in given.items():
-            place(cube[name], value)
+            place(cube[name], value, rate_of(cube))
         return dict(given), []
     found = snap(cube, given)
-    notes = [
-        f"{name} = {given[name]:.10g} is not on its axis; drawn at the nearest, {value:.10g}"
-        for name, value in found.items()
-        if abs(value - given[name]) > 1e-6 * max(abs(value), 1e-300)
-    ]
+    notes = []
+    for axis, value in found.items():
+        if abs(value - given[axis]) > 1e-6 * max(abs(value), 1e-300):
+            name, own = axis_in_own_words(axis, rate_of(cube))
+            asked, near = float(own(given[axis])), float(own(value))
+            notes.append(f"{name} = {asked:.10g} is not on its axis; drawn at the nearest, {near:.10g}")
     return found, notes
 
 

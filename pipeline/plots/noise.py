@@ -16,6 +16,7 @@ from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.conventions import shown_unit
+from pipeline.layout.own_words import rate_of
 from pipeline.plots import labels, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.products.figures import DensityFigureOptions, EscapeFigureOptions
@@ -124,7 +125,7 @@ def _at(ds: xr.Dataset, of: str, at: Mapping[str, float] | None) -> xr.Dataset:
     for name, value in (at or {}).items():
         if name not in dims:
             raise ValueError(unknown_name("axis", name, dims))
-        ds = ds.isel({name: place(ds[name], value)})
+        ds = ds.isel({name: place(ds[name], value, rate_of(ds))})
     return ds.isel({d: 0 for d in dims if d in ds.dims and ds.sizes[d] == 1})
 
 

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.ragged import dense, dims_of, isel
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
+from pipeline.layout.own_words import rate_of
 from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, periods_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.bifurcation import swept_parameters
@@ -63,7 +64,7 @@ def _selected(ds: xr.Dataset, at: Mapping[str, float]) -> tuple[xr.Dataset, str]
     dims = dims_of(ds)
     for name, value in at.items():
         if name in dims and ds.sizes[name] > 1:
-            ds = isel(ds, {name: place(ds[name], value)})
+            ds = isel(ds, {name: place(ds[name], value, rate_of(ds))})
     left = [d for d in dims if d in ds.dims and ds.sizes[d] > 1]
     _check_axes(ds, left)
     return dense(isel(ds, {d: 0 for d in dims if d in ds.dims and d not in left})), left[0] if left else ""

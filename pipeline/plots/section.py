@@ -13,7 +13,7 @@ from magpend_core.models.model import Model
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense, dims_of, isel
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import place
+from pipeline.analysis.selection import place, select_points
 from pipeline.layout.vocabulary import model_of, section_name, split_dims
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import absent_handles, fixed_of, say_empty
@@ -123,14 +123,7 @@ def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Datas
 def _one_point(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
     part = at_points(ds, at)
     dims, _ = split_dims(part["status"])
-    long = [d for d in dims if part.sizes[d] > 1]
-    if long:
-        one = float(part[long[0]].values[part.sizes[long[0]] // 2])
-        axes = ", ".join(f"{d} ({part.sizes[d]} values)" for d in long)
-        raise ValueError(
-            f"a section is drawn of one parameter point, and the run also has {axes}: "
-            f"choose a value of each, such as --at {long[0]}={one:g}"
-        )
+    part = select_points(part, None, purpose="a section is drawn of one parameter point")
     return part.isel(dict.fromkeys(dims, 0))
 
 

@@ -12,6 +12,7 @@ from matplotlib.colors import to_rgb
 from pipeline.analysis.ragged import N_POINTS, SAMPLE, SET, isel
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import place
+from pipeline.layout.own_words import rate_of
 from pipeline.layout.vocabulary import letter
 from pipeline.plots import labels, style
 from pipeline.plots.figure import frame_of, noted, values_of
@@ -49,7 +50,7 @@ def plot_transfer(
     ValueError
         If more than one parameter point is left, or no set was found.
     """
-    part = isel(ds, {name: place(ds[name], value) for name, value in (at or {}).items()})
+    part = isel(ds, {name: place(ds[name], value, rate_of(ds)) for name, value in (at or {}).items()})
     left = [str(d) for d in part["n_sets"].dims if part.sizes[d] > 1]
     if left:
         raise ValueError(f"sets are drawn at one parameter point; choose a value of {', '.join(left)} with at")

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pipeline.layout.own_words import axis_in_own_words, rate_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, grid_dim, is_grid_dim, parameter_name
 from pipeline.products.product import Options
 from pipeline.specification.problems import SpecError, unknown_name
@@ -54,7 +55,9 @@ def named(run: RunDirectory, options: Options) -> Options:
             word = run.spec.rate if is_left_out[role] and given[role] == FREQUENCY else _rate(run, given[role])
             changes[role] = FREQUENCY if word else parameter_name(given[role])
             changes |= _bounds(role, given, RATES[word], RATES[word].hertz) if word else {}
-            problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
+            problems += _unknown(
+                "parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY), run.spec.rate
+            )
         if "state" in fields:
             changes["state"] = given["state"] or model.section_states[0]
             problems += _unknown("state", given["state"], changes["state"], model.state_names)
@@ -118,8 +121,8 @@ def _swept(run: RunDirectory, others: Iterable[str]) -> str:
     )
 
 
-def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str]:
-    return [] if name in known else [unknown_name(what, given, known)]
+def _unknown(what: str, given: str, name: str, known: Iterable[str], rate: str = FREQUENCY) -> list[str]:
+    return [] if name in known else [unknown_name(what, given, [rate if n == FREQUENCY else n for n in known])]
 
 
 def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> tuple[str, float]:
@@ -149,4 +152,5 @@ def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> t
             return axis, math.radians(value) if in_degrees else value
     if (word := word_named(name)) and FREQUENCY_DIM in dims:
         return FREQUENCY_DIM, RATES[word].hertz(value)
-    raise SpecError(unknown_name("axis", name, [d for d in dims if d in cube.coords] or dims))
+    known = [d for d in dims if d in cube.coords] or dims
+    raise SpecError(unknown_name("axis", name, [axis_in_own_words(d, rate_of(cube))[0] for d in known]))

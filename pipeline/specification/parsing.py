@@ -324,9 +324,9 @@ def _walk(
         return None
     declared = tuple(data.get("axes", {}))
     if walk is not None and walk.path not in declared:
-        known = ", ".join(declared) or "none yet"
+        known = ", ".join(f"axes.{name}" for name in declared) or "none yet"
         problems.append(
-            f"continuation.path = {walk.path!r}: must be an axis (axes: {known}); add it to [axes] or set the path."
+            f"continuation.path = {walk.path!r}: must be an axis ({known}); add it to [axes] or set the path."
         )
     return walk
 

@@ -24,7 +24,7 @@ from pipeline.analysis.branches.kinds import (
 )
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, counted, value_with_error, values
-from pipeline.layout.own_words import RATE, dims_in_own_words
+from pipeline.layout.own_words import RATE, axis_in_own_words, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import Table
@@ -111,10 +111,11 @@ def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
     second = options.second
     if axis_name(second) == axis_name(settled.parameter):
-        raise SpecError(f"{second} is the branches' own parameter; give another one.")
+        raise SpecError(f"{_in_words(run, second)} is the branches' own parameter; give another one.")
     if swept_axis(run, second) is not None:
         raise SpecError(
-            f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."
+            f"the run sweeps {_in_words(run, second)}, so that its branches lie at several values; use a run that does "
+            "not."
         )
     interval_of(run, second, options.second_low, options.second_high)
     return settled
@@ -154,24 +155,30 @@ def interval_of(run: OpenRun, parameter: str, low: float | None, high: float | N
     base = parameters_of(run.cube())
     is_frequency = axis_name(parameter) == FREQUENCY_DIM
     if not is_frequency and parameter not in base.names:
-        raise SpecError(unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM)))
+        raise SpecError(unknown_name("parameter", parameter, (*base.names, run.spec.rate)))
     axis = swept_axis(run, parameter)
     if axis is not None:
         ends = float(axis.min()), float(axis.max())
     elif low is None or high is None:
-        raise SpecError(f"the run does not sweep {parameter}; give the interval with --from and --to.")
+        raise SpecError(f"the run does not sweep {_in_words(run, parameter)}; give the interval with --from and --to.")
     else:
         ends = low, high
     chosen = (ends[0] if low is None else float(low), ends[1] if high is None else float(high))
+    if is_frequency and min(chosen) <= 0.0:
+        least = axis_in_own_words(parameter, run.spec.rate)[1](min(chosen))
+        raise SpecError(f"--from, --to: {_in_words(run, parameter)} = {least:g} must be greater than 0.")
     if not chosen[0] < chosen[1]:
-        raise SpecError(
-            f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; --from must be less than --to."
-        )
-    if is_frequency and chosen[0] <= 0.0:
-        raise SpecError(f"--from {chosen[0]}: a drive frequency must be greater than 0.")
+        name, given = axis_in_own_words(parameter, run.spec.rate)
+        first, last = sorted(map(float, map(given, chosen)), reverse=True)
+        raise SpecError(f"the interval {first:g} to {last:g} of {name} is empty; --from must be less than --to.")
     for value in () if is_frequency else chosen:
         base.replace(**{parameter: value})
     return chosen
+
+
+def _in_words(run: OpenRun, parameter: str) -> str:
+    """Return the name of a parameter in the run's specification."""
+    return axis_in_own_words(parameter, run.spec.rate)[0]
 
 
 def branches_table(ds: xr.Dataset) -> Table:

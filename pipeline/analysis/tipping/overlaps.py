@@ -15,6 +15,7 @@ from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, place, start_dims
 from pipeline.analysis.tabular import Row, aligned, with_interval
 from pipeline.analysis.tipping.analysis import outcome_word
+from pipeline.layout.own_words import rate_of
 from pipeline.layout.vocabulary import axis_name
 from pipeline.products.product import Table
 from pipeline.products.tipping import OverlapOptions
@@ -44,7 +45,7 @@ def needs_basins(run: OpenRun, options: OverlapOptions) -> None:
     if axis not in cube["status"].dims:
         raise ValueError(f"{options.parameter} is not an axis of this run; sweep it over both values.")
     for value in (options.before, options.after):
-        place(cube[axis], value)
+        place(cube[axis], value, rate_of(cube))
 
 
 def overlaps(run: OpenRun, options: OverlapOptions) -> xr.Dataset:

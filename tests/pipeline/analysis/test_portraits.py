@@ -66,7 +66,7 @@ def test_portraits__velocities_are_those_of_the_angles(attractors):
     assert (x[0] > 0).all()
     assert (x[1] < 0).all()
     assert found["points"].attrs["units"] == "m"
-    with pytest.raises(ValueError, match=r"frequency \(2 values\)"):
+    with pytest.raises(ValueError, match=r"frequency_hz \(2 values\)"):
         portraits(attractors)
     with pytest.raises(ValueError, match="n_samples = 0"):
         portraits(attractors, at={"frequency": 2.2}, n_samples=0)

@@ -335,7 +335,7 @@ def test_analyse__incomplete_run_and_prune(main, made):
         (["attractors", "--threshold", "0"], "threshold = 0.0: must be greater than 0."),
         (["basins", "--confidence", "nan"], "confidence = nan: must be a finite number."),
         (["basins", "--interval", "wilsen"], "Did you mean 'wilson'?"),
-        (["dimension", "--at", "freqency_hz=2.2"], "unknown axis 'freqency_hz'; did you mean frequency?"),
+        (["dimension", "--at", "freqency_hz=2.2"], "unknown axis 'freqency_hz'; did you mean frequency_hz?"),
         (["branches", "--parameter", "frequency_h"], "did you mean frequency_hz?"),
         (["hysteresis"], 'hysteresis needs a continuation with direction = "both".'),
         (["attractors", "--csv", "no/where.csv"], "--csv no/where.csv: must be a file in a folder"),

@@ -158,7 +158,7 @@ def test_draw_figure__nearest_is_said_and_shown():
     run = FakeRun()
     given = options_of("section", state="psi1", at={"frequency": 2.053}, nearest=True)
     figure = draw_figure(run, "section", given)
-    assert run.said == ["frequency = 2.053 is not on its axis; drawn at the nearest, 2.05"]
+    assert run.said == ["frequency_hz = 2.053 is not on its axis; drawn at the nearest, 2.05"]
     assert figure.axes[0].get_title(loc="left") == "$f$ = 2.05\N{NO-BREAK SPACE}Hz"
     assert float(figure.data["frequency"]) == 2.05
 

@@ -75,7 +75,7 @@ def test_plot_section__all_points_of_one_parameter_point():
     same_numbers(plot_section(ds, states=("v", "x")).data["y"], ds["section"][..., 0])
     two = xr.concat([ds, make_sections(seed=4)], "frequency").assign_coords(frequency=[0.1, 0.2])
     same_numbers(plot_section(two, at={"frequency": 0.1}).data["x"], ds["section"][..., 0])
-    with pytest.raises(ValueError, match=r"one parameter point, .*frequency \(2 values\).*--at frequency=0\.2"):
+    with pytest.raises(ValueError, match=r"one parameter point, .*frequency_hz \(2 values\).*--at frequency_hz=0\.2"):
         plot_section(two)
     with pytest.raises(ValueError, match="neither x nor v is an angle"):
         plot_section(ds, degrees=True)

@@ -89,7 +89,7 @@ def test_plot_basins__cells_outcomes_and_shares(grid):
 def test_plot_basins__selection_and_refusals(grid):
     more = xr.concat([grid, grid.assign(attractor_id=1 - grid["attractor_id"].clip(0))], "frequency")
     more = more.assign_coords(frequency=("frequency", [2.2, 2.4], {"units": "Hz"}))
-    with pytest.raises(ValueError, match=r"frequency \(2 values\).*such as frequency=2\.4"):
+    with pytest.raises(ValueError, match=r"frequency_hz \(2 values\).*such as frequency_hz=2\.4"):
         plot_basins(more)
     fig = plot_basins(more, at={"frequency": 2.4})
     np.testing.assert_array_equal(fig.data["attractor_id"].transpose(*GRID), more["attractor_id"].isel(frequency=1))

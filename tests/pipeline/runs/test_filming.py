@@ -157,8 +157,8 @@ def test_animate__a_start_with_and_without_a_run(main, run, tmp_path):
 
 POINT = ["RUN", "--at", "frequency=0.16"]
 REFUSED = [
-    (["RUN", "--at", "frequency=0.1595"], "frequency = 0.1595 is not on its axis"),
-    (["RUN"], "frequency (2 values): choose a value of each"),
+    (["RUN", "--at", "frequency=0.1595"], "frequency_hz = 0.1595 is not on its axis"),
+    (["RUN"], "frequency_hz (2 values): choose a value of each"),
     ([*POINT, "--attractor", "Z"], "--attractor Z: does not exist at this point; there"),
     (["RUN", "--cell", "6"], "--cell 6: the run has the cells 0 to 5, counted through frequency, i"),
     (["RUN", "--cell", "1", "--attractor", "A"], "--attractor and --cell: a film shows one of these"),
