@@ -25,7 +25,8 @@ def images_of(located: Sequence[Located], model: Model) -> np.ndarray:
     Two are images if they are of one kind at one value of the parameter, and the mirror image of one orbit passes
     through the section point of the other one, both within `SAME_PLACE`, and if each is the other's nearest.
     """
-    found, mirror = np.full(len(located), -1), model.flow.mirror
+    found: np.ndarray = np.full(len(located), -1)
+    mirror = model.flow.mirror
     if mirror is None:
         return found
     away = np.full((len(located), len(located)), np.inf)
@@ -36,7 +37,7 @@ def images_of(located: Sequence[Located], model: Model) -> np.ndarray:
             away[k, others] = [_distance(points, *located[i]) for i in others]
     away[away > SAME_PLACE] = np.inf
     both = np.maximum(away, away.T)
-    for k in np.flatnonzero(np.isinf(np.diag(away))):  # other orbits are their own images
+    for k in np.flatnonzero(np.isinf(np.diag(away))).tolist():  # other orbits are their own images
         nearest = int(np.argmin(both[k]))
         if np.isfinite(both[k, nearest]) and int(np.argmin(both[nearest])) == k:
             found[k] = nearest
@@ -50,8 +51,8 @@ def _may_be_images(one: Located, other: Located) -> bool:
         return False
     rows = [family.rows(bifurcation.point.u[None]) for family, bifurcation in (one, other)]
     values = [[*row.parameters[0], *([] if a.system.section else row.frequency_hz)] for row in rows]
-    is_near = np.abs(np.subtract(*values)) <= SAME_PLACE * np.maximum(np.abs(values[0]), a.scales[0])
-    return bool(is_near.all())
+    here, there = np.array(values)
+    return bool((np.abs(here - there) <= SAME_PLACE * np.maximum(np.abs(here), a.scales[0])).all())
 
 
 def _distance(points: np.ndarray, family: Family, one: Bifurcation) -> float:
