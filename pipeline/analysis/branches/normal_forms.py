@@ -40,8 +40,8 @@ STEPS = 0.125 * 2.0 ** -np.arange(13.0)
 """Sizes of the steps in units of the system's scales. The largest fit smooth maps, the smallest maps that are
 strongly bent over one period."""
 
-SAME = 1e-5
-"""Relative size of a quadratic coefficient below which a branch point is a pitchfork."""
+SAME, NEARLY = 1e-5, 1e-3
+"""Least relative size of a quadratic coefficient at a transcritical point; largest, with its error, at a pitchfork."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ def _tell_branch_point(one: Bifurcation, square: tuple[float, float], cubic: tup
     error = square[1] + 3.0 * float(np.nan_to_num(abs(cubic[0]))) * away
     if abs(square[0]) > max(SAME * size, 3.0 * error):
         one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square[0], error
-    elif error <= SAME * size or by_arms:
+    elif abs(square[0]) + error <= NEARLY * size or by_arms:
         one.kind, one.criticality = PITCHFORK, by_arms
         one.coefficient, one.coefficient_error = cubic
         _judge_sign(one)
