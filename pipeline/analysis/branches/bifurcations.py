@@ -314,8 +314,8 @@ def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int
     """Count the unstable multipliers at each point of a branch with some bifurcations.
 
     Near a bifurcation rounding decides on which side of the circle a multiplier lies. There a point has the number of
-    the nearest point up to the next bifurcation where it is certain. Where none is, as at the end of a branch just
-    beyond a bifurcation, the number follows from that on the bifurcation's other side.
+    the nearest points before and after it, up to the next bifurcation, that are certain, if these agree. Where none is,
+    as at the end of a branch just beyond a bifurcation, the number follows from that on the bifurcation's other side.
     """
     counts, margins = [n_unstable(point) for point in points], np.array([_margin(point) for point in points])
     places = sorted({0, len(points), *(one.after + 1 for one in found)})
@@ -323,7 +323,9 @@ def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int
     for first, last in pairwise(places):
         sure = first + np.flatnonzero(margins[first:last] > CERTAIN)
         for i in first + np.flatnonzero(margins[first:last] <= CERTAIN) if len(sure) else ():
-            counts[i] = counts[sure[np.argmin(np.abs(sure - i))]]
+            beside = {counts[k] for k in (*sure[sure < i][-1:], *sure[sure > i][:1])}
+            if len(beside) == 1:  # else another branch crosses here, which lists the bifurcation
+                (counts[i],) = beside
         unsure += [] if len(sure) else [(first, last)]
     for first, last in unsure:
         for beside, place in ((first - 1, first), (last, last)):

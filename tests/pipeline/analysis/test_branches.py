@@ -491,6 +491,9 @@ def test_watch__neutral_saddle():
         assert counts_of(points, ones) == counts
         ones[0].after = 0
         assert counts_of(points[::-1], ones) == counts[::-1]
+    # where another branch that lists the bifurcation crosses, points between unequal ones keep their own numbers
+    points = [point_of(np.diag([mu, 0.1])) for mu in (1.03, 1.0 - 5e-5, 0.97)]
+    assert (counts_of(points, []), counts_of(points[::-1], [])) == ([1, 0, 0], [0, 0, 1])
     # two in one step, from 0 to 3: the pair that a torus changes and the fold's one
     points = [point_of(np.diag([mu, nu, xi])) for mu, nu, xi in ((0.9, 0.9, 0.9), (1.1, 1.1, 1.1))]
     two = [Bifurcation(kind, points[0], 0.0, 3, 3, True, after=0) for kind in ("fold", "neimark_sacker")]
