@@ -50,6 +50,7 @@ DOORS = {"pipeline.cli.main": "lists the commands", "pipeline.face.magpend._runs
 LEAVES = {
     "magpend_core.models.text.runtime": "what generated code calls",
     "magpend_core.models.text.writing": "the inverse of reading",
+    "pipeline.cli.report": "a command",
     "pipeline.explorer.notebook": "is imported where the packages of the widget are missing",
 }
 """Short modules with one importer that have an idea of their own."""
