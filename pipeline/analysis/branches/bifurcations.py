@@ -323,9 +323,9 @@ def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int
     for first, last in pairwise(places):
         sure = first + np.flatnonzero(margins[first:last] > CERTAIN)
         for i in first + np.flatnonzero(margins[first:last] <= CERTAIN) if len(sure) else ():
-            beside = {counts[k] for k in (*sure[sure < i][-1:], *sure[sure > i][:1])}
-            if len(beside) == 1:  # else another branch crosses here, which lists the bifurcation
-                (counts[i],) = beside
+            numbers = {counts[k] for k in (*sure[sure < i][-1:], *sure[sure > i][:1])}
+            if len(numbers) == 1:  # else another branch crosses here, which lists the bifurcation
+                (counts[i],) = numbers
         unsure += [] if len(sure) else [(first, last)]
     for first, last in unsure:
         for beside, place in ((first - 1, first), (last, last)):
