@@ -100,6 +100,7 @@ def vecmath_names() -> tuple[str, ...]:
         "cosh",
         "tanh",
         "exp",
+        "expm1",
         "log",
         "power",
         "sign",

@@ -60,12 +60,27 @@ class Writer:
             if under is not None:
                 pending += (node.args[0], under[0])
                 continue
+            if (power := self._less_one(node)) is not None:
+                pending.append(power)
+                continue
             for arg in node.args:
                 unfolds = arg.op == "neg" and node.op == "add" and arg.number not in self.leaves
                 inner = arg.args[0] if unfolds else arg
                 fused = node.op == "add" and inner.op == "mul" and inner.number not in self.leaves
                 pending += inner.args if fused else (inner,)
         return wanted
+
+    def _less_one(self, node: Node) -> Node | None:
+        """Return x if a graph node has the form exp(x) - 1 or 1 - exp(x) and depends on the state; else None.
+
+        Computed as a difference it has no digits near x = 0, where rates of ion channels divide by it.
+        """
+        if node.op != "add" or node.kind != STATED or len(node.args) != 2 or node.args[0].op != "number":
+            return None
+        one, other = node.args
+        sign, inner = (1.0, other.args[0]) if other.op == "neg" else (-1.0, other)
+        known = inner.op != "exp" or not self.leaves.keys().isdisjoint((inner.number, other.number))
+        return None if known or not one.is_number(sign) else inner.args[0]
 
     def name(self, node: Node) -> str:
         """Return what stands for a graph node's value in the generated code: a variable or a number."""
@@ -124,6 +139,8 @@ class Writer:
         return f"{_NAMES.get(node.op, node.op)}({', '.join(args)})"
 
     def _sum(self, node: Node) -> str:
+        if (power := self._less_one(node)) is not None:
+            return f"{'-' if node.args[0].is_number(1.0) else ''}expm1({self.name(power)})"
         plain: list[tuple[str, Node]] = []
         products: list[tuple[str, Node]] = []
         for term in node.args:

@@ -11,7 +11,7 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
-from pipeline.analysis.branches.kinds import KINDS
+from pipeline.analysis.branches.kinds import FOLD, KINDS, SNIC
 from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises
@@ -19,7 +19,7 @@ from pipeline.analysis.events.dataset import dataset_of
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
 from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
-from pipeline.analysis.events.one_event import with_images
+from pipeline.analysis.events.one_event import faces, with_images
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -99,6 +99,7 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
+    named = [_on_circle(one, named) for one in named]
     if not options.orbits:
         breakups = Breakups(scene)
         named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
@@ -285,14 +286,22 @@ def _piece(down: Fate, up: Fate) -> tuple[int, ...]:
 
 
 def _event(scene: Scene, one: Stretch, rises: bool, fate: Fate) -> Event:
-    """Name the end of a stretch by the fate of its orbit."""
-    place = one.places[rises]
-    beyond = place + (1 if rises else -1)
+    """Name the end of a stretch by the fate of its orbit, and say on which attractors its cells go on."""
+    place, way = one.places[rises], 1 if rises else -1
+    beyond = place + way
     if not 0 <= beyond < len(scene.along):
         _, n_cells = _cells(scene, one.attractor, rises, place, place)
         return Event(one, rises, replace(fate, value=float(scene.along[place])), RANGE_END, n_cells=n_cells)
+    event = _named(scene, Event(one, rises, fate, beyond=beyond))
+    if abs(scene.along[beyond] - event.fate.value) <= event.error and 0 <= beyond + way < len(scene.along):
+        beyond += way
     to, n_cells = _cells(scene, one.attractor, rises, place, beyond)
-    event = Event(one, rises, fate, to=to, n_cells=n_cells)
+    return replace(event, beyond=beyond, to=to, n_cells=n_cells)
+
+
+def _named(scene: Scene, event: Event) -> Event:
+    """Name the end of an orbit by the bifurcation or the limit at which its branch ends."""
+    fate = event.fate
     if fate.is_bound:
         return replace(event, what=LIVES_ON)
     if fate.limit:
@@ -323,6 +332,13 @@ def _touching(scene: Scene, event: Event) -> Event:
     what, value, error, why = found
     fate = replace(fate, value=value, why=f"{fate.why}; {why}")
     return replace(event, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
+
+
+def _on_circle(one: Event, named: Sequence[Event]) -> Event:
+    """Name the fold of an equilibrium by the cycle that begins there, if there is one."""
+    if (one.what, one.stretch.kind) != (FOLD, EQUILIBRIUM):
+        return one
+    return next((replace(one, what=SNIC) for cycle in named if cycle.what == SNIC and faces(one, cycle)), one)
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:

@@ -28,7 +28,7 @@ def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event
     """Return the events and stretches of a scene as the Dataset of the analysis."""
     named = sorted(named, key=lambda one: (one.stretch.attractor, one.stretch.places[one.rises]))
     located, along, n = scene.located, scene.along, len(scene.along)
-    beyond = [one.stretch.places[one.rises] + (1 if one.rises else -1) for one in named]
+    beyond = [one.beyond for one in named]
     bifurcations = np.array([one.fate.bifurcation for one in named], int)
     own = [is_own(located, one.fate) for one in named]
     degrees = [
@@ -49,7 +49,11 @@ def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event
         "value": ([_value(one) for one in named], "parameter value of the event", unit),
         "value_error": ([one.error for one in named], "error of the value", unit),
         "seen": ([along[one.stretch.places[one.rises]] for one in named], "last value with cells", unit),
-        "beyond": ([along[b] if 0 <= b < n else np.nan for b in beyond], "next value of the run", unit),
+        "beyond": (
+            [along[b] if 0 <= b < n else np.nan for b in beyond],
+            "next value of the run, where the event does not lie",
+            unit,
+        ),
         "bifurcation": (bifurcations.tolist(), "number of the bifurcation, -1 none", {}),
         "branch": ([one.fate.branch for one in named], "branch of the attractor, -1 none", {}),
         "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),

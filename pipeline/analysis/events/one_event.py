@@ -10,6 +10,7 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
+from pipeline.analysis.branches.kinds import SNIC
 from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate
 from pipeline.analysis.events.names import BREAKUP, CRISES, RANGE_END, UNDECIDED
@@ -93,6 +94,8 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
     # comparisons with the errors of events that have no value, which are NaN, are false
     if a.what != b.what or not abs(a.fate.value - b.fate.value) <= a.error + b.error:
         return False
+    if a.what == SNIC and faces(a, b):
+        return True
     ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
     if a.what in (*CRISES, BREAKUP) and (
         a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)
@@ -104,6 +107,11 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
         if j == k or np.nanmin(away) <= SAME_PLACE:
             return True
     return a.rises == b.rises and _are_mirrored(scene, a, b)
+
+
+def faces(a: Event, b: Event) -> bool:
+    """Tell whether two attractors end at one value from its two sides."""
+    return a.rises != b.rises and abs(a.fate.value - b.fate.value) <= a.error + b.error
 
 
 def _are_mirrored(scene: Scene, a: Event, b: Event) -> bool:

@@ -36,7 +36,8 @@ class Event:
     fate: Fate
     what: str = UNDECIDED
     error: float = np.nan
-    to: Mapping[int, int] = field(default_factory=dict)  # numbers of cells by the id on which they go on
+    beyond: int = -1  # place of the run's next value, or of the one after it if the event lies at the next value
+    to: Mapping[int, int] = field(default_factory=dict)  # numbers of cells by the id on which they go on there
     n_cells: int = 0
     after: Stretch | None = None  # the attractor beyond a change
     born: Born | None = None  # evidence of the end of a chaotic set or a torus

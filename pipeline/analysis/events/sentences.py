@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, TORUS, TRANSCRITICAL
+from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, SNIC, TORUS, TRANSCRITICAL
 from pipeline.analysis.events.graph import graph_of
 from pipeline.analysis.events.names import (
     BANDS,
@@ -167,6 +167,8 @@ def _reason(row: Row, doublings: list[float]) -> str:
         return "grazing, a peak of it begins to touch a surface of impacts or switches"
     if what == SLIDING:
         return "grazing-sliding, its stay on the surface of a switch shrinks to a touch"
+    if what == SNIC and row["set"] == "equilibrium":
+        return f"{_LIMITS[what]}; it meets the unstable equilibrium of branch {row['branch']} on a cycle"
     if what in _LIMITS:
         return f"{_LIMITS[what]}; its period grows without bound"
     degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "

@@ -206,6 +206,30 @@ def test_explore__unstable_cycle_of_lorenz():
     assert any("saddle quantity 4.4" in line and "an unstable cycle" in line for line in branches_table(ds).lines)
 
 
+HODGKIN_HUXLEY = table(
+    "hodgkin-huxley",
+    {
+        "v": "I - 120*m**3*h*(v - 115) - 36*n**4*(v + 12) - 0.3*(v - 10.599)",
+        "m": "0.1*(25 - v)/(exp((25 - v)/10) - 1)*(1 - m) - 4*exp(-v/18)*m",
+        "h": "0.07*exp(-v/20)*(1 - h) - h/(exp((30 - v)/10) + 1)",
+        "n": "0.01*(10 - v)/(exp((10 - v)/10) - 1)*(1 - n) - 0.125*exp(-v/80)*n",
+    },
+    {"I": 7.0},
+)
+
+
+def test_explore__cycles_whose_peak_is_a_removable_singularity():
+    """The unstable cycles of Hodgkin and Huxley's model turn at I = 7.8465 (Guckenheimer and Oliva, SIAM J. Appl. Dyn.
+    Syst. 1, 2002, 105); before, at 8.2337, their peak passes v = 10, where a rate is 0/0.
+    """
+    state, current = [3.5, 0.07794908, 0.4168789, 0.39370776], 9.278217390498842
+    ds = followed(HODGKIN_HUXLEY, "v", state, "I", 7.5, 9.4, level=3.5, longest=100.0, I=current)
+    found = {kind: [row["I"] for row in table_of(ds) if row["type"] == kind] for kind in ("fold", "period_doubling")}
+    assert found["fold"] == pytest.approx([7.8465], abs=6e-5)
+    # the multiplier exceeds 3e4 where the cycles double beside their next fold, 7.9220
+    assert found["period_doubling"] == pytest.approx([7.84954, 7.92198], abs=1e-5)
+
+
 def test_explore__cycles_that_come_to_touch_the_section():
     """Towards Hopf's point the same cycles shrink about z = rho - 1, until their lowest point is on z = 10."""
     ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 15.9, 24.0, level=10.0, rho=15.9959022)

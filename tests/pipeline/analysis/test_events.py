@@ -119,8 +119,8 @@ KNOWN = {
     "soft": [("A", 0, "rises", "hopf", SUPER, 0.0)],
     # cycles of the radius R with mu + R - R**2 = 0
     "hard": [("A", 0, "rises", "hopf", SUB, 0.0), ("B", 1, "falls", "fold", "unknown", -0.25)],
-    # on the circle theta' = mu + cos theta
-    "circle": [("A", 0, "rises", "fold", "unknown", 1.0), ("B", 1, "falls", "snic", "unknown", 1.0)],
+    # on the circle theta' = mu + cos theta: one event, of the equilibrium and of the cycle
+    "circle": [("A", 0, "rises", "snic", "unknown", 1.0)],
     # where the slope of the friction is the damping: mu/v0 exp(-belt/v0) = 2 zeta
     "belt": [
         ("A", 1, "rises", "grazing_sliding", "unknown", belt_end),
@@ -207,6 +207,18 @@ def test_events__closed_forms(name, tmp_path):
     brief, full = run.branches(stable=True), run.branches()
     assert told(run.table("events", stable=True))[0] == events
     assert int(brief["n_points"].sum()) < int(full["n_points"].sum()) + (name in ("delayed", "soft", "lorenz"))
+
+
+@pytest.mark.slow
+def test_events__saddle_node_on_a_circle_at_a_value_of_the_run(tmp_path):
+    """th' = I - sin(th): one event at I = 1, where no cell ends on an attractor; cells go on to the cycle."""
+    angle = {"th": {"unit": "rad", "on_circle": True}}
+    adler = magpend.model("th' = I - sin(th)", name="adler", states=angle, I=1.05)
+    values, section = np.linspace(0.9, 1.1, 9), {"of": "th", "value": 3.0}
+    run = sweep(adler, tmp_path, {"th": (-3.0, 3.0)}, {"n_transient": 30}, section=section, I=values)
+    (told,) = [row for row in run.table("events")["sentence"] if "reaches the end" not in row]
+    assert told.startswith("A (equilibrium) ends at I = 1.0000000000 ± ")
+    assert told.endswith(", where B (period 1) begins; its cells go on to B")
 
 
 def cut_at(along, up, down):

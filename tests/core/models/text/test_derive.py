@@ -208,6 +208,15 @@ def test_jacobian__is_sympys_derivative(text):
     np.testing.assert_allclose(found[1], [v, x])
 
 
+@pytest.mark.parametrize("text", ["x/(exp(x) - 1)", "0.5*x*exp(-x/2)*2/(1 - exp(-x))*exp(-x/2)"])
+def test_rates__of_ion_channels_at_their_removable_singularity(text):
+    """x/(exp(x) - 1) = 1 - x/2 + x**2/12 - ... has all its digits near 0, where exp(x) - 1 as a difference has none."""
+    model = model_of({"x": text})
+    for x in (1e-12, -3e-9, 2e-6, -7e-5):
+        assert plain_rates(model, (x,))[0] == pytest.approx(1.0 - x / 2.0 + x * x / 12.0, rel=1e-15)
+        assert plain_jacobian(model, (x,))[0, 0] == pytest.approx(x / 6.0 - 0.5, abs=1e-15 / abs(x))
+
+
 @pytest.fixture(scope="module")
 def functions():
     """A model with a quantity for each function, powers besides."""
