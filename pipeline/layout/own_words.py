@@ -33,6 +33,9 @@ _ERRORS = {
 _TOLD = re.compile(rf"\b{FREQUENCY} = ([-+.,e\d ]*\d)(?: ± ([-+.e\d]*\d))?")
 """Values of the frequency in a text, with an error."""
 
+ROUNDED = 7
+"""Number of digits of a value in a text that may be rounded."""
+
 
 def rate_attribute(word: str) -> dict[str, str]:
     """Return the dataset attribute that names the word; `in_own_words` reads it."""
@@ -78,8 +81,8 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset with the drive's rate in the word of its specification, for tables and figures.
 
     All variables in Hz are converted and rounded to 15 digits, unless their names end in ``_hz``, and so are values of
-    the frequency in the texts of ``evidence``. The dim and the coordinate ``frequency`` are named like the word, and so
-    are attributes whose value is this name. Others are returned unchanged.
+    the frequency in the texts of ``evidence`` and ``left_out``. The dim and the coordinate ``frequency`` are named like
+    the word, and so are attributes whose value is this name. Others are returned unchanged.
     """
     word = str(ds.attrs.get(RATE, FREQUENCY))
     if word == FREQUENCY:
@@ -106,6 +109,8 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     shown = ds.assign_coords(coordinates).assign({n: v for n, v in found.items() if n not in ds.coords})
     named = {FREQUENCY: rate.column, FREQUENCY_DIM: rate.column, "Hz": unit}
     shown.attrs = {k: named.get(v, v) if isinstance(v, str) else v for k, v in ds.attrs.items()}
+    if "left_out" in shown.attrs:
+        shown.attrs["left_out"] = _told(shown.attrs["left_out"], rate)
     if FREQUENCY_DIM not in ds.variables:
         return shown
     shown = shown.rename({FREQUENCY_DIM: rate.column})
@@ -116,9 +121,13 @@ def _told(text: str, rate: Rate) -> str:
     """Return a text with the values of the frequency in it as those of its rate."""
 
     def converted(found: re.Match[str]) -> str:
-        values = np.array([float(x) for x in found[1].split(", ")])
+        texts = found[1].split(", ")
+        values = np.array([float(x) for x in texts])
+        # a rounded value keeps its number of digits, so that what was round in the word is round again
+        digits = [len(re.sub(r"e.*|\D", "", x).lstrip("0")) for x in texts]
+        told = [f"{x:.{n if ROUNDED <= n < 10 else 10}g}" for x, n in zip(rate.given(values), digits, strict=True)]
         error = f" ± {float(found[2]) * rate.slope(values[-1]):.0e}" if found[2] else ""
-        return f"{rate.column} = {', '.join(f'{x:.10g}' for x in rate.given(values))}{error}"
+        return f"{rate.column} = {', '.join(told)}{error}"
 
     return _TOLD.sub(converted, text)
 

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.lines import Line2D
 
+from pipeline.analysis.branches.analysis import cut_words
 from pipeline.analysis.branches.levels import at_levels, refuse_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain
@@ -81,7 +82,8 @@ def plot_backbone(
     swept = labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"])
     style.label_axes(ax, swept if levels else "frequency [Hz]", name)
     style.limits(ax, frame)
-    style.complete(fig, ax, labels.caption(ds, with_start=False), _handles(ds, kinds, levels))
+    caption = style.join([labels.caption(ds, with_start=False), cut_words(ds)])
+    style.complete(fig, ax, caption, _handles(ds, kinds, levels))
     return fig
 
 

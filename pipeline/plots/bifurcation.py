@@ -328,13 +328,15 @@ class Diagram:
         """Whether a strip below the diagram is needed, which shows the share of cells without points."""
         return any(counts.any() for counts in self.survey.absent.values())
 
-    def dress(self, ax: Axes) -> None:
-        """Set the limits, the ticks and the vertical label of axes for the diagram."""
+    def dress(self, ax: Axes, alone: bool = True) -> None:
+        """Set the limits, the ticks and the vertical label of axes for the diagram; say if they are empty, when nothing
+        else is drawn.
+        """
         style.style_axes(ax)
         style.limits(ax, self.frame, style.span(self.x), self._heights())
         labels.angle_ticks(ax, self.measure)
         style.label_axes(ax, y=self.measure.label)
-        if self.survey.empty:
+        if self.survey.empty and alone:
             say_empty(ax, self.survey, "in these ranges")
 
     def _heights(self) -> tuple[float, float]:

@@ -12,14 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from pipeline.analysis.branches.analysis import isolas_of, limits_of
+from pipeline.analysis.branches.analysis import cut_words, isolas_of, limits_of
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
 from pipeline.analysis.branches.levels import refuse_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bifurcation import Diagram, draw_bands, with_bands, with_diagram
+from pipeline.plots.bifurcation import Diagram, draw_bands, hold, with_bands, with_diagram
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
@@ -90,20 +90,21 @@ def plot_branches(
     below = _below(cube, measure, degrees, at, frame)
     fig = style.new_figure(4.5, _stored(ds), frame)
     ax = fig.add_subplot()
-    if below is not None:
-        below.dress(ax)
     chosen = _chosen(ds, max_period)
+    if below is not None:
+        below.dress(ax, alone=not chosen)
     names = _draw_lines(ax, ds, chosen, measure, below is None)
     if below is None:
         _dress(ax, frame, measure)
-    elif frame.ylim is None:
-        _hold_isolas(ax, ds, chosen, measure)
+    else:
+        _hold_branches(ax, ds, chosen, measure, below.survey.empty)
     style.label_axes(ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label)
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
     if bands is not None:
         handles += draw_bands(ax, bands, measure, max_period)
         fig.data = with_bands(fig.data, bands)
-    style.complete(fig, ax, below.caption if below is not None else labels.caption(ds), handles)
+    caption = below.caption if below is not None else labels.caption(ds)
+    style.complete(fig, ax, style.join([caption, cut_words(ds, chosen)]), handles)
     if below is not None:
         fig.data = with_diagram(fig.data, below.draw([pixels.Panel(ax, below.layers)]))
     _name(ax, names)
@@ -240,14 +241,19 @@ def _limits(ds: xr.Dataset) -> Iterator[_Mark]:
         yield kind, branch, float(ds["limit_value"][branch, end]), last["section"], int(last["n_unstable"])
 
 
-def _hold_isolas(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure) -> None:
-    """Widen the range of a diagram to hold the isolas, on which cells of the diagram need not end."""
-    own = [i for i in isolas_of(ds) if i in chosen]
-    if own:
-        y = measure.shown(ds["section"].sel(state=measure.name).values[own])
-        low, high = float(np.nanmin(y)), float(np.nanmax(y))
-        margin = 0.06 * (high - low)
-        ax.set_ylim(min(ax.get_ylim()[0], low - margin), max(ax.get_ylim()[1], high + margin))
+def _hold_branches(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, alone: bool) -> None:
+    """Widen the axes of a diagram to hold the branches and their bifurcations, on which cells of the diagram need not
+    end. If no cell is drawn, the vertical axis is that of the branches.
+    """
+    events = np.isin(ds["of_branch"].values, chosen)
+    sections = ds["section"].values[chosen], ds["bifurcation_section"].values[events]
+    k = int(np.flatnonzero(ds["state"].values == measure.name)[0])
+    y = measure.shown(np.concatenate([one[..., k].ravel() for one in sections]))
+    x = np.concatenate([ds["parameter"].values[chosen].ravel(), ds["value"].values[events]])
+    if alone and np.isfinite(y).any() and not measure.on_circle and style.figure_of(ax).frame.ylim is None:
+        middle = float(np.nanmedian(y))
+        ax.set_ylim(middle, middle + 1e-9 * max(abs(middle), 1.0))
+    hold(ax, [x], [y])
 
 
 def _isola(ds: xr.Dataset, branch: int, measure: Measure) -> _Name:

@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.branches.analysis import fixed_of, isolas_of
+from pipeline.analysis.branches.analysis import cut_words, fixed_of, isolas_of
 from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.branches.levels import SAME, at_levels
 from pipeline.analysis.points import POINT, read_points
@@ -110,7 +110,7 @@ def plot_response(
     if has_phase:
         axes[1].set_ylabel(labels.with_unit(f"lag of harmonic {max(harmonic, 1)}", phase.unit))
         labels.angle_ticks(axes[1], phase, most=4.5)
-    style.caption(axes[0], style.join([labels.caption(ds, with_start=False), *_one_level(ds, levels)]))
+    style.caption(axes[0], style.join([labels.caption(ds, with_start=False), *_one_level(ds, levels), cut_words(ds)]))
     style.legend_above(fig, _handles(ds, levels, drawn), size=fig.look.tick)
     style.finish(fig)
     return fig

@@ -120,7 +120,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=6,
+    version=7,
 )
 
 CURVES = Analysis(
@@ -135,7 +135,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
-    version=4,
+    version=5,
 )
 
 BANDS = Analysis(

@@ -61,8 +61,8 @@ dim of angles. Each variable's ``long_name`` says what it is (`dataset`). Beyond
 are NaN, counts -1. ``side`` is there if the model has words for motions; ``eigenvalue_...`` if there are equilibria;
 ``limit_...`` if a period grows without bound; ``searched_...`` and ``box_...`` after a search of all orbits or
 equilibria. Parameters with other values than the run's own are variables of their name. Attributes ``parameter``,
-``parameter_units``, ``model``, ``left_out``: a line for each attractor that was not followed, and ``stuck``: a line for
-each end that is stuck, with what was met there.
+``parameter_units``, ``model``, ``left_out``: a line for each attractor that was not followed, for each end within the
+interval at which a branch was cut off, with what was met there, and for each bound that branches pass.
 
 ``first_end`` and ``last_end`` say why a branch ends: ``bound`` of the parameter, ``closed`` on itself, ``start`` (it
 sprang off there), ``period_halving`` (on the orbit of half the period), ``max_points``, ``stuck`` (Newton's method

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +16,7 @@ from pipeline.analysis.branches.kinds import (
     BRANCH_POINTS,
     BRANCHING,
     COEFFICIENTS,
+    CURVE_WHY,
     FOLD,
     HOMOCLINIC,
     KINDS,
@@ -23,7 +25,7 @@ from pipeline.analysis.branches.kinds import (
     PITCHFORK,
 )
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, value_with_error, values
+from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, value_with_error, values, words_of
 from pipeline.layout.own_words import RATE, axis_in_own_words, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
@@ -123,7 +125,7 @@ def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
 
 def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     """Continue the bifurcations on the branches in the plane of the branches' parameter and a second one."""
-    from pipeline.analysis.branches.curves import curves_dataset, curves_from
+    from pipeline.analysis.branches.curves import curves_dataset, curves_from, not_followed
 
     located = run.derive("branches", **options.part(BranchOptions))
     bounds = (_ends(options), (options.second_low, options.second_high))
@@ -132,9 +134,8 @@ def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     left_out: dict[int, str] = {}
     found = curves_from(located, base, second, bounds, options.curve_period, left_out=left_out)
     lines = [f"{_place_of(located, k)}: {why}" for k, why in sorted(left_out.items()) if k >= 0]
-    return curves_dataset(found, axis_name(options.parameter), second, base.model).assign_attrs(
-        left_out="\n".join(lines)
-    )
+    ds = curves_dataset(found, axis_name(options.parameter), second, base.model)
+    return ds.assign_attrs(left_out="\n".join([*lines, *not_followed(ds)]))
 
 
 def _place_of(ds: xr.Dataset, k: int) -> str:
@@ -195,7 +196,7 @@ def branches_table(ds: xr.Dataset) -> Table:
     rows = table_of(ds, once=True)
     if not ds.sizes["branch"]:
         lines = ["no branch: no closed orbit to begin with", *counted_lines(ds), *searched_lines(ds)]
-        return Table(rows, [*lines, *_listed(ds, "left_out")], _why_none(ds))
+        return Table(rows, [*lines, *listed(ds, "left_out")], _why_none(ds))
     head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
     head += ", mirror images counted once" if any(row.get("mirror_branch", -1) >= 0 for row in rows) else ""
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
@@ -205,12 +206,20 @@ def branches_table(ds: xr.Dataset) -> Table:
             *lines,
             *_unbounded(ds),
             *_detached(ds),
+            *_no_equilibria(ds),
             *counted_lines(ds),
             *searched_lines(ds),
-            *_listed(ds, "stuck"),
-            *_listed(ds, "left_out"),
+            *listed(ds, "left_out"),
         ],
     )
+
+
+def _no_equilibria(ds: xr.Dataset) -> list[str]:
+    """Return a text line on how to start from equilibria, if a flow's branches have cycles alone and no bifurcation."""
+    is_alone = not ds.sizes["bifurcation"] and bool((ds["orbit_period"].values > 0).all())
+    if not is_alone or "model" not in ds.attrs or model_of(ds).crossing is None:
+        return []
+    return ["", "no branch of equilibria: no cell rests; --all-equilibria finds all in a box, --start follows one"]
 
 
 def _why_none(ds: xr.Dataset) -> str:
@@ -439,10 +448,31 @@ def period_words(period: int) -> str:
     return f"period {period}" if period else "equilibrium"
 
 
-def _listed(ds: xr.Dataset, name: str) -> list[str]:
+def listed(ds: xr.Dataset, name: str) -> list[str]:
     """Return the lines of an attribute under its name."""
     lines = str(ds.attrs.get(name, "")).splitlines()
     return ["", name.replace("_", " "), *(f"  {line}" for line in lines)] if lines else []
+
+
+CUT = {"stuck": "stuck", "max_points": "after too many points", "bound": "at a bound"}
+"""Ends at which branches and curves are cut off, with the words for figures."""
+
+
+def cut_words(ds: xr.Dataset, chosen: Iterable[int] | None = None) -> str:
+    """Return a short text on the ends at which branches or curves are cut off, for figures; empty if there is none."""
+    lines = ds["parameter"].values
+    found: dict[str, list[float]] = {why: [] for why in CUT}
+    for i in range(len(lines)) if chosen is None else chosen:
+        for name, point in (("first_end", 0), ("last_end", int(ds["n_points"].values[i]) - 1)):
+            why = words_of(ds[name])[int(ds[name].values[i])]
+            if why in found:
+                found[why].append(float(lines[i, point]))
+    told = [
+        f"{len(at)} {CUT[why]}" + (f" ({', '.join(f'{x:.5g}' for x in sorted(set(at))[:3])})" if why != "bound" else "")
+        for why, at in found.items()
+        if at
+    ]
+    return f"ends: {', '.join(told)}" if told else ""
 
 
 def isolas_of(ds: xr.Dataset) -> list[int]:
@@ -585,7 +615,7 @@ def curves_table(ds: xr.Dataset) -> Table:
         lines += ["", f"{counted(missed, 'sign change')} of test functions could not be located: points may be missing"]
     if rows:
         lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
-    return Table(rows, [*lines, *_listed(ds, "left_out")])
+    return Table(rows, [*lines, *listed(ds, "left_out")])
 
 
 def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
@@ -618,7 +648,7 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     told, n = values(one, "kind", "orbit_period", "first_end", "last_end"), int(one["n_points"])
     lines = [one[role].values[:n] for role in ("first", "second")]
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
-    ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
+    ends = ", ".join(CURVE_WHY.get(end, plain(end)) for end in (told["first_end"], told["last_end"]) if end != "bound")
     what = f"{LABELS[told['kind']]} {told['kind']}, {period_words(int(told['orbit_period']))}"
     if told["kind"] == HOMOCLINIC:
         quantity = one["saddle_quantity"].values[:n]

@@ -16,8 +16,10 @@ from pipeline.analysis.branches.bifurcations import has_torus
 from pipeline.analysis.branches.center_manifold import null_vectors
 from pipeline.analysis.branches.codimension_two import (
     BT,
+    CHENCINER,
     DEGENERATE,
     DOUBLE_HOPF,
+    DOUBLE_TORUS,
     DOUBLING_TORUS,
     FOLD_FLIP,
     FOLD_TORUS,
@@ -27,6 +29,8 @@ from pipeline.analysis.branches.codimension_two import (
     POINT_KINDS,
     R1,
     R2,
+    R3,
+    R4,
     ZERO_HOPF,
     Detector,
     SpecialPoint,
@@ -72,8 +76,9 @@ from pipeline.analysis.branches.problems import (
     parameter_units,
     state_units,
 )
+from pipeline.analysis.tabular import plain
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import frequency_of, model_attribute, section_attributes
+from pipeline.layout.vocabulary import frequency_of, model_attribute, parameter_name, section_attributes
 
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Settings with longer steps than on a branch, since nothing is located in between. The residual includes the
@@ -113,6 +118,18 @@ SPRINGING = {
 }
 """Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit; at
 equilibria 0 for equilibria, 1 for cycles."""
+
+OTHERS = {
+    CHENCINER: ["folds of tori"],
+    R3: ["saddle orbits of three times the period"],
+    R4: ["orbits of four times the period"],
+    DOUBLE_TORUS: ["tori of three frequencies"],
+    DOUBLE_HOPF: ["tori of three frequencies"],
+}
+"""What springs from points of codimension two beside `SPRINGING`, and is never followed from there."""
+
+CLOSE = 0.05
+"""Largest distance of a curve from a point of codimension two from which it springs, in units of the ranges."""
 
 NO_FREQUENCY = 1e-6
 """Square of the dimensionless frequency of a Hopf point below which it is a Bogdanov-Takens point."""
@@ -516,6 +533,40 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
         coords={"state": list(names)},
         attrs={"first_parameter": first, "second_parameter": second, **told},
     )
+
+
+def not_followed(ds: xr.Dataset) -> list[str]:
+    """Return a text line for each point of codimension two from which curves spring that were not followed.
+
+    A curve counts as followed if one of its kind and period comes within `CLOSE` of the point.
+    """
+    roles, lines = ("first", "second"), list[str]()
+    if not ds.sizes["curve"]:
+        return lines
+    ranges = np.array([np.nanmax(ds[role].values) - np.nanmin(ds[role].values) for role in roles])
+    ranges[ranges == 0.0] = 1.0
+    points = np.stack([ds[role].values for role in roles], axis=-1) / ranges
+    for k in range(ds.sizes["special"]):
+        kind, period = POINT_KINDS[int(ds["special_kind"][k])], int(ds["special_period"][k])
+        at = [float(ds[f"special_{role}"][k]) for role in roles]
+        near = np.nanmin(np.linalg.norm(points - np.array(at) / ranges, axis=-1), axis=1) < CLOSE
+        known = {
+            (CURVE_KINDS[int(one)], int(n))
+            for one, n in zip(ds["kind"].values[near], ds["orbit_period"].values[near], strict=True)
+        }
+        wanted = [(one, n * period if period else n) for one, n in SPRINGING.get(kind, ())]
+        missing = [
+            f"{plain(one)} of {f'period {n}' if n else 'equilibria'}" for one, n in wanted if (one, n) not in known
+        ]
+        if kind == BT and HOMOCLINIC not in {one for one, _ in known}:
+            missing.append("homoclinic orbits")
+        missing += OTHERS.get(kind, [])
+        if missing:
+            place = ", ".join(
+                f"{parameter_name(ds.attrs[f'{role}_parameter'])} = {x:.7g}" for role, x in zip(roles, at, strict=True)
+            )
+            lines.append(f"{plain(kind)} at {place}: not followed from there: {', '.join(missing)}")
+    return lines
 
 
 def _special_points(

@@ -24,7 +24,7 @@ from pipeline.analysis.branches.bifurcations import (
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.images import images_of
 from pipeline.analysis.branches.kinds import HOPF, KINDS
-from pipeline.analysis.branches.limits import stuck_ends
+from pipeline.analysis.branches.limits import cut_ends
 from pipeline.analysis.branches.problems import FREQUENCY, parameter_units, state_units
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.conventions import code_flags
@@ -52,7 +52,7 @@ def dataset_of(
     parameters
         Parameters of the run; their model gives names, units, and the class of each orbit's motion.
     left_out
-        Lines on attractors that were not followed, with reasons.
+        Lines on attractors that were not followed, with reasons; those on the ends of branches are added.
     """
     model = None if parameters is None else parameters.model
     system = branches[0].family.system if branches else (None if model is None else model.system)
@@ -92,8 +92,7 @@ def dataset_of(
     return result.assign_attrs(
         parameter=parameter,
         parameter_units=parameter_units(parameter, model),
-        left_out="\n".join(left_out),
-        stuck="\n".join(stuck_ends(branches)),
+        left_out="\n".join([*left_out, *cut_ends(branches)]),
     )
 
 

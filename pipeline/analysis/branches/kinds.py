@@ -44,3 +44,15 @@ COEFFICIENTS = {
     **dict.fromkeys(("lyapunov2", "s", "theta", "delta"), "1"),
 }
 """Coefficients of the normal forms of equilibria at points of codimension two, with their units (`center_manifold`)."""
+
+CURVE_WHY = {
+    "closed": "closed",
+    "resonance": "the multipliers become real",
+    "max_points": "too many points",
+    "stuck": "Newton's method finds no next point",
+    "period_halving": "an orbit of half the period",
+    "equilibrium": "the cycles shrink to an equilibrium",
+    "tangent": "the cycles only touch the section",
+    "heteroclinic": "the orbit meets another saddle",
+}
+"""Reasons why a curve in two parameters ends within its bounds, in words; others are points of codimension two."""

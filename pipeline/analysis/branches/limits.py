@@ -16,6 +16,7 @@ The law's slope is fitted to the last points, and computed from the equilibrium.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -31,6 +32,7 @@ from pipeline.analysis.branches.following import Branch, Limit, leading_of, oppo
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.layout.vocabulary import parameter_name
 
 STEEPER = 6.0
 """Natural logarithm of the factor by which the period's slope along the branch rises, if the period grows."""
@@ -363,19 +365,32 @@ def _fold(family: Family, value: float, states: np.ndarray) -> tuple[np.ndarray,
     return z[:n] * scales, float(z[-1] * unit), max(abs(float(step[-1])), 1e-14) * unit, float(expected)
 
 
-# ---- stuck ends --------------------------------------------------------------------------------
+# ---- ends within the interval ------------------------------------------------------------------
 
 
-def stuck_ends(branches: Sequence[Branch]) -> list[str]:
-    """Return a text line for each end of a branch that is stuck, with what was met there."""
-    lines = []
+def cut_ends(branches: Sequence[Branch]) -> list[str]:
+    """Return text lines on the ends at which a branch was cut off: one that is stuck, with what was met there, one with
+    too many points, and those at the bounds of the parameter, together.
+    """
+    lines, beyond = [], dict[str, list[int]]()
     for i, branch in enumerate(branches):
         for which in (0, 1):
-            if branch.ends[which] == "stuck":
-                points = towards(branch, which)
-                name, value = branch.family.free[0], branch.family.values(points[-1].u)[0]
-                lines.append(f"branch {i} at {name} {value:.7g}: {'; '.join(_met(branch, points))}")
-    return lines
+            points, why = towards(branch, which), branch.ends[which]
+            at = f"{parameter_name(branch.family.free[0])} = {branch.family.values(points[-1].u)[0]:.7g}"
+            if why == "stuck":
+                lines.append(f"branch {i} at {at}: {'; '.join(_met(branch, points))}")
+            elif why == "max_points":
+                lines.append(f"branch {i} at {at}: {len(points)} points, no more are followed; see the rest by --start")
+            elif why == "bound":
+                beyond.setdefault(at, []).append(i)
+    return [*lines, *(f"{_numbered(ones)} beyond {at}, a bound of the interval" for at, ones in beyond.items())]
+
+
+def _numbered(branches: Sequence[int]) -> str:
+    """Name branches by their numbers, with how often each occurs."""
+    counts = Counter(branches)
+    told = [f"{i}{f' ({n} times)' if n > 1 else ''}" for i, n in counts.items()]
+    return f"branch{'es' if len(counts) > 1 else ''} {', '.join(told)}"
 
 
 def _met(branch: Branch, points: Sequence[Point]) -> list[str]:

@@ -282,7 +282,7 @@ def sensitivities_of(branches: xr.Dataset, base: Parameters) -> xr.Dataset:
     dims, one = ("bifurcation", "parameter"), {"units": "1"}
     sides = [name for name in ("bifurcation_side",) if name in branches]
     kept = branches[["kind", "of_branch", *sides]].drop_vars("state", errors="ignore")
-    kept.attrs = {k: v for k, v in branches.attrs.items() if k not in ("left_out", "stuck")}
+    kept.attrs = {k: v for k, v in branches.attrs.items() if k != "left_out"}
     return kept.assign(
         value=("bifurcation", value, {"units": branches.attrs["parameter_units"], "long_name": f"value of {first}"}),
         orbit_period=("bifurcation", branches["orbit_period"].values[branches["of_branch"].values], one),

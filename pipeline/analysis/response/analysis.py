@@ -13,7 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
-from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of
+from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, listed
 from pipeline.analysis.branches.completeness import searched_lines
 from pipeline.analysis.branches.kinds import LABELS
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
@@ -266,7 +266,7 @@ def response_table(ds: xr.Dataset) -> Table:
     jumps = [_jump(ds, name, int(k)) for k in np.argsort(values, kind="stable")]
     none = "no jump: no stable orbit ends at a fold or a subcritical bifurcation"
     lines += ["", "jumps", *aligned(jumps, "  ")] if jumps else ["", none]
-    lines += searched_lines(ds)
+    lines += [*searched_lines(ds), *listed(ds, "left_out")]
     return Table(rows, lines)
 
 

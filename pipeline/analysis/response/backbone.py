@@ -298,10 +298,21 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         "last_end": ("curve", np.array(last, np.int8), code_flags(ENDS)),
         "linear_frequency": ("curve", np.array(linear, float), linear_about),
     }
+    left_out = [*left_out, *(f"curve {i}: {why}" for i, curve in enumerate(curves) for why in _cut_off(curve))]
     coords = {**channel_coordinates(model, HARMONICS), "state": list(model.state_names)}
     attrs = {"model": model_attribute(run.model), **section_attributes(run.model.crossing), "parameter": FREQUENCY}
     attrs |= {"parameter_units": "Hz", "of_channel": options.channel, "force": options.drive}
     return xr.Dataset(variables, coords, {**attrs, "left_out": "\n".join(left_out)})
+
+
+def _cut_off(curve: Curve) -> Iterator[str]:
+    """Yield a text for each end at which a curve was cut off within its bounds."""
+    for why, end in zip(curve.ends, (curve.points[0], curve.points[-1]), strict=True):
+        at = f"at frequency_hz = {float(curve.problem.family.values(end.u)[0]):.7g}"
+        if why == "stuck":
+            yield f"stuck {at}: Newton's method found no next orbit for the shortest step"
+        elif why == "max_points":
+            yield f"{len(curve.points)} points {at}, no more are followed; narrow the bounds"
 
 
 def backbone_table(ds: xr.Dataset) -> Table:

@@ -114,7 +114,7 @@ def test_explore__towards_a_homoclinic_orbit():
     assert windows_of(ds)[0]["begins"] == "homoclinic"
     names = {text.get_text() for text in plot_branches(ds).axes[0].texts}
     assert "HOM" in names
-    assert str(ds.attrs["stuck"]) == ""
+    assert "branch 0 at" not in str(ds.attrs["left_out"])
 
 
 MORRIS_LECAR = table(
@@ -273,7 +273,7 @@ def test_explore__period_without_bound_by_another_law():
     """The period 2 pi/omega grows without bound, but at omega = 0 the cycle is a circle of equilibria."""
     ds = followed(HOPF, "y", [0.5, 0.0], "omega", -1.0, 2.0, longest=2000.0, omega=1.0)
     assert not table_of(ds)
-    (line,) = str(ds.attrs["stuck"]).splitlines()
+    (line,) = [line for line in str(ds.attrs["left_out"]).splitlines() if line.startswith("branch 0 at")]
     assert "the period grows faster and faster" in line
     assert "not decided: " in line
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -28,7 +29,9 @@ from pipeline.plots import (
     plot_section,
     plot_trajectory,
     save_figure,
+    style,
 )
+from pipeline.plots.bifurcation import hold
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import (
     DUFFING,
@@ -305,3 +308,15 @@ def test_labels__units_and_fractions_of_pi():
     assert {unit: labels.with_unit("F", unit) for unit in given} == given
     given = {"0": 0.0, "π": 1.0, "\N{MINUS SIGN}π/2": -0.5, "3π/4": 0.75, "π/8": 0.125, "4π": 4.0}
     assert [labels.pi_fraction(value * math.pi) for value in given.values()] == list(given)
+
+
+def test_hold__axes_hold_what_is_drawn_unless_the_user_gave_a_range():
+    for frame, lows in ((style.WIDE, (-1.0, -3.0)), (replace(style.WIDE, ylim=(0.0, 1.0)), (-1.0, 0.0))):
+        ax = style.new_figure(3.0, xr.Dataset(), frame).add_subplot()
+        ax.set_xlim(0.0, 1.0)
+        ax.set_ylim(0.0, 1.0)
+        hold(ax, [np.array([-1.0, 0.5])], [np.array([np.nan, -3.0])])
+        found = ax.get_xlim()[0], ax.get_ylim()[0]
+        assert [a <= b for a, b in zip(found, lows, strict=True)] == [True, True]
+        assert (found[1] == 0.0) == (frame.ylim is not None)
+        assert ax.get_xlim()[1] == ax.get_ylim()[1] == 1.0

@@ -358,7 +358,7 @@ def test_curves__alone_in_a_table_and_over_the_map(map_of_two, curves_of_two):
     row = {"q": 1.5, "frequency_hz": 2.15, "period": 1, "error": pytest.approx(1e-8), "curve": 0}
     assert table.rows[0] == {"label": "CP", "type": "cusp", **row}
     assert table.lines[1].startswith("  0: LP fold, period 1")
-    assert table.lines[1].endswith("; ends: stuck")
+    assert table.lines[1].endswith("; ends: Newton's method finds no next point")
 
 
 @pytest.mark.slow

@@ -75,6 +75,10 @@ def test_evidence__has_the_word_of_the_specification(runs):
     )
     assert omega == ["2 of 3 at omega = 1.570796327, -3.141592654; 3 turn", "from omega = 1.256637061 ± 6e-03."]
     assert period[1] == "from drive_period = 5 ± 2e-02."
+    cut = ds.assign_attrs(
+        drive_rate="omega", model=model, left_out="branch 0 beyond frequency_hz = 0.07957747, a bound"
+    )
+    assert in_own_words(cut).attrs["left_out"] == "branch 0 beyond omega = 0.5, a bound"
 
 
 def test_options__take_values_in_the_word_that_they_name(runs):

@@ -1,0 +1,40 @@
+"""Ends at which branches and curves are cut off, and what was not followed, are said."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.branches.analysis import curves_table, cut_words
+from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.codimension_two import SpecialPoint
+from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
+from pipeline.analysis.branches.problems import Family, Value
+
+
+def test_cut_words():
+    """Figures say how many branches were cut off, and where they got stuck."""
+    flags = {"flag_meanings": "bound closed max_points stuck", "flag_values": np.arange(4, dtype=np.int8)}
+    ends = {"first_end": [0, 3, 1], "last_end": [0, 2, 1]}
+    ds = xr.Dataset(
+        {name: ("branch", np.array(codes, np.int8), flags) for name, codes in ends.items()}
+        | {"parameter": (("branch", "point"), [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]), "n_points": ("branch", [2] * 3)}
+    )
+    assert cut_words(ds) == "ends: 1 stuck (0.25), 1 after too many points (0.75), 2 at a bound"
+    assert cut_words(ds, [2]) == ""
+
+
+def test_not_followed():
+    """What springs from a point of codimension two and has no curve there is said; ends have their reasons in words."""
+    system = SimpleNamespace(n_states=1, state_names=("x",), scales=(1.0,), is_angle=np.array([False]))
+    family = Family(system, 1, 1.0, np.zeros(2), ("p", "q"), (1.0, 1.0))
+    value = Value(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 1)), np.eye(1))
+    points = [Point(np.array([0.0, p, p**2]), np.zeros(3), value, 0) for p in (0.0, 0.5, 1.0)]
+    places = zip(("r2", "chenciner"), points[1:], strict=True)
+    special = [SpecialPoint(kind, family, at, np.full(2, 1e-9)) for kind, at in places]
+    ds = curves_dataset([Curve(family, "neimark_sacker", points, ("bound", "stuck"), 0, special)], "p", "q")
+    assert not_followed(ds) == [
+        "r2 at p = 0.5, q = 0.25: not followed from there: period doubling of period 1, neimark sacker of period 2",
+        "chenciner at p = 1, q = 1: not followed from there: folds of tori",
+    ]
+    assert any("ends: Newton's method finds no next point" in line for line in curves_table(ds).lines)
