@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.following import Branch, problem_of
+from pipeline.analysis.branches.kinds import FOLD
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.tolerances import SAME_ON_BRANCH
@@ -23,6 +24,10 @@ GUESS = 0.05
 
 INEXACT = 1e-12
 """Error of the residual of an orbit [scaled]."""
+
+AT_FOLD, NEAR_FOLD = 1e-9, 1e-3
+"""Largest distances of an orbit from a fold, in the parameter and in the states [scaled], at which it is the fold's: it
+may lie beyond the last point of its branch, and is found to the root of its residual alone."""
 
 SAME_VALUE = 1e-12
 """Largest distance of two values of the parameter that are one but for rounding [scale of the parameter]."""
@@ -56,7 +61,16 @@ def lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
     polished = run_together([at_value(starts[i].family, starts[i].unknowns) for i in near])
     own = dict(zip(near, polished, strict=True))
     known = {i for i, point in candidates if _is_same(starts[i], own[i], point)}
-    return [i in known for i in range(len(starts))]
+    return [i in known or any(_is_fold_of(start, branch) for branch in branches) for i, start in enumerate(starts)]
+
+
+def _is_fold_of(start: Start, branch: Branch) -> bool:
+    """Return whether an orbit is at a fold of a branch."""
+    family, here = branch.family, start.unknowns
+    if start.family.period != family.period or not same_others(family, start.family):
+        return False
+    folds = [one.point for one in branch.bifurcations if one.kind == FOLD and abs(one.point.u[-1] - here[-1]) < AT_FOLD]
+    return any(gap(family, here, point) < NEAR_FOLD for point in folds)
 
 
 def _is_same(start: Start, polished: Point | None, point: Point) -> bool:

@@ -67,6 +67,17 @@ def test_equilibria__both_folds_in_one_step(x):
     assert [x for _, x in folds] == pytest.approx([c, -c], abs=2e-6)
 
 
+def test_explore__a_start_at_a_fold_lies_on_the_branch_that_turns_there():
+    """m = x^2: the branch is the same from (1, 1) and from its fold, beyond all points of it."""
+    model = model_of({"x": "x^2 - m"}, {"m": 0.5})
+    family = Family(model.system, 0, 1.0, model.load().pack(), ("m",), (1.5,))
+    starts = [Start(family, np.array([-1.0]), 1.0), Start(family, np.array([1e-9]), 0.0)]
+    for given in (starts, starts[::-1]):
+        (branch,) = explore(given, Scope(-0.5, 1.0, 2))
+        assert only(branch, "fold")[1] == pytest.approx(0.0, abs=1e-9)
+        assert branch.ends == ("bound", "bound")
+
+
 @pytest.mark.slow
 def test_equilibria__lorenz():
     """Subcritical Hopf point at sigma (sigma + beta + 3)/(sigma - beta - 1) = 470/19."""
