@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.branches.analysis import cut_words
+from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.levels import at_levels, refuse_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import plain

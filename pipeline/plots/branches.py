@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from pipeline.analysis.branches.analysis import cut_words, isolas_of, limits_of
+from pipeline.analysis.branches.analysis import isolas_of, limits_of
+from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
 from pipeline.analysis.branches.levels import refuse_at
 from pipeline.analysis.run import OpenRun

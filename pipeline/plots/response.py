@@ -10,7 +10,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.branches.analysis import cut_words, fixed_of, isolas_of
+from pipeline.analysis.branches.analysis import fixed_of, isolas_of
+from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.kinds import KINDS, LABELS
 from pipeline.analysis.branches.levels import SAME, at_levels
 from pipeline.analysis.points import POINT, read_points

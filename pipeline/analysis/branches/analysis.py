@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -25,7 +24,7 @@ from pipeline.analysis.branches.kinds import (
     PITCHFORK,
 )
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, value_with_error, values, words_of
+from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, value_with_error, values
 from pipeline.layout.own_words import RATE, axis_in_own_words, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
@@ -452,27 +451,6 @@ def listed(ds: xr.Dataset, name: str) -> list[str]:
     """Return the lines of an attribute under its name."""
     lines = str(ds.attrs.get(name, "")).splitlines()
     return ["", name.replace("_", " "), *(f"  {line}" for line in lines)] if lines else []
-
-
-CUT = {"stuck": "stuck", "max_points": "after too many points", "bound": "at a bound"}
-"""Ends at which branches and curves are cut off, with the words for figures."""
-
-
-def cut_words(ds: xr.Dataset, chosen: Iterable[int] | None = None) -> str:
-    """Return a short text on the ends at which branches or curves are cut off, for figures; empty if there is none."""
-    lines = ds["parameter"].values
-    found: dict[str, list[float]] = {why: [] for why in CUT}
-    for i in range(len(lines)) if chosen is None else chosen:
-        for name, point in (("first_end", 0), ("last_end", int(ds["n_points"].values[i]) - 1)):
-            why = words_of(ds[name])[int(ds[name].values[i])]
-            if why in found:
-                found[why].append(float(lines[i, point]))
-    told = [
-        f"{len(at)} {CUT[why]}" + (f" ({', '.join(f'{x:.5g}' for x in sorted(set(at))[:3])})" if why != "bound" else "")
-        for why, at in found.items()
-        if at
-    ]
-    return f"ends: {', '.join(told)}" if told else ""
 
 
 def isolas_of(ds: xr.Dataset) -> list[int]:

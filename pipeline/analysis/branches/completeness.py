@@ -1,8 +1,10 @@
-"""Say how complete a search was: of all orbits, or of all equilibria of a box, at values of the parameter."""
+"""Say how complete a search was: of all orbits, or of all equilibria of a box, at values of the parameter; and which
+ends are cut off.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import xarray as xr
@@ -75,3 +77,24 @@ def counted_lines(ds: xr.Dataset) -> list[str]:
         for one, where in _places(ds, "box")
     ]
     return ["", f"all equilibria of the box, at {counted(len(rows), 'value')}", *aligned(rows)]
+
+
+CUT = {"stuck": "stuck", "max_points": "after too many points", "bound": "at a bound"}
+"""Ends at which branches and curves are cut off, with the words for figures."""
+
+
+def cut_words(ds: xr.Dataset, chosen: Iterable[int] | None = None) -> str:
+    """Return a short text on the ends at which branches or curves are cut off, for figures; empty if there is none."""
+    lines = ds["parameter"].values
+    found: dict[str, list[float]] = {why: [] for why in CUT}
+    for i in range(len(lines)) if chosen is None else chosen:
+        for name, point in (("first_end", 0), ("last_end", int(ds["n_points"].values[i]) - 1)):
+            why = words_of(ds[name])[int(ds[name].values[i])]
+            if why in found:
+                found[why].append(float(lines[i, point]))
+    told = [
+        f"{len(at)} {CUT[why]}" + (f" ({', '.join(f'{x:.5g}' for x in sorted(set(at))[:3])})" if why != "bound" else "")
+        for why, at in found.items()
+        if at
+    ]
+    return f"ends: {', '.join(told)}" if told else ""

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.analysis import curves_table, cut_words
+from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
+from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
 from pipeline.analysis.branches.problems import Family, Value
 
