@@ -51,7 +51,7 @@ def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event
         "seen": ([along[one.stretch.places[one.rises]] for one in named], "last value with cells", unit),
         "beyond": (
             [along[b] if 0 <= b < n else np.nan for b in beyond],
-            "next value of the run, where the event does not lie",
+            "next value of the run beyond the event",
             unit,
         ),
         "bifurcation": (bifurcations.tolist(), "number of the bifurcation, -1 none", {}),

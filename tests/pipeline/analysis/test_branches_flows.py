@@ -226,7 +226,7 @@ def test_explore__cycles_whose_peak_is_a_removable_singularity():
     ds = followed(HODGKIN_HUXLEY, "v", state, "I", 7.5, 9.4, level=3.5, longest=100.0, I=current)
     found = {kind: [row["I"] for row in table_of(ds) if row["type"] == kind] for kind in ("fold", "period_doubling")}
     assert found["fold"] == pytest.approx([7.8465], abs=6e-5)
-    # the cycles double beyond the fold; then a multiplier passes 3e4, and rounding decides how far the branch is followed
+    # beyond this doubling a multiplier passes 3e4, and rounding decides how far the branch is followed
     assert found["period_doubling"][0] == pytest.approx(7.84954, abs=1e-5)
 
 
