@@ -168,22 +168,35 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 def read_commits(info: RunInfo, plan: Plan) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
-    If no record is packed, a record's files must all exist with their sizes. In larger runs this check would take as
-    long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the reading of chunks.
+    A record's files must all exist, and have their sizes if no record is packed. In larger runs sizes would take as
+    long as reading all records; there they are left to `verify`, `pipeline.runs.run` and the reading of chunks.
 
     Raise `DamagedError` if a file of a record is missing or has another size: its task is done, and not pending. Raise
     `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending, since a
     failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
     records, _ = scan(info, plan, copies=info.files.local is None)
-    if not records.packs and absent_objects(info, records):
+    if _lost(info, plan, records):
         # another process may have withdrawn a record before its files: look at both again
         records, _ = scan(info, plan)
-        absent = {} if records.packs else absent_objects(info, records)
-        if absent:
-            more = f" (and files of {len(absent) - 1} more tasks)" if len(absent) > 1 else ""
-            raise DamagedError(f"{info.name}/{CUBE}/{next(iter(absent.values()))}{more}. {remedy(info.name)}")
+        if lost := _lost(info, plan, records):
+            more = f" (and files of {len(lost) - 1} more tasks)" if len(lost) > 1 else ""
+            raise DamagedError(f"{info.name}/{CUBE}/{next(iter(lost.values()))}{more}. {remedy(info.name)}")
     return records
+
+
+def _lost(info: RunInfo, plan: Plan, records: Records) -> dict[int, str]:
+    """Find committed tasks whose files are gone, by listing the folders; return the problems by task."""
+    if not records.packs:
+        return absent_objects(info, records)
+    cube, owners = info.files.below(CUBE), Owners(plan)
+    found: dict[int, str] = {}
+    for folder in (v.name for v in plan.variables):
+        there = {f"{folder}/{name}" for name in _names(cube.below(folder))}
+        for key in owners.keys(folder):
+            if key not in there and (index := owners.task(key)) in records:
+                found.setdefault(index, f"{key} is missing")
+    return found
 
 
 def remedy(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 from pipeline.layout.plan import Plan
 
@@ -41,6 +42,11 @@ class Owners:
             shape = (*plan.shape, *(plan.sizes[dim] for dim in variable.own_dims))
             self._chunks[variable.name] = chunks
             self._counts[variable.name] = tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
+
+    def keys(self, name: str) -> Iterator[str]:
+        """Yield the keys of all chunks of a variable, in order."""
+        for place in itertools.product(*(map(str, range(n)) for n in self._counts[name])):
+            yield ".".join((f"{name}/c", *place))
 
     def task(self, key: str) -> int | None:
         """Return the task that a chunk's key belongs to; None if the key names no chunk of a variable."""
