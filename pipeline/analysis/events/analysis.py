@@ -17,9 +17,23 @@ from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises
 from pipeline.analysis.events.dataset import dataset_of
 from pipeline.analysis.events.grazing import grazing_of
-from pipeline.analysis.events.lines import CROSSING, Fate, Orbit, at, crossing_at, follow, lines_of, places_of
+from pipeline.analysis.events.lines import (
+    AT_BRANCH_POINT,
+    CROSSING,
+    LOCATED,
+    Fate,
+    Orbit,
+    Place,
+    at,
+    bifurcation_at,
+    crossing_at,
+    error_at,
+    follow,
+    lines_of,
+    places_of,
+)
 from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
-from pipeline.analysis.events.one_event import faces, with_images
+from pipeline.analysis.events.one_event import are_mirrored, on_circle, with_images
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -42,12 +56,6 @@ from pipeline.layout.vocabulary import (
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.products.branches import BranchOptions
 from pipeline.products.events import EventOptions
-
-LOCATED = 1e-9
-"""Least error of a located bifurcation, as a share of the interval: integrations have the tolerance 1e-12."""
-
-AT_BRANCH_POINT = 1e-7
-"""The same of branch points, where Newton's method is as exact as the root of its residual."""
 
 _AT_EVEN_TIMES = "a limit cycle seen at even times has no branch; see it at crossings: [section] of a new run"
 
@@ -90,7 +98,7 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     others |= {parameter_name(FREQUENCY_DIM): frequency_of(base.model, {k: float(v) for k, v in _scalars(part)})}
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
-    stretches, ids = _continued(scene, _stretches(scene))
+    stretches, ids = _continued(scene, [_undoubled(scene, one) for one in _stretches(scene)])
     crises = Crises(replace(scene, names=ids))
     stretches = stretches if options.orbits else crises.split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
@@ -99,7 +107,7 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
     scene = crises.scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
-    named = [_on_circle(one, named) for one in named]
+    named = [_on_circle(scene, one, named) for one in named]
     if not options.orbits:
         breakups = Breakups(scene)
         named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
@@ -188,11 +196,37 @@ def _fates(scene: Scene, stretches: Sequence[Stretch]) -> Fates:
             asked.append((one, rises))
             orbits.append(Orbit(scene.family(place, one.period), points[row][0], float(scene.along[place])))
     for key, found in zip(asked, places_of(orbits, scene.lines, geometry_of(ds)), strict=True):
+        found = found or _bifurcation_at(scene, *key, key[0].period)
         if found is None:
-            fates[key] = (Fate(np.nan, why="no branch has this orbit as a stable one (--period, --recurrences)"),) * 2
+            fates[key] = (Fate(np.nan, why=_not_followed(scene, *key)),) * 2
         else:
             fates[key] = follow(scene.located, found, -1), follow(scene.located, found, 1)
     return fates
+
+
+def _bifurcation_at(scene: Scene, one: Stretch, rises: bool, period: int) -> Place | None:
+    """Find a bifurcation of orbits of a period at which the orbit at an end of a stretch lies."""
+    value, points = float(scene.along[one.places[rises]]), points_of_rows(scene.attractors)[one.rows[rises]]
+    geometry, own = geometry_of(scene.attractors), [line for line in scene.lines if line.period == period]
+    found = (bifurcation_at(scene.located, line, value, points, geometry, scene.scale) for line in own)
+    return next((place for place in found if place is not None), None)
+
+
+def _undoubled(scene: Scene, one: Stretch) -> Stretch:
+    """Halve the period of an orbit that is seen at the very value of its doubling, where cells still alternate."""
+    is_alone = one.places[0] == one.places[1] and one.period and one.period % 2 == 0
+    is_double = is_alone and _bifurcation_at(scene, one, False, one.period // 2) is not None
+    return replace(one, period=one.period // 2) if is_double else one
+
+
+def _not_followed(scene: Scene, one: Stretch, rises: bool) -> str:
+    """Say that no branch has the orbit at an end of a stretch, and which bifurcations lie at its value."""
+    ds, value, why = scene.located, float(scene.along[one.places[rises]]), "no branch has this orbit as a stable one"
+    near = [k for k, x in enumerate(ds["value"].values) if abs(x - value) <= error_at(ds, k, scene.scale)]
+    if near:
+        kinds = dict.fromkeys(plain(KINDS[int(ds["kind"].values[k])]) for k in near)
+        return f"{why}, and it is not the orbit of the {' or '.join(kinds)} at {at(ds, value)}"
+    return f"{why} (--period, --recurrences)"
 
 
 def _cut(scene: Scene, stretches: Sequence[Stretch]) -> tuple[list[Stretch], Fates]:
@@ -313,10 +347,9 @@ def _named(scene: Scene, event: Event) -> Event:
     if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
         why = f"{fate.why} at {at(ds, fate.value)}, whose numbers of unstable multipliers contradict it"
         return replace(event, fate=replace(fate, value=np.nan, bifurcation=-1, why=why))
-    crosses = int(ds["kind"].values[k]) in CROSSING
-    error = max(float(ds["bracket"].values[k]), (AT_BRANCH_POINT if crosses else LOCATED) * scene.scale)
-    what = crossing_at(ds, scene.lines, k) if crosses else KINDS[int(ds["kind"].values[k])]
-    return replace(event, what=what, error=error)
+    kind = int(ds["kind"].values[k])
+    what = crossing_at(ds, scene.lines, k) if kind in CROSSING else KINDS[kind]
+    return replace(event, what=what, error=error_at(ds, k, scene.scale))
 
 
 def _touching(scene: Scene, event: Event) -> Event:
@@ -334,11 +367,13 @@ def _touching(scene: Scene, event: Event) -> Event:
     return replace(event, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
 
 
-def _on_circle(one: Event, named: Sequence[Event]) -> Event:
-    """Name the fold of an equilibrium by the cycle that begins there, if there is one."""
+def _on_circle(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the fold of an equilibrium, or of its mirror image, by the cycle that begins there, if there is one."""
     if (one.what, one.stretch.kind) != (FOLD, EQUILIBRIUM):
         return one
-    return next((replace(one, what=SNIC) for cycle in named if cycle.what == SNIC and faces(one, cycle)), one)
+    images = [one, *(other for other in named if other.what == FOLD and are_mirrored(scene, one, other))]
+    found = any(on_circle(scene, image, cycle) for image in images for cycle in named if cycle.what == SNIC)
+    return replace(one, what=SNIC) if found else one
 
 
 def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -> tuple[dict[int, int], int]:

@@ -13,7 +13,7 @@ from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.exploring import BESIDE
 from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LIMITS, PITCHFORK, TRANSCRITICAL
-from pipeline.analysis.branches.known import GUESS, SAME_VALUE, at_value, error_of
+from pipeline.analysis.branches.known import GUESS, NEAR_FOLD, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.sets import Geometry
@@ -23,6 +23,12 @@ from pipeline.layout.vocabulary import parameter_name
 
 CROSSING = [KINDS.index(kind) for kind in (BRANCHING, PITCHFORK, TRANSCRITICAL)]
 """Codes of the bifurcations at which another branch passes."""
+
+LOCATED = 1e-9
+"""Least error of a located bifurcation, as a share of the interval: integrations have the tolerance 1e-12."""
+
+AT_BRANCH_POINT = 1e-7
+"""The same of branch points, where Newton's method is as exact as the root of its residual."""
 
 SPRUNG = ("start", "period_halving", "equilibrium")
 """Ends of a branch that lie on another branch."""
@@ -150,6 +156,29 @@ def places_of(orbits: Sequence[Orbit], lines: Sequence[Line], geometry: Geometry
         if away <= SAME_ON_BRANCH + error_of(point) and moved < best.get(i, (np.inf,))[0]:
             best[i] = (moved, (line, node, away))
     return [best[i][1] if i in best else None for i in range(len(orbits))]
+
+
+def bifurcation_at(
+    ds: xr.Dataset, line: Line, value: float, points: np.ndarray, geometry: Geometry, scale: float
+) -> Place | None:
+    """Find a bifurcation at which an orbit lies, and the stable segment of a line that ends there; None without one.
+
+    The orbit of a bifurcation may lie beyond the last one of its branch, and is found to the root of its residual
+    alone, so that values are compared within the error of the bifurcation, and all points of the orbit with its own.
+    """
+    for node in np.flatnonzero(line.bifurcation >= 0).tolist():
+        away = geometry.distance(points[:, None], line.points[node]).min(axis=1).max()
+        stable = [i for i in (node - 1, node) if 0 <= i < len(line.is_stable) and line.is_stable[i]]
+        is_here = abs(line.value[node] - value) <= error_at(ds, int(line.bifurcation[node]), scale)
+        if is_here and stable and away <= NEAR_FOLD:
+            return line, stable[0], float(away)
+    return None
+
+
+def error_at(ds: xr.Dataset, k: int, scale: float) -> float:
+    """Return the error of the value of a bifurcation, given the length of the interval."""
+    least = AT_BRANCH_POINT if int(ds["kind"].values[k]) in CROSSING else LOCATED
+    return max(float(ds["bracket"].values[k]), least * scale)
 
 
 def _guesses(orbit: Orbit, line: Line, geometry: Geometry) -> list[tuple[int, np.ndarray]]:

@@ -76,7 +76,7 @@ def _is_image(scene: Scene, one: Event, other: Event) -> bool:
     if "mirror_partner" not in ds or (mine.kind, mine.period, one.rises) != (its.kind, its.period, other.rises):
         return False
     if not mine.period and mine.kind != EQUILIBRIUM:
-        return _are_mirrored(scene, one, other) and _are_mirrored(scene, other, one)
+        return are_mirrored(scene, one, other) and are_mirrored(scene, other, one)
     partner = int(ds["mirror_partner"].values[row])
     is_there = its.places[0] <= place <= its.places[1]
     is_same = ds["mirror_distance"].values[row] <= SAME_ON_BRANCH
@@ -94,7 +94,7 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
     # comparisons with the errors of events that have no value, which are NaN, are false
     if a.what != b.what or not abs(a.fate.value - b.fate.value) <= a.error + b.error:
         return False
-    if a.what == SNIC and faces(a, b):
+    if a.what == SNIC and (on_circle(scene, a, b) or on_circle(scene, b, a)):
         return True
     ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
     if a.what in (*CRISES, BREAKUP) and (
@@ -106,15 +106,20 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
         away = geometry_of(scene.attractors).distance(points[0], points[1, 0])
         if j == k or np.nanmin(away) <= SAME_PLACE:
             return True
-    return a.rises == b.rises and _are_mirrored(scene, a, b)
+    return a.rises == b.rises and are_mirrored(scene, a, b)
 
 
-def faces(a: Event, b: Event) -> bool:
-    """Tell whether two attractors end at one value from its two sides."""
-    return a.rises != b.rises and abs(a.fate.value - b.fate.value) <= a.error + b.error
+def on_circle(scene: Scene, one: Event, cycle: Event) -> bool:
+    """Tell whether an equilibrium ends, from the other side, in the fold at which a cycle comes to rest."""
+    ds, k = scene.located, one.fate.bifurcation
+    is_at = abs(one.fate.value - cycle.fate.value) <= one.error + cycle.error
+    if k < 0 or cycle.fate.limit != SNIC or one.rises == cycle.rises or not is_at:
+        return False
+    rest = ds["limit_state"].values[cycle.fate.branch, int(cycle.fate.node > 0)]
+    return bool(geometry_of(scene.attractors).distance(ds["bifurcation_section"].values[k, 0], rest) <= SAME_PLACE)
 
 
-def _are_mirrored(scene: Scene, a: Event, b: Event) -> bool:
+def are_mirrored(scene: Scene, a: Event, b: Event) -> bool:
     """Tell whether two attractors are mirror images of each other at the ends of their stretches."""
     ds, (i, j) = scene.attractors, (one.stretch.rows[one.rises] for one in (a, b))
     if a.stretch.places[a.rises] != b.stretch.places[b.rises] or "mirror_partner" not in ds:
