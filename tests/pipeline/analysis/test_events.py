@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,8 +17,8 @@ from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.events.analysis import parts_of
 from pipeline.analysis.events.cascades import cascade_of
 from pipeline.analysis.events.crises import Crisis
-from pipeline.analysis.events.lines import Fate, crossing_at, lines_of
-from pipeline.analysis.events.one_event import with_images
+from pipeline.analysis.events.lines import Fate, Line, bifurcation_at, crossing_at, follow, lines_of
+from pipeline.analysis.events.one_event import on_circle, with_images
 from pipeline.analysis.events.scene import Event, Stretch
 from pipeline.analysis.ragged import ROW_SIZE
 from pipeline.analysis.sets import Geometry
@@ -219,6 +220,65 @@ def test_events__saddle_node_on_a_circle_at_a_value_of_the_run(tmp_path):
     (told,) = [row for row in run.table("events")["sentence"] if "reaches the end" not in row]
     assert told.startswith("A (equilibrium) ends at I = 1.0000000000 ± ")
     assert told.endswith(", where B (period 1) begins; its cells go on to B")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["circle", "logistic"])
+def test_events__seen_at_the_very_value_of_a_bifurcation(name, tmp_path):
+    """There cells end on the orbit of the bifurcation, with an id or a period of its own: it is no third attractor."""
+    section = {"of": "y", "value": 0.0, "direction": "up"}
+    if name == "circle":
+        starts = {"x": (-1.5, 1.5), "y": (-1.5, 1.5)}
+        run = sweep(CIRCLE, tmp_path, starts, section=section, mu=[0.8, 0.9, 1.0, 1.1, 1.2])
+        known, value = [("A", 0, "rises", "snic", "unknown")], 1.0
+    else:
+        run = sweep(LOGISTIC, tmp_path, {"x": (0.1, 0.9)}, LONG, r=[2.9, 3.0, 3.1, 3.2])
+        known, value = [("A", 1, "rises", "period_doubling", SUPER)], 3.0
+    table = run.table("events")
+    events, values, errors = told(table)
+    assert events == known
+    assert abs(values[0] - value) <= errors[0]
+    assert not (table["what"] == "not_decided").any(), table["evidence"].tolist()
+    assert table["seen"][table["what"] == known[0][3]].tolist() == [value]
+
+
+def line_to_fold(value=1.0, state=0.0):
+    """A stable line up to a fold, as a parabola, and the located branches with the fold."""
+    points = state + np.array([-0.2, -0.1, 0.0, 0.1])[:, None, None]
+    line = Line(0, 1, value - points[:, 0, 0] ** 2, points, np.array([-1, -1, 0, -1]), np.array([0, 0, -1, 1]),
+                np.array([True, True, False]), ("bound", "bound"))  # fmt: skip
+    columns = {"kind": [KINDS.index("fold")], "bracket": [1e-10], "value": [value]}
+    return line, xr.Dataset({key: ("bifurcation", found) for key, found in columns.items()})
+
+
+def test_bifurcation_at__values_within_the_error_and_all_points_of_the_orbit():
+    (line, ds), geometry = line_to_fold(), Geometry((False,), (1.0,))
+    at_fold = partial(bifurcation_at, ds, line, geometry=geometry, scale=0.4)
+    found = at_fold(1.0 + 1e-10, np.array([[1e-5]]))
+    assert found[1] == 1
+    assert [follow(ds.assign_attrs(parameter="mu"), found, way).bifurcation for way in (-1, 1)] == [-1, 0]
+    assert at_fold(1.0 + 1e-8, np.array([[1e-5]])) is None  # another value
+    assert at_fold(1.0, np.array([[1e-5], [0.1]])) is None  # an orbit that has other points too
+    unstable = replace(line, is_stable=np.zeros(3, bool))
+    assert bifurcation_at(ds, unstable, 1.0, np.array([[0.0]]), geometry, 0.4) is None
+
+
+def test_on_circle__compares_values_sides_and_states():
+    """A fold elsewhere in space, at the value of a saddle node on a circle, is another event."""
+    ds = xr.Dataset({
+        "bifurcation_section": (("bifurcation", "phase", "state"), [[[0.0, 1.0]], [[0.0, -1.0]]]),
+        "limit_state": (("branch", "end", "state"), [[[np.nan] * 2] * 2, [[1e-9, 1.0], [np.nan] * 2]]),
+    })  # fmt: skip
+    attractors = xr.Dataset(attrs={"model": magpend.load_model("duffing").name})
+    scene = SimpleNamespace(located=ds, attractors=attractors)
+    rest, turns = Stretch(0, SETS.index("equilibrium"), 0, (0, 1), (0, 1)), Stretch(1, 1, 1, (2, 3), (2, 3))
+    fold = Event(rest, True, Fate(1.0, 0, 5, 0), "fold", 1e-10)
+    cycle = Event(turns, False, Fate(1.0 + 1e-10, 1, 0, limit="snic", error=1e-10), "snic", 1e-10)
+    assert on_circle(scene, fold, cycle)
+    assert not on_circle(scene, replace(fold, fate=replace(fold.fate, bifurcation=1)), cycle)
+    assert not on_circle(scene, replace(fold, fate=replace(fold.fate, value=1.1)), cycle)
+    assert not on_circle(scene, replace(fold, rises=False), cycle)
+    assert not on_circle(scene, cycle, fold)
 
 
 def cut_at(along, up, down):
