@@ -27,7 +27,9 @@ class StartOptions(Options):
     """Options for a state from which to start."""
 
     start: dict[str, float] = option(
-        {}, "Also start from this state, such as x=0.1,v=0; along branches the parameter may be among them."
+        {},
+        "Also start from this state, such as x=0.1,v=0; along branches the parameter may be among them, in any of its "
+        "words.",
     )
     start_period: int = option(
         1,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.layout.own_words import axis_in_own_words, rate_of
+import numpy as np
+
+from pipeline.layout.own_words import axis_in_own_words, rate_of, spelling_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, grid_dim, is_grid_dim, parameter_name
 from pipeline.products.product import Options
 from pipeline.specification.problems import SpecError, unknown_name
@@ -27,8 +30,8 @@ def named(run: RunDirectory, options: Options) -> Options:
 
     ``at`` accepts ``frequency``, ``frequency_hz``, ``omega`` or ``period`` of the drive, a parameter, and for a grid
     of initial states its axis ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second``
-    accept these names, too; bounds are then in their unit. An empty ``parameter`` stands for the swept one, an empty
-    ``state`` for the first state that varies between sections.
+    accept these names, too; bounds are then in their unit. ``start`` accepts the parameter in any of its words. An
+    empty ``parameter`` stands for the swept one, an empty ``state`` for the first state that varies between sections.
 
     Raises
     ------
@@ -54,16 +57,36 @@ def named(run: RunDirectory, options: Options) -> Options:
         for role in {"parameter", "second"} & fields.keys():
             word = run.spec.rate if is_left_out[role] and given[role] == FREQUENCY else _rate(run, given[role])
             changes[role] = FREQUENCY if word else parameter_name(given[role])
-            changes |= _bounds(role, given, RATES[word], RATES[word].hertz) if word else {}
+            changes |= _bounds(role, given, RATES[word], partial(_hertz, word)) if word else {}
             problems += _unknown(
                 "parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY), run.spec.rate
             )
+        if given.get("start") and "parameter" in fields:
+            changes["start"] = _start(run, given["start"], changes["parameter"], problems)
         if "state" in fields:
             changes["state"] = given["state"] or model.section_states[0]
             problems += _unknown("state", given["state"], changes["state"], model.state_names)
     if problems:
         raise SpecError(problems)
     return options.model_copy(update=changes)
+
+
+def _start(run: RunDirectory, start: Mapping[str, float], parameter: str, problems: list[str]) -> dict[str, float]:
+    """Return a start with the name and unit of the parameter that may be among its states."""
+    found: dict[str, float] = {}
+    words: dict[str, str] = {}
+    for given, value in start.items():
+        name, convert = spelling_of(given, run.model)
+        name = parameter_name(name)
+        if given in run.model.state_names or name != parameter:
+            name, convert = given, np.asarray
+        if name in found:
+            problems.append(f"--start: {words[name]} and {given} are both {parameter}; leave one of them out.")
+        elif word_named(given) and name == FREQUENCY and not value > 0.0:
+            problems.append(f"--start: {given} = {value:g} must be greater than 0.")
+        else:
+            found[name], words[name] = float(convert(value)), given
+    return found
 
 
 _BOUNDS = {"parameter": ("low", "high", "before", "after"), "second": ("second_low", "second_high")}
@@ -73,6 +96,13 @@ _BOUNDS = {"parameter": ("low", "high", "before", "after"), "second": ("second_l
 def _rate(run: RunDirectory, name: str) -> str:
     """Return the word for the drive's rate that an option's name is; empty if it is none."""
     return "" if name in run.model.parameter_names else word_named(name)
+
+
+def _hertz(word: str, value: float) -> float:
+    """Return the frequency for a value of the drive's rate; raise SpecError for a period of 0."""
+    if not value and RATES[word].inverse:
+        raise SpecError(f"{word} = {value:g} must be greater than 0.")
+    return float(RATES[word].hertz(value))
 
 
 def _bounds(role: str, given: Mapping[str, Any], rate: Rate, convert: Callable[[Any], Any]) -> dict[str, Any]:
@@ -92,6 +122,11 @@ def in_own_words(run: RunDirectory, options: Some) -> Some:
         changes["at"] = {
             word if name == FREQUENCY_DIM else name: rate.given(value) if name == FREQUENCY_DIM else value
             for name, value in at.items()
+        }
+    if FREQUENCY in (start := getattr(options, "start", {})):
+        changes["start"] = {
+            word if name == FREQUENCY else name: rate.given(value) if name == FREQUENCY else value
+            for name, value in start.items()
         }
     for role in _BOUNDS.keys() & fields.keys():
         if getattr(options, role) == FREQUENCY:
@@ -151,6 +186,6 @@ def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> t
             in_degrees = is_grid_dim(axis) and turned and (degrees or name != plain)
             return axis, math.radians(value) if in_degrees else value
     if (word := word_named(name)) and FREQUENCY_DIM in dims:
-        return FREQUENCY_DIM, RATES[word].hertz(value)
+        return FREQUENCY_DIM, _hertz(word, value)
     known = [d for d in dims if d in cube.coords] or dims
     raise SpecError(unknown_name("axis", name, [axis_in_own_words(d, rate_of(cube))[0] for d in known]))

@@ -165,6 +165,9 @@ _TYPES = {
 }
 
 
+_LENGTHS = {"short": ("min_length", "at least", "add what is missing"), "long": ("max_length", "at most", "cut it")}
+
+
 def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
     location, kind, value = item["loc"], item["type"], item["input"]
     path, context = _path(prefix, location), item.get("ctx", {})
@@ -182,6 +185,11 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
         return f"{path} = {shown(value)}: must be a table{_example(model, location)}."
     if kind in _TYPES:
         return f"{path} = {shown(value)}: must be {_TYPES[kind]}."
+    is_text, (_, _, way) = kind.startswith("string_"), kind.rpartition("_")
+    if way in _LENGTHS and kind.endswith(f"too_{way}"):
+        name, words, remedy = _LENGTHS[way]
+        what = f"{context[name]} {'character' if is_text else 'value'}{'s' * (context[name] != 1)}"
+        return f"{path} = {shown(value)}: must have {words} {what}; {remedy}."
     message = item["msg"].removeprefix("Value error, ")
     return f"{path}: {message}"
 

@@ -141,7 +141,7 @@ def _place_of(ds: xr.Dataset, k: int) -> str:
     """Name a located bifurcation with its place."""
     kind, period = KINDS[int(ds["kind"][k])], int(ds["orbit_period"][int(ds["of_branch"][k])])
     name = parameter_name(str(ds.attrs["parameter"]))
-    return f"{kind}, {period_words(period)}, at {name} {float(ds['value'][k]):.7g}"
+    return f"{kind}, {period_words(period)}, at {name} = {float(ds['value'][k]):.7g}"
 
 
 def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:

@@ -22,9 +22,11 @@ from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.searching import family_at, rows_of, where_variables
 from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import code_flags
+from pipeline.layout.own_words import axis_in_own_words
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
 from pipeline.products.branches import BranchOptions, StartOptions
 from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.tables import FREQUENCY
 
 COUNTS = ("proved", "border", "undecided", "jumps", "no_text")
 """Values of `box_verdict`: why the number of equilibria is proved, or is not."""
@@ -33,9 +35,11 @@ COUNTS = ("proved", "border", "undecided", "jumps", "no_text")
 def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, float]) -> None:
     """Raise SpecError unless the options on starts name all states, with numbers in their bounds."""
     model, name, (low, high) = run.model, parameter_name(options.parameter), interval
-    problems = start_problems(model, options, name)
+    problems = start_problems(model, options, name, word=run.spec.rate)
     if not low <= (value := options.start.get(name, low)) <= high:
-        problems.append(f"--start: {name} = {value:g} is outside of {low:g} to {high:g}; change --from and --to.")
+        own, given = axis_in_own_words(name, run.spec.rate)
+        value, (low, high) = float(given(value)), sorted(float(given(x)) for x in interval)
+        problems.append(f"--start: {own} = {value:g} is outside of {low:g} to {high:g}; change --from and --to.")
     if options.start and 0 < options.max_period < options.start_period:
         problems.append(f"--start-period {options.start_period} is above --period {options.max_period}; raise that.")
     if problems:
@@ -56,12 +60,15 @@ def has_equilibria(model: Model) -> bool:
     return model.autonomous and not model.is_map
 
 
-def start_problems(model: Model, options: StartOptions, *others: str) -> list[str]:
-    """Return what is wrong with --start, which names all states and may name some other quantities."""
+def start_problems(model: Model, options: StartOptions, *others: str, word: str = FREQUENCY) -> list[str]:
+    """Return what is wrong with --start, which names all states and may name some other quantities, of which the
+    drive's rate has a word of its own in the specification.
+    """
     if not options.start:
         return []
     known = (*model.state_names, *others)
-    problems = [f"--start: {unknown_name('state', one, known)}" for one in options.start if one not in known]
+    told = [axis_in_own_words(name, word)[0] for name in known]
+    problems = [f"--start: {unknown_name('state', one, told)}" for one in options.start if one not in known]
     if missing := [state for state in model.state_names if state not in options.start]:
         problems.append(f"--start: give all states; missing: {', '.join(missing)}.")
     if options.start_period == 0 and not has_equilibria(model):
@@ -101,8 +108,8 @@ def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, fl
         near, own_period = _closed_near(there, state, period)
         if near is None:
             what = f"no orbit of period {period}" if period else "no equilibrium"
-            at = "".join(f", {parameter_name(n)} {v:g}" for n, v in {name: value, **where}.items())
-            lines.append(f"start{at}: Newton's method found {what} from there")
+            at = ", ".join(f"{parameter_name(n)} = {v:.7g}" for n, v in {name: value, **where}.items())
+            lines.append(f"start at {at}: Newton's method found {what} from there")
         else:
             starts.append(Start(replace(there, period=own_period), near, value))
     return starts, lines

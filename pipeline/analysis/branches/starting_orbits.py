@@ -18,7 +18,7 @@ from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.ragged import points_of_rows
 from pipeline.analysis.tabular import sets_of
 from pipeline.analysis.tolerances import RECURRENCE
-from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, split_dims
+from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameter_name, split_dims
 
 TRIES = 16
 """Most recurrences tried per period."""
@@ -114,7 +114,8 @@ def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str
         return f"its period is {one.period}; take it with --period {one.period}"
     if not interval[0] <= one.start.value <= interval[1]:
         low, high = interval
-        return f"outside of {one.start.family.free[0]} {low:g} to {high:g}; widen it with --from and --to"
+        name = parameter_name(one.start.family.free[0])
+        return f"outside of {name} = {low:.7g} to {high:.7g}; widen it with --from and --to"
     return ""
 
 
@@ -124,7 +125,8 @@ def _places(where: Sequence[Mapping[str, float]]) -> str:
     ranges = []
     for name in where[0]:
         values = sorted({at[name] for at in where})
-        ranges.append(f"{name} {values[0]:g}" + (f" to {values[-1]:g}" if len(values) > 1 else ""))
+        last = f" to {values[-1]:.7g}" if len(values) > 1 else ""
+        ranges.append(f"{parameter_name(name)} = {values[0]:.7g}{last}")
     points = f" ({len(where)} points)" if len(where) > 1 else ""
     return f" at {', '.join(ranges)}{points}"
 

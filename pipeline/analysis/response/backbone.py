@@ -40,6 +40,8 @@ from pipeline.specification.problems import SpecError, unknown_name
 
 KINDS = ("phase_resonance", "normal_mode")
 
+NAME = parameter_name(FREQUENCY)
+
 HARMONICS = 5
 """Number of harmonics that are measured."""
 
@@ -176,7 +178,7 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
         found = run_alone(phase_resonance(problem, guess))
         if found is None:
             frequency, force = problem.family.values(guess)
-            where = f"{frequency:g} Hz, {options.drive} {force:g}"
+            where = f"{NAME} = {frequency:.7g}, {options.drive} = {force:g}"
             left_out.append(f"phase resonance at {where}: Newton's method found no orbit within the bounds")
             continue
         nearest = min(found.points, key=lambda p: float(np.linalg.norm(p.u - guess)))
@@ -186,7 +188,7 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
 
 def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[ResonanceProblem, Array]]:
     """Yield the equations and a guess for each step of a branch on which the cosine of the lag changes its sign."""
-    asked = {"parameter": parameter_name(FREQUENCY), "low": options.low, "high": options.high}
+    asked = {"parameter": NAME, "low": options.low, "high": options.high}
     located, response = (run.derive(name, **asked) for name in ("branches", "response"))
     base = parameters_of(run.cube())
     system, force = base.model.system, options.drive
@@ -224,11 +226,11 @@ def _follow_modes(run: OpenRun, options: BackboneOptions, curves: list[Curve], l
             low, high = options.low or lines.min() / WIDE, options.high or lines.max() * WIDE
         for k in np.flatnonzero(values.imag > 0.0)[np.argsort(values.imag[values.imag > 0.0])]:
             hertz = float(values[k].imag / (2.0 * np.pi))
-            line = f"normal mode of {hertz:.6g} Hz at {where}"
+            line = f"normal mode of {NAME} = {hertz:.7g} at {where}"
             if not undamped[k]:
                 left_out.append(f"{line}: grows or decays at the rate {values[k].real:.3g} 1/s; see --undamped")
             elif not low <= hertz <= high:
-                left_out.append(f"{line}: outside of {low:g} to {high:g} Hz; widen it with --from and --to")
+                left_out.append(f"{line}: outside of {NAME} = {low:.7g} to {high:.7g}; widen it with --from and --to")
             else:
                 scaled = state / np.asarray(model.system.scales)
                 bounds = ((low, high), (0.0, options.reach))
@@ -308,7 +310,7 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
 def _cut_off(curve: Curve) -> Iterator[str]:
     """Yield a text for each end at which a curve was cut off within its bounds."""
     for why, end in zip(curve.ends, (curve.points[0], curve.points[-1]), strict=True):
-        at = f"at frequency_hz = {float(curve.problem.family.values(end.u)[0]):.7g}"
+        at = f"at {NAME} = {float(curve.problem.family.values(end.u)[0]):.7g}"
         if why == "stuck":
             yield f"stuck {at}: Newton's method found no next orbit for the shortest step"
         elif why == "max_points":

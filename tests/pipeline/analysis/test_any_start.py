@@ -190,7 +190,7 @@ def test_branches__start_at_an_unstable_state(hoop):
     assert ds.sizes["branch"] == plain.sizes["branch"] + 1
     assert (ds["n_unstable"].values[0, : int(ds["n_points"][0])] == 1).all()
     lost = hoop.branches(low=0.5, high=0.9, start={"th": np.pi / 2, "v": 1e6})
-    assert lost.attrs["left_out"].startswith("start, w 0.5: Newton's method found no equilibrium")
+    assert lost.attrs["left_out"].startswith("start at w = 0.5: Newton's method found no equilibrium")
 
 
 @pytest.mark.parametrize(

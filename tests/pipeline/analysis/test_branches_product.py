@@ -66,7 +66,7 @@ def test_branches__all_periods_or_a_line(directory):
     short = derive(directory, "branches", SHORT)
     left_out = [line for line in branches_table(short).lines if "take it with --period 4" in line]
     assert len(left_out) == 1
-    assert "amplitude 0.289" in left_out[0]
+    assert "amplitude = 0.289" in left_out[0]
     # a stored result says it again
     again = derive(directory, "branches", SHORT)
     assert branches_table(again).lines == branches_table(short).lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from math import pi
 
 import numpy as np
@@ -14,8 +15,10 @@ import magpend
 from pipeline.compute.simulate import simulate
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.own_words import in_own_words
-from pipeline.products.branches import CurveOptions
+from pipeline.products.branches import BranchOptions, CurveOptions
+from pipeline.products.product import StateOptions
 from pipeline.runs.naming import named
+from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import RATES
 
 SPRING = "x'' = F*cos(omega*t) - 0.1*x' - x - x**3\nF = 0.3"
@@ -79,6 +82,48 @@ def test_evidence__has_the_word_of_the_specification(runs):
         drive_rate="omega", model=model, left_out="branch 0 beyond frequency_hz = 0.07957747, a bound"
     )
     assert in_own_words(cut).attrs["left_out"] == "branch 0 beyond omega = 0.5, a bound"
+    told = "A at frequency_hz = 0.25 to 0.5 (3 points): outside of frequency_hz = 0.1432394 to 0.2, F = 3"
+    omega, period = (
+        in_own_words(ds.assign_attrs(drive_rate=word, model=model, left_out=told)).attrs["left_out"]
+        for word in ("omega", "period")
+    )
+    # 0.9/(2 pi), rounded, is 0.9 again
+    assert omega == "A at omega = 1.570796327 to 3.141592654 (3 points): outside of omega = 0.9 to 1.256637061, F = 3"
+    assert period.startswith("A at drive_period = 2 to 4 (3 points): outside of drive_period = 5 to 6.98132")
+
+
+def test_start__has_the_rate_in_any_of_its_words(runs):
+    state = {"x": 0.5, "x_dot": 0.0}
+    for run in runs.values():
+        for word, value in (("omega", 1.5), ("period", 2 * pi / 1.5), ("frequency_hz", 1.5 / (2 * pi))):
+            for parameter in ("", "omega", "frequency_hz"):
+                found = named(run, BranchOptions(parameter=parameter, start={**state, word: value})).start
+                assert found == pytest.approx({**state, "frequency_hz": 1.5 / (2 * pi)})
+    problems = {
+        "omega": (1.95, r"start: omega = 1\.95 is outside of 1\.2 to 1\.9; change low= and high=\."),
+        "period": (0.0, r"start: period = 0 must be greater than 0\."),
+        "omgea": (1.5, r"start: unknown state 'omgea'; did you mean omega\?"),
+    }
+    for word, (value, message) in problems.items():
+        with pytest.raises(SpecError, match=message):
+            runs["omega"].branches(start={**state, word: value})
+    with pytest.raises(SpecError, match=r"omega and period are both frequency_hz; leave one of them out\."):
+        runs["omega"].branches(start={**state, "omega": 1.5, "period": 4.0})
+    for given in ({"at": {"period": 0.0}}, {"parameter": "period", "low": 0.0}):
+        with pytest.raises(SpecError, match=r"^period = 0 must be greater than 0\."):
+            named(runs["omega"], StateOptions(**given) if "at" in given else BranchOptions(**given))
+
+
+def test_left_out__has_the_word_of_the_specification(runs):
+    found = runs["omega"].branches(parameter="omega", low=1.25, high=1.35, start={"x": 1e9, "x_dot": 0.0, "omega": 1.3})
+    lines = in_own_words(found).attrs["left_out"].splitlines()
+    assert lines[0] == "start at omega = 1.3: Newton's method found no orbit of period 1 from there"
+    outside = [line for line in lines if line.startswith("attractor")]
+    assert outside
+    for line in outside:
+        assert re.search(
+            r" at omega = 1\.\d( to 1\.\d)?( \(\d points\))?: outside of omega = 1\.25 to 1\.35; widen", line
+        )
 
 
 def test_options__take_values_in_the_word_that_they_name(runs):

@@ -93,6 +93,7 @@ def test_parse_spec__all_errors_at_once():
         (("[axes]", "[parameters]\noverrides = { q = 1.0 }\n[axes]"), "axes.q", "keep one"),
         (("[axes]", "[continuation]\n[axes]"), "continuation", "a sweep has no such table"),
         (("[1.5, 1.6]", "[1.6, 1.5]"), "axes.q", "rise strictly"),
+        (("[1.5, 1.6]", "[]"), "axes.q.values = []: ", "must have at least 1 value; add what is missing."),
         (('kind = "grid"\n', ""), "initial_conditions.kind", "missing"),
         (("psi1_dot = 0.1", "psi1_dot = 0.1\npsi1_dot_deg = 2"), "initial_conditions", "keep one"),
         (("rtol = 1e-6", "rtol = '1e-6'"), "integration.rtol", "a number"),
