@@ -281,12 +281,15 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
         echo(line)
     sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
     carry_out(extension.spec, extension.text, files, echo=echo, sources=sources, **how)
-    _record(extension, files)
+    echo(f"{_record(extension, files)} of {extension.plan.n_cells} cells were reused")
     return state(files)
 
 
-def _record(extension: Extension, files: Files) -> None:
-    """Write a file that lists the runs from which cells were copied."""
+def _record(extension: Extension, files: Files) -> int:
+    """Write a file that lists the runs from which cells were copied; return the number of these cells.
+
+    It is smaller than planned if a source turned out to be damaged.
+    """
     taken: dict[int, int] = {}
     with contextlib.suppress(FileNotFoundError):
         for line in files.read(TIMINGS).decode().splitlines():
@@ -298,9 +301,10 @@ def _record(extension: Extension, files: Files) -> None:
             {"directory": run.info.files.place, "digest": run.info.digest, "cells": count} for run, count in runs
         ],
         "cells": extension.plan.n_cells,
-        "reused": sum(taken.values()),
+        "reused": (reused := sum(taken.values())),
     }
     files.write(EXTENDED, canonical(content).encode())
+    return reused
 
 
 # ---- further values ----------------------------------------------------------------------------

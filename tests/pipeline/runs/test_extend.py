@@ -304,6 +304,7 @@ def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
     code, out, err = main(*words, "--workers", 0)
     assert code == 0, err
     assert f"the old run is in {mine}.before" in err
+    assert "25 of 35 cells were reused\n" in err
     assert open_run(mine).section.equals(open_run(fresh).section)
     # the text that was written is a specification like any other
     text = tmp_path / "again.toml"
