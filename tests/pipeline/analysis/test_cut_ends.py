@@ -5,12 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.analysis import curves_table
+from magpend_core.crossing import Crossing
+from magpend_core.models import load_model
+from magpend_core.models.sectioned import sectioned
+from pipeline.analysis.branches.analysis import _no_equilibria, curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
 from pipeline.analysis.branches.problems import Family, Value
+from pipeline.layout.vocabulary import model_attribute, section_attributes
 
 
 def test_cut_words():
@@ -23,6 +27,17 @@ def test_cut_words():
     )
     assert cut_words(ds) == "ends: 1 stuck (0.25), 1 after too many points (0.75), 2 at a bound"
     assert cut_words(ds, [2]) == ""
+
+
+def test_branches_table__of_cycles_alone_names_how_to_begin_at_equilibria():
+    """A flow whose cells all end on one cycle has no branch of equilibria, and so no Hopf point."""
+    model = sectioned(load_model("lorenz"), Crossing("z", 20.0))
+    of_flow = {"model": model_attribute(model), **section_attributes(model.crossing)}
+    driven = {"model": model_attribute(load_model("duffing"))}
+    for period, attrs, n in ((1, of_flow, 1), (0, of_flow, 0), (1, driven, 0)):
+        ds = xr.Dataset({"orbit_period": ("branch", [period]), "value": ("bifurcation", np.zeros(0))}, attrs=attrs)
+        told = [line for line in _no_equilibria(ds) if "--all-equilibria finds all in a box, --start follows" in line]
+        assert len(told) == n
 
 
 def test_not_followed():

@@ -13,6 +13,7 @@ from pipeline.analysis.series.analysis import series_table
 from pipeline.analysis.spectrum.analysis import LINES, spectrum_table
 from pipeline.analysis.spectrum.estimate import ALL, frequencies_of
 from pipeline.analysis.spectrum.gaps import filled
+from pipeline.plots.spectrum import plot_spectrum
 from pipeline.specification.problems import SpecError
 
 from .cubes import swept
@@ -321,6 +322,17 @@ def test_figures__show_lines_densities_and_orders(duffing):
     first = duffing.spectrum(at={"F": 0.2})
     assert np.nanmax(column[drive - 1 : drive + 2]) == pytest.approx(float(first["amplitude"][0, 0]), rel=1e-9)
     assert np.isnan(column[drive + 20])
+
+
+def test_figure__ends_where_the_power_does():
+    """A line of order 1 and a trace of order 3: the axis does not go on to the highest bin, at order 12.8."""
+    t = np.arange(16_384) / 64.0
+    for trace, last in ((1e-9, (2.0, 2.2)), (0.1, (3.0, 3.2))):
+        x = np.cos(TURN * 2.5 * t) + trace * np.cos(TURN * 7.5 * t)
+        found = magpend.spectrum_of(series(x, 64.0), nperseg=512, drive_hz=2.5)
+        ax = plot_spectrum(found).axes[0]
+        assert float(found["order"].max()) > 12.0
+        assert last[0] < ax.get_xlim()[1] < last[1]
 
 
 @pytest.mark.parametrize(
