@@ -77,7 +77,7 @@ def test_branches__none_to_begin_with(directory, main, tmp_path):
     assert ds.sizes["branch"] == 0
     lines = branches_table(ds).lines
     assert lines[0].startswith("no branch")
-    assert any("outside of amplitude 0.4 to 0.6" in line for line in lines)
+    assert any("outside of amplitude = 0.4 to 0.6" in line for line in lines)
     # With the reason, and without a file
     words = ("--parameter", "amplitude", "--from", 0.4, "--to", 0.6)
     code, out, err = main("analyse", "branches", directory, *words, "--csv", "found.csv")
