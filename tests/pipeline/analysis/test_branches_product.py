@@ -84,7 +84,7 @@ def test_branches__none_to_begin_with(directory, main, tmp_path):
     assert code == Exit.REFUSED
     assert out == ""
     assert "no branch along amplitude: there is no closed orbit to begin with" in err
-    assert "2 of 3: outside of amplitude 0.4 to 0.6" in err
+    assert "2 of 3: outside of amplitude = 0.4 to 0.6" in err
     assert "1 of 3: a set that does not close" in err
     assert not (tmp_path / "found.csv").exists()
 
