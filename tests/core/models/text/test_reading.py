@@ -137,6 +137,7 @@ def test_mirror__must_be_one_of_the_equations(signs, half_period, wrong):
         (("states", "frequency"), "m", "names something else in runs"),
         (("states", "x"), {"unit": 3}, "model.states.x.unit: 3 must be a text in quotes."),
         (("states", "x"), {"unit": "\x1b[2J"}, r"model.states.x.unit: '\x1b[2J' has control characters; remove them."),
+        (("title",), "\x1b[31mred", r"model.title: '\x1b[31mred' has control characters; remove them."),
         (("states", "x"), {"scale": 0.0}, "model.states.x.scale: 0.0 must be greater than 0."),
         (("states", "x"), {"angle": True}, "model.states.x.angle: is no key here; "),
         (("states", "x"), {"on_circle": "yes"}, 'model.states.x.on_circle: "yes" must be true or false.'),
