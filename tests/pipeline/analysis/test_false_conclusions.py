@@ -133,6 +133,18 @@ def test_identify__a_steady_rotation_is_a_limit_cycle(equations, starts, of, sec
         assert not strobed or own[0] == 1.0
 
 
+@pytest.mark.slow
+def test_attractors__of_a_run_that_sees_a_turning_angle_at_instants(computed):
+    """At the default tolerance the crossings of the cycle's level were lost, and the analysis ended in an error."""
+    starts = [[0.5, 1.0], [1.5, 2.0], [0.2, 0.0]]
+    run = sweep(UNIFORM_ANGLE, starts, frequency_hz=0.3, lengths=(200, 16), tolerance=1e-8)
+    found = derive(computed(run), "attractors")
+    assert found["kind"].values.tolist() == [PERIODIC_ORBIT]
+    assert found["stability"].values.tolist() == [ATTRACTS]
+    assert float(found["period_s"][0]) == pytest.approx(2.0 * np.pi, rel=1e-9)
+    assert found["n_cells"].values.tolist() == [3]
+
+
 def test_identify__a_curve_has_one_id_at_any_phase():
     """A cycle of multiplier .64 that cells reach after the run, and its mirror image: scipy goes through all points."""
     rng = np.random.default_rng(0)
