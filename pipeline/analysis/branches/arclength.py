@@ -3,6 +3,11 @@
 The predictor extends the cubic through the last two points by a step along the tangent. The corrector is
 Newton's method in the plane normal to the tangent, so that it also passes folds in the parameter.
 Unknowns are scaled; lengths are Euclidean in them.
+
+A step is short by the range that each unknown has covered so far, where this is more than its scale: a curve that moves
+far, as the amplitude does at a sharp resonance, takes longer steps, but not in the unknowns that move little. So the
+number of points grows with the logarithm of the distance. A free parameter, whose scale is its interval, takes no
+longer steps.
 """
 
 from __future__ import annotations
@@ -22,8 +27,9 @@ class Settings:
 
     # arclengths; a trace ends if it needs a step below the shortest
     first_step: float = 1e-3
-    longest_step: float = 5e-3
+    longest_step: float = 5e-3  # in units of the range of the unknowns, which is at least `size`
     shortest_step: float = 1e-7
+    size: float = 1.0
     max_points: int = 4000  # points of one trace
     tolerance: float = 1e-10  # largest scaled residual of a point
     max_iterations: int = 6  # Newton steps before a step is halved
@@ -134,12 +140,13 @@ def trace(
     point, but not where the unknowns jump (`across`). The start is the first of the points.
     """
     found = Trace([start])
-    step = settings.first_step
+    step, low, high = settings.first_step, start.u, start.u
     while len(found.points) < settings.max_points:
         here = found.points[-1]
         guess = _ahead(found.points, step)
         there = yield from correct(problem, guess, here.tangent, settings)
-        is_near = there is not None and _is_near(here, there, step, settings)
+        ranges = np.maximum(high - low, settings.size)
+        is_near = there is not None and _is_near(here, there, step, ranges, settings)
         if there is None or not is_near or (between and not (yield from between(here, there))):
             step *= 0.5
             if step >= settings.shortest_step:
@@ -149,16 +156,19 @@ def trace(
                 found.end = "stuck"
                 return found
             found.points.append(pair[1])
-            step = settings.first_step
+            step, low, high = settings.first_step, pair[1].u, pair[1].u
             continue
         found.points.append(there)
         found.end = stop(found.points) if stop else ""
         if found.end:
             return found
+        low, high = np.minimum(low, there.u), np.maximum(high, there.u)
+        longest = _longest(there, np.maximum(high - low, settings.size), settings)
         if there.n_iterations <= 3:
-            step = min(1.5 * step, settings.longest_step)
+            step *= 1.5
         elif there.n_iterations > 4:
             step *= 0.7
+        step = min(step, longest)
     found.end = "max_points"
     return found
 
@@ -186,8 +196,20 @@ def _ahead(points: list[Point], step: float) -> np.ndarray:
     return np.asarray(bent - (here.tangent @ (bent - straight)) * here.tangent)
 
 
-def _is_near(here: Point, there: Point, step: float, settings: Settings) -> bool:
-    """Return whether a step stayed on the solution curve: the tangent turned little, and the correction was small."""
-    cosine = float(here.tangent @ there.tangent)
-    moved = np.linalg.norm(there.u - here.u - step * here.tangent)
-    return cosine >= np.cos(settings.largest_turn) and bool(moved <= 0.5 * step)
+def _longest(here: Point, ranges: np.ndarray, settings: Settings) -> float:
+    """Return the longest step at a point, for the ranges of the unknowns so far."""
+    own = np.linalg.norm(here.tangent * (settings.size / ranges))
+    return float(settings.size * settings.longest_step * (np.linalg.norm(here.tangent) / own))
+
+
+def _is_near(here: Point, there: Point, step: float, ranges: np.ndarray, settings: Settings) -> bool:
+    """Return whether a step stayed on the solution curve: the tangent turned little, and the correction was small, both
+    in the unknowns and in units of their ranges.
+    """
+    for unit in (np.ones_like(ranges), ranges):
+        first, last, moved = here.tangent / unit, there.tangent / unit, (there.u - here.u) / unit
+        length = float(np.linalg.norm(first))
+        cosine = float(first @ last) / (length * float(np.linalg.norm(last)))
+        if cosine < np.cos(settings.largest_turn) or np.linalg.norm(moved - step * first) > 0.5 * step * length:
+            return False
+    return True

@@ -36,6 +36,10 @@ distance of the first orbit from the point, in units of the step."""
 ACROSS = 100.0
 """Step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step."""
 
+NEAR_HALF, PASSED = 0.2, 4.0
+"""Distances of two neighbouring points from the orbit of half the period, by the way to the point half a period later,
+below which the branch passes it: scaled, and in units of the step. On the way through it changes by two steps."""
+
 REST = 0.5
 """At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""
 
@@ -161,7 +165,8 @@ def has_halved(family: Family, points: list[Point]) -> bool:
     if not family.period or family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
-    return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2)
+    near = max(NEAR_HALF, PASSED * float(np.linalg.norm(points[-1].u - points[-2].u)))
+    return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < near)
 
 
 def _half_way(family: Family, point: Point) -> np.ndarray:

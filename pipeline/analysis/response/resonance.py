@@ -193,7 +193,7 @@ def phase_resonance(problem: ResonanceProblem, guess: Array) -> Steps[Curve | No
     if start is None:
         return None
     size = max(1.0, float(np.linalg.norm(start.u[: problem.system.n_states])))
-    settings = replace(RESONANCE, longest_step=size * RESONANCE.longest_step)
+    settings = replace(RESONANCE, size=size)
     back = yield from trace(problem, opposite(start), settings)
     ahead = yield from trace(problem, start, settings)
     points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
@@ -217,7 +217,7 @@ def normal_mode(problem: ModeProblem, direction: Array) -> Steps[Curve | None]:
     found = yield from correct(problem, start, normal, MODE)
     if found is None or not (yield from is_closed(found, found)):
         return None
-    settings = replace(MODE, longest_step=problem.bounds[1][1] * MODE.longest_step)
+    settings = replace(MODE, size=problem.bounds[1][1])
     followed = yield from trace(problem, found, settings, between=is_closed)
     return Curve(problem, followed.points, ("linear_mode", _end(problem, followed)))
 
