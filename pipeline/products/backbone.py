@@ -42,4 +42,5 @@ BACKBONE = Analysis(
     settle=f"{_ROOM}:settle_backbone",
     builds_on=("branches", "response"),
     figure="backbone",
+    version=2,
 )
