@@ -42,5 +42,4 @@ BACKBONE = Analysis(
     settle=f"{_ROOM}:settle_backbone",
     builds_on=("branches", "response"),
     figure="backbone",
-    version=2,
 )

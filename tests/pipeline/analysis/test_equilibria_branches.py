@@ -56,6 +56,27 @@ def test_equilibria__folds_of_a_cubic():
     assert branch.ends == ("bound", "bound")
 
 
+@pytest.mark.slow
+def test_equilibria__folds_of_a_branch_whose_states_move_far():
+    """Predator and prey: the prey moves from 2 to 80. At a fold the determinant of the Jacobian, taken here, is 0."""
+    equations = {"x": "x - x*z/(1 + alpha*x) - 0.01*x^2", "z": "-z + x*z/(1 + alpha*x) - delta*z^2"}
+    model = model_of(equations, {"alpha": 0.1, "delta": 0.3})
+    (branch,), _ = branches_of(model, "alpha", (0.05, 0.55), [1.6, 1.2], 0.1)
+
+    def fold(v):
+        x, z, alpha = v
+        eats, saturation = z / (1.0 + alpha * x) ** 2, x / (1.0 + alpha * x)
+        slopes = [[alpha * x * eats - 0.01 * x, -saturation], [eats, -0.3 * z]]
+        rates = (1.0 - z / (1.0 + alpha * x) - 0.01 * x, -1.0 + saturation - 0.3 * z)
+        return (*rates, np.linalg.det(slopes))
+
+    wanted = [fsolve(fold, guess)[-1] for guess in ((6.0, 3.0, 0.36), (45.0, 7.6, 0.28))]
+    found = [branch.family.values(b.point.u)[0] for b in branch.bifurcations if b.kind == "fold"]
+    np.testing.assert_allclose(found, wanted, rtol=1e-8)
+    assert branch.ends == ("bound", "bound")
+    assert len(branch.points) < 2000
+
+
 @pytest.mark.parametrize("x", [0.5, 0.505, 0.51])
 def test_equilibria__both_folds_in_one_step(x):
     """m = x^3 - 3 c^2 x: folds at x = -c and c, much nearer to each other than the longest step."""
