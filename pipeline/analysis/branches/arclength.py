@@ -4,9 +4,9 @@ The predictor extends the cubic through the last two points by a step along the 
 Newton's method in the plane normal to the tangent, so that it also passes folds in the parameter.
 Unknowns are scaled; lengths are Euclidean in them.
 
-A step is short by the range that each unknown has covered so far, where this is more than its scale: a curve that moves
-far, as the amplitude does at a sharp resonance, takes longer steps, but not in the unknowns that move little. So the
-number of points grows with the logarithm of the distance. A free parameter, whose scale is its interval, takes no
+The longest step is a share of the range that each unknown has covered so far, or of its scale if this is more. A curve
+that moves far, as at a sharp resonance, takes longer steps in the unknowns that move far, but not in the others. So the
+number of points grows with the logarithm of the distance. A free parameter, whose scale is its interval, never takes
 longer steps.
 """
 
@@ -27,9 +27,9 @@ class Settings:
 
     # arclengths; a trace ends if it needs a step below the shortest
     first_step: float = 1e-3
-    longest_step: float = 5e-3  # in units of the range of the unknowns, which is at least `size`
+    longest_step: float = 5e-3  # in units of the range that an unknown has covered, or of `size` if this is more
     shortest_step: float = 1e-7
-    size: float = 1.0
+    size: float = 1.0  # scaled
     max_points: int = 4000  # points of one trace
     tolerance: float = 1e-10  # largest scaled residual of a point
     max_iterations: int = 6  # Newton steps before a step is halved
