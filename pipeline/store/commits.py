@@ -194,7 +194,8 @@ def _lost(info: RunInfo, plan: Plan, records: Records) -> dict[int, str]:
     for folder in (v.name for v in plan.variables):
         there = {f"{folder}/{name}" for name in _names(cube.below(folder))}
         for key in owners.keys(folder):
-            if key not in there and (index := owners.task(key)) in records:
+            index = None if key in there else owners.task(key)
+            if index is not None and index in records:
                 found.setdefault(index, f"{key} is missing")
     return found
 
