@@ -105,6 +105,15 @@ def number(value: float, spec: str) -> str:
     return format(value, spec) if np.isfinite(value) else "-"
 
 
+def in_scale(value: float, scale: float) -> str:
+    """Format a state's value to four digits of its scale at least, and 0 where it is the rounding of one; a dash if it
+    is not finite.
+    """
+    if not np.isfinite(value) or abs(value) < 1e-12 * scale:
+        return "0" if np.isfinite(value) else "-"
+    return format(value, f".{max(4, 4 + int(np.floor(np.log10(abs(value) / scale))))}g")
+
+
 def plain(label: str) -> str:
     """Replace underscores by spaces in a label."""
     return label.replace("_", " ")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -19,6 +20,7 @@ from pipeline.analysis.tabular import (
     Words,
     counted,
     distinct,
+    in_scale,
     largest_share,
     leading,
     number,
@@ -35,6 +37,9 @@ from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims, time_unit
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions
 from pipeline.products.product import Table
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
 
 MOST_STATES = 2
 """Most states of a model whose places are printed; the CSV table has those of all models."""
@@ -73,7 +78,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
     dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     attracting = np.unique(ds["attractor"].values[ds["stability"].values == ATTRACTS])
-    unit = time_unit(model_of(ds))
+    model = model_of(ds)
     n, others = attracting.size, int(ds.attrs[N_IDS]) - attracting.size
     lines = [f"{counted(n, 'attractor')} at {counted(n_points, 'parameter point')}"]
     if others:
@@ -85,7 +90,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
         rest = _others_lines(ds)
         for i, (_, where) in enumerate(points_of(ds, dims)):
             shown, more = _largest([row for row in rows if all(row[k] == v for k, v in where.items())])
-            table = point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, unit))
+            table = point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, model))
             lines += [*table, *more, *rest[i]]
     return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
 
@@ -246,7 +251,7 @@ def _growing_lines(ds: xr.Dataset) -> list[str]:
     ]
 
 
-def _attractor_words(row: Row, n_points: int, unit: str) -> Words:
+def _attractor_words(row: Row, n_points: int, model: Model) -> Words:
     turns = [f"{round(v, 3) + 0.0:.3f}" for k, v in row.items() if k.startswith("rotation_")]
     decided = [f"{n} {plain(k.removeprefix('by_'))}" for k, n in row.items() if k.startswith("by_") and n]
     flow = "eigenvalue_real" in row  # returns of a flow differ in length
@@ -261,7 +266,7 @@ def _attractor_words(row: Row, n_points: int, unit: str) -> Words:
         "rotation": " ".join(turns) or None,
         "|multiplier|": number(row["multiplier_modulus"], ".4g" if flow else ".4f"),
         "eigenvalue": _eigenvalue(row) if flow else None,
-        f"exponent per {unit}": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
+        f"exponent per {time_unit(model)}": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
         "cells": str(row["n_cells"]),
         "share": with_interval(row, FRACTION, ".4f") if "fraction" in row else None,
         "mirror": _known(row["mirror_partner"]) if "mirror_partner" in row else None,
@@ -269,17 +274,16 @@ def _attractor_words(row: Row, n_points: int, unit: str) -> Words:
         "id by": plain(row["match_basis"]) if n_points > 1 and "match_basis" in row else None,
     }
     last = {"decided": ", ".join(decided), "shown by": _shown_by(row)}
-    place = _place(row)
+    place = _place(row, model)
     columns = state_columns(place, [*words, *last])
     return {**words, **{columns[name]: text for name, text in place.items()}, **last}
 
 
-def _place(row: Row) -> Words:
+def _place(row: Row, model: Model) -> Words:
     """Return the section point and, where it moves, the range of a set in each state, if the states are few."""
-    states = [name.removeprefix("section_") for name in row if name.startswith("section_")]
     words = {}
-    for x in states if len(states) <= MOST_STATES else ():
-        point, low, high = (number(row[f"{part}_{x}"], ".4g") for part in ("section", "min", "max"))
+    for x, scale in zip(model.state_names, model.scales, strict=True) if len(model.states) <= MOST_STATES else ():
+        point, low, high = (in_scale(row[f"{part}_{x}"], scale) for part in ("section", "min", "max"))
         words[x] = point if low == high else f"{point} ({low} to {high})"
     return words
 
