@@ -90,7 +90,7 @@ def newton_steps(
         met = np.zeros(states.shape)
     met[good] = np.maximum(met[good], np.abs(rates[good]))
     norms = np.abs(own * scales / scales[:, None]).max(axis=(1, 2), initial=0.0)
-    allowed = np.maximum(RATE_LEFT * met[good], RATE_ROUNDING * norms[:, None] * scales)
+    allowed = np.maximum(RATE_LEFT * met[good], RATE_ROUNDING * max(1.0, system.farthest) * norms[:, None] * scales)
     vanishes[good] = (left <= allowed).all(axis=1)
     return steps, jacobians, vanishes
 

@@ -106,10 +106,11 @@ def orbit_periods(
     window = window_of(max_orbit_period)
     settings = Settings(0, 0, max_orbit_period, closure_tolerance, window)
     rings = np.zeros((len(sections), window * system.n_states))
-    flat = sections[:, -window:].reshape(len(sections), -1)
+    # the compiled test divides by the units
+    flat = (sections[:, -window:] * _per_scale(system)).reshape(len(sections), -1)
     rings[:, : flat.shape[1]] = flat
     found = np.zeros(len(sections), np.int16)
-    judge_of(system)(rings, min(sections.shape[1], window), settings, found)
+    judge_of(system.plain)(rings, min(sections.shape[1], window), settings, found)
     return found
 
 
@@ -119,13 +120,18 @@ def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
         found[i] = closed_period(rings[i], last, settings)
 
 
+def _per_scale(system: System) -> np.ndarray:
+    """Return the unit of each state in scales of the motion; 1 for angles, which are compared on their circle."""
+    return np.where(system.is_angle, 1.0, np.asarray(system.units) / np.asarray(system.scales))
+
+
 @cache
 def judge_of(system: System) -> Callable[..., None]:
     """Compile `judge`, the test for periodic orbits, for a system with its angles and scales."""
     bindings: dict[str, Any] = {
         "N": system.n_states,
         "IS_ANGLE": np.array(system.is_angle, np.int64),
-        "SCALES": np.array(system.scales),
+        "SCALES": np.array(system.units),
     }
     for key in observers.HELPERS:
         bindings[key] = bound_part(getattr(observers, key), bindings, True)

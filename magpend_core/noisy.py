@@ -313,4 +313,4 @@ def _halved_error(system: System, engine: Any, cells: NoisyCells, rows: np.ndarr
     distance = np.abs(halved.section[:, 0] - cells.section[rows, -1])
     circle = np.array(system.is_angle)
     distance = np.where(circle, np.minimum(distance, np.abs(TWO_PI - distance)), distance)
-    return np.asarray((distance / np.array(system.scales)).max(axis=1))
+    return np.asarray((distance / np.array(system.units)).max(axis=1))

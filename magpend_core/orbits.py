@@ -29,6 +29,9 @@ from magpend_core.validation import check_array, check_frequency, check_states, 
 RTOL = 1e-12
 """Tolerance of the integrations here: the residual can then go below 1e-10."""
 
+ROUNDING = 1e-12
+"""Residual that the rounding of the states leaves, relative to their largest value."""
+
 TRUST = 0.5
 """Longest Newton step in units of the system's scales; a longer one is shortened to this."""
 
@@ -283,7 +286,7 @@ def polish_orbits(
     frequency = check_frequency(frequency_hz, 1)
     packed = check_array("parameters", parameters, 2)
     guesses = check_states(points, 2, system.n_states, "points")
-    tolerance = check_tolerance("tolerance", tolerance)
+    tolerance = max(check_tolerance("tolerance", tolerance), ROUNDING * system.farthest)
     periods = np.asarray(orbit_period)
     if not (len(packed) == len(frequency) == len(guesses) == len(periods)):
         raise ValueError(

@@ -252,7 +252,7 @@ def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> 
     """
     out = np.zeros(len(sections), np.int64)
     flat = np.ascontiguousarray(sections.reshape(len(sections), -1))
-    judge_of(system.recorded_for or system)(flat, settings.window, settings, out)
+    judge_of((system.recorded_for or system).plain)(flat, settings.window, settings, out)
     return out
 
 

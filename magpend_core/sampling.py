@@ -11,7 +11,7 @@ from magpend_core.defaults import ATOL, MOST_STEPS_BETWEEN, RTOL
 from magpend_core.engine import sampling as engine
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.driven import with_recorded_drive
-from magpend_core.engine.entry import N_LANES, check_tolerances, integrate, slack_of
+from magpend_core.engine.entry import N_LANES, check_tolerances, integrate, rtol_of_motion, slack_of
 from magpend_core.engine.observers import LIFT, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.validation import check_array, check_count, check_states
@@ -197,6 +197,7 @@ def sample(
         If a shape does not fit, an argument is out of bounds or a drive does not cover its piece.
     """
     rtol, atol = check_tolerances(rtol, atol)
+    rtol = rtol_of_motion(system, rtol)
     packed = check_array("parameters", parameters, 2)
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     wanted = (len(initial), len(system.parameter_names))

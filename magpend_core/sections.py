@@ -152,7 +152,8 @@ def run_branches(
         n_transient,
         n_keep,
         max_orbit_period,
-        tolerance,
+        # the compiled test divides by the units
+        tolerance * min(1.0, *np.asarray(system.scales) / np.asarray(system.units)),
         window_of(max_orbit_period),
         check_flag("stop_when_closed", stop_when_closed),
     )

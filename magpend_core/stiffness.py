@@ -67,7 +67,7 @@ def _in_layers(system: System, y: np.ndarray, c: tuple[Any, ...]) -> list[np.nda
         return float(value), float(half_width)
 
     rates = tuple(rhs(tuple(y), u, c)) + ((0.0,) if system.timed_layers else ())
-    found, steps = [], _DIFFERENCE * np.eye(len(y)) * np.array(system.scales)
+    found, steps = [], _DIFFERENCE * np.eye(len(y)) * np.array(system.units)
     for k in range(len(layers(tuple(y), rates, c))):
         state = y.astype(np.float64).copy()
         for _ in range(_NEWTON_STEPS):

@@ -154,11 +154,11 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
     n, names = system.n_states, ", ".join(system.state_names)
     if not n:
         yield "state_names is empty; a system has one state at least."
-    for field in ("is_angle", "scales", "sizes", "escape"):
+    for field in ("is_angle", "units", "scales", "sizes", "escape"):
         values = getattr(system, field)
         if len(values) != n:
             yield f"{field} has {len(values)} entries; it must have one for each of the {n} states ({names})."
-    for field in ("scales", "sizes", "escape"):
+    for field in ("units", "scales", "sizes", "escape"):
         for name, value in zip(system.state_names, getattr(system, field), strict=False):
             if not value > 0.0 or (field != "escape" and not np.isfinite(value)):
                 yield f"{field}: {value!r} for {name} is out of bounds; it must be greater than 0" + (
@@ -284,7 +284,7 @@ class _Motion:
     ) -> None:
         functions.problems = []
         self.system, self.functions = system, functions
-        self.scales = np.asarray(system.scales, np.float64)
+        self.scales = np.asarray(system.units, np.float64)
         self.period = 1.0 / frequency
         self.times = self.period * (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES
         self.edges = functions.edges(frequency, p) if system.n_edges else np.empty((3, 0))

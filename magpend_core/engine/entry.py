@@ -35,6 +35,17 @@ LEAST_RTOL = 1e-13
 """Smallest relative tolerance; below it, rounding errors dominate and the step size becomes too small."""
 
 
+FAR = 10.0
+"""Largest absolute value of the motion, in units of the scale, up to which the relative tolerance is taken as given."""
+
+
+def rtol_of_motion(system: System, rtol: float) -> float:
+    """Return the relative tolerance with which errors are as given relative to the motion of a system, where this is
+    far from zero; it is not below `LEAST_RTOL`.
+    """
+    return rtol if system.farthest <= FAR else max(rtol / system.farthest, min(rtol, LEAST_RTOL))
+
+
 def slack_of(rtol: float, atol: float) -> float:
     """Return the slack for given tolerances: the constant that limits steps near boundary layers and forcing edges."""
     tolerance = rtol + atol
@@ -128,6 +139,7 @@ def integrate(
         If the functions of the system contradict its declaration (see `check_system`).
     """
     rtol, atol = check_tolerances(rtol, atol)
+    rtol = rtol_of_motion(system, rtol)
     watched = check_quantities(quantities, system)
     if watched and system.method != "dopri5":
         raise ValueError(f"quantities are watched with method dopri5 alone; it is {system.method!r}.")

@@ -117,7 +117,7 @@ def event_bindings(system: System) -> dict[str, Any]:
     same = [0.0] * (system.n_switches + system.n_impacts)
     if system.section is not None:
         directions, starts = [*directions, float(direction)], [*starts, float(direction)]
-        same = [*same, SAME * (1.0 if system.is_angle[of] else system.scales[of])]
+        same = [*same, SAME * (1.0 if system.is_angle[of] else system.units[of])]
     return {
         "HAS_EVENTS": system.n_events > 0,
         "HAS_SECTION": system.section is not None,

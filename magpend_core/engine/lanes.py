@@ -921,7 +921,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "REWRITES": observer.rewrites,
         "RENEW_BELOW": observer.renew_below,
         "IS_ANGLE": np.array(system.is_angle, np.int64),
-        "SCALES": np.array(system.scales),
+        "SCALES": np.array(system.units),
         "SIZES": np.array(system.sizes),
         "ESCAPE": np.where(system.is_angle, np.minimum(system.escape, FARTHEST), system.escape),
         "constants": system.constants,
@@ -964,7 +964,7 @@ def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ())
 
     `watched` holds their indices in ``system.state_names + system.quantity_names``.
     """
-    return _engine_of(system, observer, watched)
+    return _engine_of(system.plain, observer, watched)
 
 
 @cache

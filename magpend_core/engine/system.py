@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections import namedtuple
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -86,8 +86,15 @@ class System:
     is_angle : tuple of bool
         Which states are angles modulo 2 pi; empty for none. They are wrapped to (-pi, pi] at every section, and
         their full turns are counted; `rhs` must not change when 2 pi is added.
+    units : tuple of float
+        Typical size of each state, the unit in which the engine compares sections; empty for
+        `scales`, or 1.
     scales : tuple of float
-        Typical size of each state, the unit in which sections are compared; empty for 1.
+        Unit in which analyses compare states: the extent of the motion, where it is known; empty for `units`. No
+        compiled code depends on it.
+    farthest : float
+        Largest absolute value of a state in the motion, in units of its scale: far above 1 if states are measured from
+        a distant zero.
     sizes : tuple of float
         Unit of each state's absolute tolerance; empty for 1. It is not 1 where the scale was found from the motion.
     escape : tuple of float
@@ -206,7 +213,9 @@ class System:
     jacobian: Callable[..., Any] | None = None
     jacobian_entries: tuple[int, ...] | None = None
     is_angle: tuple[bool, ...] = ()
+    units: tuple[float, ...] = ()
     scales: tuple[float, ...] = ()
+    farthest: float = 1.0
     sizes: tuple[float, ...] = ()
     escape: tuple[float, ...] = ()
     n_edges: int = 0
@@ -242,7 +251,7 @@ class System:
         n = self.n_states
         absent = {
             "is_angle": (False,) * n,
-            "scales": (1.0,) * n,
+            "units": tuple(self.scales) or (1.0,) * n,
             "sizes": (1.0,) * n,
             "escape": (math.inf,) * n,
             "forcing": no_forcing,
@@ -256,6 +265,7 @@ class System:
             "parameter_names": str,
             "quantity_names": str,
             "is_angle": bool,
+            "units": float,
             "scales": float,
             "sizes": float,
             "escape": float,
@@ -269,6 +279,13 @@ class System:
         for name, value in absent.items():
             if not getattr(self, name):
                 object.__setattr__(self, name, value)
+        if not self.scales:
+            object.__setattr__(self, "scales", self.units)
+
+    @property
+    def plain(self) -> System:
+        """The system as the cells of a run are integrated, with its `units` in place of the extent of the motion."""
+        return replace(self, scales=self.units, farthest=1.0)
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
@@ -283,7 +300,7 @@ class System:
         data = (
             self.state_names,
             self.is_angle,
-            self.scales,
+            self.units,
             self.parameter_names,
             self.n_constants,
             self.n_edges,

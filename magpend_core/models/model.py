@@ -55,6 +55,8 @@ class State:
         Whether it is an angle [rad] of which full turns do not matter.
     scale : float
         Size that counts as 1 when states are compared.
+    motion : tuple of float or None
+        Least and largest value in the motion of a run; half of their difference then counts as 1 in its analyses.
     escape : float
         Beyond this absolute value at a section a trajectory has diverged.
     size : float
@@ -72,6 +74,17 @@ class State:
     escape: float = math.inf
     rate: str = ""
     size: float = 1.0
+    motion: tuple[float, float] | None = None
+
+    @property
+    def measure(self) -> float:
+        """Size that counts as 1 in analyses: half of the extent of the motion where it is known, else the scale."""
+        return self.scale if self.motion is None else 0.5 * (self.motion[1] - self.motion[0])
+
+    @property
+    def farthest(self) -> float:
+        """Largest absolute value in the motion, in units of the measure; 1 where the motion is not known."""
+        return 1.0 if self.motion is None else max(abs(x) for x in self.motion) / self.measure
 
 
 @dataclass(frozen=True)
@@ -287,8 +300,8 @@ class Model:
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """Return the typical size of each state, by which differences between states are divided."""
-        return tuple(s.scale for s in self.states)
+        """Return the measure of each state, by which differences between states are divided."""
+        return tuple(s.measure for s in self.states)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -77,7 +77,7 @@ def compute(
             spec.refine,
             lambda rows: {k: v[:, 0] for k, v in integrate(spec, inputs.take(rows)).items()},
             closure_tolerance=spec.integration.closure_tolerance,
-            system=spec.model.system,
+            system=spec.model.system.plain,
         )
         values = {name: array[:, None] for name, array in values.items()}
     return {name: cells.outputs(block, array) for name, array in values.items()}

@@ -48,6 +48,8 @@ def identity_tables(tables: Mapping[str, Any]) -> dict[str, Any]:
     for name, without in (("drive", ("file", "text")), ("model", ("function",))):
         if isinstance(found.get(name), Mapping):
             found[name] = {k: v for k, v in found[name].items() if k not in without}
+    if isinstance(found["model"], Mapping):
+        found["model"] = _without_motion(found["model"])
     if "drift" in found:
         drift = found["drift"].items()
         found["drift"] = {name: {k: v for k, v in table.items() if k not in ("file", "text")} for name, table in drift}
@@ -58,6 +60,22 @@ def foreign_keys(identity: Mapping[str, Any], tables: Mapping[str, Any]) -> list
     """Return the keys in which an identity differs from a specification with these tables, which are plain data."""
     lines = differences(identity_tables(identity["spec"]), identity_tables(tables))
     return [line.partition(": ")[0] for line in lines]
+
+
+def _without_motion(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the text of a model without the extents of the motion: they are the measure of the analyses alone."""
+    states = table.get("states")
+    if not isinstance(states, Mapping):
+        return dict(table)
+    own = {name: _plain_entry(entry) for name, entry in states.items()}
+    return {**table, "states": own}
+
+
+def _plain_entry(entry: Any) -> Any:
+    if not isinstance(entry, Mapping) or "motion" not in entry:
+        return entry
+    rest = {key: value for key, value in entry.items() if key != "motion"}
+    return rest["unit"] if set(rest) == {"unit"} else rest
 
 
 def _coordinates_digest(spec: Spec) -> str:

@@ -128,7 +128,7 @@ class Steady:
     @property
     def system(self) -> System:
         """System that is integrated, with the method of the run."""
-        return replace(self.model.system, method=self.integration.method)
+        return replace(self.model.system.plain, method=self.integration.method)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -229,7 +229,7 @@ class Steady:
         if len(open_):
             periods = orbit_periods(
                 values["section"][open_, 0, -judged:],
-                system=self.model.system,
+                system=self.system,
                 closure_tolerance=integration.closure_tolerance,
                 max_orbit_period=integration.max_orbit_period,
             )

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.layout.cells import CellMap
-from pipeline.layout.evaluation import check_starts, with_sizes
+from pipeline.layout.evaluation import check_starts
+from pipeline.layout.extents import with_sizes
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.own_words import dims_in_own_words

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.layout.conventions import unit_remarks
-from pipeline.layout.evaluation import size_remarks
+from pipeline.layout.extents import size_remarks
 from pipeline.layout.own_words import dims_in_own_words
 from pipeline.layout.plan import Plan, check_space, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim

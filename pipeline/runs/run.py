@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import origin
 from pipeline.layout.conventions import unit_remarks
-from pipeline.layout.evaluation import check_starts, size_remarks, with_sizes
+from pipeline.layout.evaluation import check_starts
+from pipeline.layout.extents import size_remarks, with_sizes
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import Plan, check_plan, check_space, make_plan
 from pipeline.runs.noise import check_steps, warn_of_steps

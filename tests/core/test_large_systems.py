@@ -227,7 +227,9 @@ def test_read_model__sixty_four_states_are_the_most():
 
 def test_lyapunov__refuses_more_states_before_anything_is_computed(monkeypatch):
     names = tuple(f"x{i}" for i in range(MAX_STATES + 1))
-    large = dataclasses.replace(CHAIN, name="large", state_names=names, is_angle=(), scales=(), sizes=(), escape=())
+    large = dataclasses.replace(
+        CHAIN, name="large", state_names=names, is_angle=(), units=(), scales=(), sizes=(), escape=()
+    )
     monkeypatch.setattr(exponents, "integrate", lambda *args, **options: pytest.fail("integrated"))
     words = "large has 65 states; Lyapunov exponents, multipliers and orbits are computed for at most 64"
     with pytest.raises(ValueError, match=words):

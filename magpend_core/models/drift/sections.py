@@ -283,7 +283,7 @@ class _Walk:
         period = np.zeros(len(failed), np.int16)
         for n in np.unique(n_after[n_after > 0]):
             own = n_after == n
-            judged = replace(self.system, method="dopri5")
+            judged = replace(self.system.plain, method="dopri5")
             period[own] = orbit_periods(
                 self.seen[own, -n:],
                 system=judged,

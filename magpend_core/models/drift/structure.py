@@ -83,7 +83,7 @@ class _Probe:
             if function is None:
                 continue
             for _ in range(4):
-                y, dy = rng.normal(size=(2, self.system.n_states)) * np.asarray(self.system.scales)
+                y, dy = rng.normal(size=(2, self.system.n_states)) * np.asarray(self.system.units)
                 t = float(rng.random() / self.hz[cell])
                 pairs = plain(function)(np.float64(t), tuple(y), tuple(dy), (*own, *modes))
                 found += [float(value) for value, _ in pairs]

@@ -6,6 +6,7 @@ Needs nothing but numpy; takes milliseconds, whatever is given.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -47,7 +48,7 @@ KEYS = (
     "classifier",
     "function",
 )
-_STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "size", "escape")
+_STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "size", "escape", "motion")
 _PARAMETER_KEYS = ("value", "unit", "meaning", "symbol", "bound")
 _QUANTITY_KEYS = ("value", "unit", "meaning", "symbol")
 # dims, coordinates and keys of runs: a state, a parameter or a quantity of the name would be taken for them
@@ -183,6 +184,21 @@ class _Reading(ViewsReader):
         self.keys(entry, place, keys)
         return entry
 
+    def _motion(self, entry: Mapping[str, Any], place: str) -> tuple[float, float] | None:
+        """Return the least and the largest value of a state in the motion of a run; None if the run gives none."""
+        given = entry.get("motion")
+        if given is None:
+            return None
+        is_pair = isinstance(given, (list, tuple)) and len(given) == 2
+        if not is_pair or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in given):
+            self.report(f"{place}.motion", f"= {given!r} must be two numbers, the least and the largest value.")
+            return None
+        low, high = map(float, given)
+        if not low < high:
+            self.report(f"{place}.motion", f"= {given!r}: the first number must be below the second.")
+            return None
+        return low, high
+
     def _states(self, given: Any) -> tuple[State, ...]:
         states = []
         for name, value in self.table(given, self.at("states"), MAX_STATES, "states").items():
@@ -196,7 +212,8 @@ class _Reading(ViewsReader):
             size = self.positive(entry, "size", place, 1.0)
             scale = self.positive(entry, "scale", place, size)
             escape = self.positive(entry, "escape", place, ESCAPE * size)
-            states.append(State(name, unit, meaning, symbol, on_circle, scale, escape, size=size))
+            motion = self._motion(entry, place)
+            states.append(State(name, unit, meaning, symbol, on_circle, scale, escape, size=size, motion=motion))
         if isinstance(given, Mapping) and not given and not self.problems:
             self.report(self.at("states"), "is empty; a model has one state at least.")
         return tuple(states)

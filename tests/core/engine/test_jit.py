@@ -103,7 +103,7 @@ def test_plain_python__gives_the_same_numbers(run_python, preset):
     assert np.array(lines[2].split(), dtype=float) == pytest.approx(noisy, rel=1e-13)
 
 
-@pytest.mark.parametrize("changes", [{"escape": (1.0, 1.0, 1.0, 1.0)}, {"scales": (1.0, 1.0, 5.0, 5.0)}])
+@pytest.mark.parametrize("changes", [{"escape": (1.0, 1.0, 1.0, 1.0)}, {"units": (1.0, 1.0, 5.0, 5.0)}])
 def test_label__follows_the_data(changes):
     """Data of a system go into its compiled code, so they must go into the name under which it is kept."""
     changed = dataclasses.replace(PENDULUM_FITTED, **changes)

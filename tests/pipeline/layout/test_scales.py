@@ -1,8 +1,10 @@
 """Sizes of the states from the starts and a short motion."""
 
+import numpy as np
 import pytest
 
-from pipeline.layout.evaluation import with_sizes
+from pipeline.layout.extents import with_sizes
+from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 
 TEXT = {
@@ -53,9 +55,65 @@ def test_with_sizes__the_motion_counts_more_than_its_starts():
 def test_with_sizes__what_a_specification_or_a_run_says():
     assert sizes(spec_of("well", 1e-9, 1e6, scale=1e-7))[0] == 1.0
     kept = with_sizes(spec_of("well", 1e-9, 1e6))
-    assert kept.model.scales == kept.model.system.sizes == (1e-9, 1e-3)
+    assert kept.model.system.sizes == kept.model.system.units == (1e-9, 1e-3)
     assert [s.escape for s in kept.model.states] == pytest.approx([1.0, 1e6])
     assert with_sizes(kept) is kept
     assert sizes(spec_of("well", 1e-7, 1e6), kept) == (1e-9, 1e-3)
-    own = spec_of("well")
-    assert with_sizes(own) is own
+
+
+def measures(spec):
+    return np.array([s.motion for s in with_sizes(spec).model.states])
+
+
+@pytest.mark.parametrize("name", TEXT)
+@pytest.mark.parametrize("length", [1e-9, 0.03, 300.0, 1e6])
+def test_with_sizes__the_measure_follows_the_unit_without_a_dead_band(name, length):
+    plain = measures(spec_of(name))
+    np.testing.assert_allclose(measures(spec_of(name, length)), length * plain, rtol=1e-9)
+    np.testing.assert_allclose(measures(spec_of(name, length, 10.0)), length * plain * [[1.0], [10.0]], rtol=1e-9)
+
+
+def affine(unit, zero):
+    """Two wells of depth 1/4 at zero - unit and zero + unit; one of twelve starts begins far out."""
+    x = f"((x - {zero!r})/{unit!r})"
+    return Spec.parse(
+        {
+            "kind": "sweep",
+            "model": {
+                "name": "affine",
+                "states": {"x": {}, "v": {}},
+                "equations": {"x": "v", "v": f"{unit!r}*({x} - {x}**3) - 0.5*v"},
+            },
+            "section": {"of": "x", "value": zero, "longest": 50.0},
+            "initial_conditions": {
+                "kind": "grid",
+                "x": {"start": zero - 1.5 * unit, "stop": zero + 1.6 * unit, "num": 12},
+            },
+        }
+    )
+
+
+@pytest.mark.parametrize(("unit", "zero"), [(1.0, 1000.0), (1e-6, 1e-3), (300.0, -3e5)])
+def test_with_sizes__the_measure_leaves_out_where_the_zero_is(unit, zero):
+    plain = measures(affine(1.0, 0.0))
+    moved = measures(affine(unit, zero)) - [[zero], [0.0]]
+    np.testing.assert_allclose(moved, unit * plain, rtol=1e-6, atol=1e-6 * unit)
+
+
+def test_with_sizes__wide_starts_do_not_hide_a_small_attractor():
+    model = {"name": "small", "states": {"u": {}}, "equations": {"u": "u*(0.01 - u)*(u - 0.02)*1e4"}}
+    points = [[0.001], [0.011], [0.019], [0.021], [5.0]]
+    spec = {
+        "kind": "sweep",
+        "model": model,
+        "section": {"of": "u", "value": 0.015, "longest": 100.0},
+        "initial_conditions": {"kind": "list", "points": points},
+    }
+    ((low, high),) = measures(Spec.parse(spec))
+    assert high - low == pytest.approx(0.1 * 5.0, rel=0.01)  # a tenth of the whole motion at most
+
+
+@pytest.mark.parametrize(("given", "message"), [([1.0], "two numbers"), ([2.0, 1.0], "below the second")])
+def test_motion_of_a_state__is_checked(given, message):
+    with pytest.raises(SpecError, match=message):
+        spec_of("well", motion=given)

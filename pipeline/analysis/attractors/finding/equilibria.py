@@ -18,7 +18,6 @@ import numpy as np
 from magpend_core.equilibria import can_hold, find_equilibria, newton_steps
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
-from magpend_core.sizes import natural_size
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.held import held_near, ways
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
@@ -141,7 +140,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
     number.
     """
     found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
-    scales, rate = np.asarray(geometry.scales), natural_size(RATES * point.frequency)
+    scales, rate = np.asarray(geometry.scales), RATES * point.frequency
     kept: list[Equilibrium] = []
     for i in np.flatnonzero(found.converged):
         if all(geometry.distance(found.states[i], other.state) > SAME_EQUILIBRIUM for other in kept):
