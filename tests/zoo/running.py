@@ -18,7 +18,7 @@ import numpy as np
 from tests.zoo import answers, variants
 from tests.zoo.answers import Answer
 from tests.zoo.judge import Verdict, judge_point, words
-from tests.zoo.rescaling import UNITS, Units, rescaled
+from tests.zoo.rescaling import UNITS, Units, plain_units, rescaled
 
 
 @dataclass
@@ -48,11 +48,11 @@ def outcome_of(name: str, setting: str, limit: float = 0.0) -> Outcome:
     started = time.perf_counter()
     outcome = Outcome(name, setting)
     data, units = variants.load(name), None
-    if setting in UNITS:
-        data, units = rescaled(data, *UNITS[setting])
-    else:
-        data = dict(variants.settings(data))[setting]
     try:
+        if setting in UNITS:
+            data, units = rescaled(data, UNITS[setting])
+        else:
+            data = dict(variants.settings(data))[setting]
         with _time_limit(limit), tempfile.TemporaryDirectory(prefix=f"zoo-{name}-") as folder:
             ds, rows = analysed(data, Path(folder))
             outcome.verdict = judged(answers.load(name), ds, rows, units)
@@ -98,16 +98,15 @@ def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]], units: Units | N
     from pipeline.layout.vocabulary import model_of, split_dims
 
     model = model_of(ds)
-    units = units or Units(dict.fromkeys(model.state_names, 1.0))
-    lengths = np.array(list(units.states.values()))
-    geometry = Geometry(model.is_angle, tuple(np.array(model.scales) / lengths)).difference
+    units = units or plain_units(model.state_names)
+    geometry = Geometry(model.is_angle, tuple(np.array(model.scales) / units.factors)).difference
     dims, _ = split_dims(ds["attractor_id"])
     verdict = Verdict()
     for index in np.ndindex(*(ds.sizes[d] for d in dims)):
         one = ds.isel(dict(zip(dims, index, strict=True)))
         where = {d: float(one[d]) for d in dims}
         here = [
-            {**units.row(row), "points": one["attractor_points"].sel(attractor=row["attractor_id"]).values / lengths}
+            {**units.row(row), "points": units.own(one["attractor_points"].sel(attractor=row["attractor_id"]).values)}
             for row in rows
             if all(np.isclose(row[d], v, rtol=1e-12, atol=0.0) for d, v in where.items())
         ]

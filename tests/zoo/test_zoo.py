@@ -13,9 +13,11 @@ ROOT = Path(__file__).parents[2]
 if str(ROOT) not in sys.path:  # tests are no package; the zoo's modules are found from the checkout
     sys.path.append(str(ROOT))
 
+from pipeline.runs.derive import derive  # noqa: E402
+from pipeline.runs.run import run  # noqa: E402
 from tests.zoo import answers, variants  # noqa: E402
 from tests.zoo.judge import judge_point  # noqa: E402
-from tests.zoo.rescaling import UNITS  # noqa: E402
+from tests.zoo.rescaling import UNITS, rescaled  # noqa: E402
 from tests.zoo.running import outcome_of  # noqa: E402
 
 ANSWERS = {name: answers.load(name) for name in answers.names()}
@@ -29,14 +31,52 @@ def test_zoo__quick(name):
     assert not outcome.verdict.wrong, (outcome.verdict.wrong, outcome.found)
 
 
+TWINS = [
+    ("bautin", "small and slow"),
+    ("bautin", "turned"),
+    ("close-pair", "large and fast"),
+    ("close-pair", "far from zero"),
+    ("slow-focus", "of two sizes"),
+    ("slow-focus", "hundreds, far from zero"),
+    ("repeller", "far from zero"),
+    ("repeller", "degrees"),
+    ("belt-stick", "small and slow"),
+    ("lorenz-pair", "hundreds, far from zero"),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", UNITS)
-@pytest.mark.parametrize("name", ["bautin", "close-pair", "slow-focus", "repeller", "belt-stick"])
+@pytest.mark.parametrize(("name", "setting"), TWINS)
 def test_zoo__other_units_change_no_conclusion(name, setting):
     outcome = outcome_of(name, setting)
     assert not outcome.error, outcome.error
     assert not outcome.verdict.wrong, (outcome.verdict.wrong, outcome.found)
     assert outcome.word == outcome_of(name, variants.OWN).word
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("setting", UNITS)
+@pytest.mark.parametrize("name", [name for name in ANSWERS if isinstance(variants.load(name)["model"], dict)])
+def test_zoo__no_twin_is_wrong(name, setting):
+    outcome = outcome_of(name, setting)
+    assert not outcome.error, outcome.error
+    assert not outcome.verdict.wrong, (outcome.verdict.wrong, outcome.found)
+
+
+@pytest.mark.slow
+def test_zoo__a_twin_has_the_same_bifurcations(tmp_path):
+    found = []
+    for setting in (variants.OWN, "hundreds, far from zero"):
+        data = variants.load("brusselator")
+        if setting in UNITS:
+            data, _ = rescaled(data, UNITS[setting])
+        run(data, tmp_path / setting, workers=0, echo=lambda _: None)
+        ds = derive(tmp_path / setting, "branches")
+        found.append((ds["kind"].values.tolist(), ds["value"].values, ds.sizes["branch"]))
+    (kinds, values, n_branches), twin = found
+    assert len(kinds) > 0
+    assert (twin[0], twin[2]) == (kinds, n_branches)
+    np.testing.assert_allclose(twin[1], values, rtol=1e-6)
 
 
 @pytest.mark.slow
