@@ -299,6 +299,11 @@ class Model:
         return tuple(s.name for s in self.states if s.on_circle)
 
     @property
+    def units(self) -> tuple[float, ...]:
+        """Return the unit in which sizes of disturbances and coefficients are told, for each state."""
+        return tuple(s.scale for s in self.states)
+
+    @property
     def scales(self) -> tuple[float, ...]:
         """Return the measure of each state, by which differences between states are divided."""
         return tuple(s.measure for s in self.states)

@@ -42,6 +42,11 @@ class Geometry:
         """Return the geometry of the states of a system or a model."""
         return cls(owner.is_angle, owner.scales)
 
+    @classmethod
+    def in_units(cls, owner: System | Model) -> Geometry:
+        """Return the geometry in which distances that a user gives or reads are told: in the states' units."""
+        return cls(owner.is_angle, owner.units)
+
     @property
     def n_states(self) -> int:
         """Number of state variables."""

@@ -244,14 +244,14 @@ class Destinations(KnownSets):
 
     def _is_near(self, path: np.ndarray, number: int, near: float) -> np.ndarray:
         """Return for each state of a path whether it is near an attractor, an orbit's states at their phases."""
-        orbit = self.orbit(number)
+        orbit, units = self.orbit(number), Geometry.in_units(self.point.integrates)
         if orbit is not None:
             phase = int(np.argmin(self.geometry.distance(orbit.points, path[-1])))
             on_phase = orbit.points[(phase - np.arange(len(path))[::-1]) % orbit.period]
-            return np.asarray(self.geometry.distance(path, on_phase) <= near)
+            return np.asarray(units.distance(path, on_phase) <= near)
         if number in self._rest_ids:
             rest = self.point.equilibria[self._rest_ids.index(number)]
-            return np.asarray(self.geometry.distance(path, rest.state) <= near)
+            return np.asarray(units.distance(path, rest.state) <= near)
         if number not in self.cloud_ids:
             return np.ones(len(path), bool)
         inside = self.clouds[self.cloud_ids.index(number)].distances(path) <= REACHED

@@ -2,7 +2,7 @@
 
 The manifold x = H(w) and the normal form w' = G(w) solve ``f(H(w)) = H'(w) G(w)``, degree by degree (Kuznetsov, SIAM
 J. Numer. Anal. 36, 1999, 1104; Elements of Applied Bifurcation Theory, 3rd ed., 2004, Ch. 8). The terms of ``f(H)`` are
-those of power series (`magpend_core.jets`), so that no derivative is a difference. All in scaled states, with
+those of power series (`magpend_core.jets`), so that no derivative is a difference. All in units of the states, with
 ``|q| = 1``, ``<p, q> = 1``:
 
 =================== ========================================================================== =======================
@@ -37,20 +37,30 @@ NO_TERM = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """An equilibrium: its unknowns, and the scaled Jacobian [1/s] there."""
+    """An equilibrium: its unknowns, and the Jacobian there."""
 
     family: Family
     u: np.ndarray
-    matrix: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def units(self) -> np.ndarray:
+        """Units of the states: not the extent of a run's motion, on which a coefficient must not depend."""
+        return np.asarray(self.family.system.units)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Jacobian [1/s] of states in their units."""
+        return np.asarray(self.jacobian * self.units / self.units[:, None])
 
     def rates(self, of: Monomials, states: np.ndarray) -> np.ndarray:
-        """Return the scaled rates on scaled states that are power series."""
-        scales, row = np.asarray(self.family.system.scales)[:, None], self.family.rows(self.u[None])
-        states = np.concatenate([row.states.T, states[:, 1:] * scales], axis=1)
-        return np.asarray(rates_on(self.family.system, row.parameters[0], of, states) / scales)
+        """Return the rates, in units of the states, on such states that are power series."""
+        units, row = self.units[:, None], self.family.rows(self.u[None])
+        states = np.concatenate([row.states.T, states[:, 1:] * units], axis=1)
+        return np.asarray(rates_on(self.family.system, row.parameters[0], of, states) / units)
 
     def second(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the second derivative B(a, b) of the scaled rates along two vectors."""
+        """Return the second derivative B(a, b) of the rates along two vectors."""
         of = monomials(2, 2)
         states = np.zeros((len(a), len(of.exponents)), complex)
         states[:, 1], states[:, 2] = a, b

@@ -3,7 +3,7 @@
 The eigenvector q at a section point becomes v(t) along the orbit, by the flow's derivative. The norm of v is the root
 of its mean square over the orbit's period, as in MatCont (Dhooge, Govaerts and Kuznetsov, ACM Trans. Math. Softw. 29,
 2003, 141), of a map over the orbit's points. Of a flow without a drive v is known up to a multiple of the rates; the
-mean is that of its part across them. All in scaled states.
+mean is that of its part across them. All in units of the states, not of their motion in a run.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ def mean_squares(one: Critical, settings: Settings = Settings()) -> tuple[np.nda
         trajectories fail.
     """
     system, orbits = _motion(one, settings.instants)
-    scales = np.asarray(system.scales)
-    orbit, beside = orbits[0], orbits[1:] / scales
+    units = np.asarray(system.units)
+    orbit, beside = orbits[0], orbits[1:] / units
     ahead, behind = np.swapaxes(beside.reshape(-1, 2, len(one.steps), *beside.shape[1:]), 0, 1)
     odd, h = ahead - behind, one.steps[1:, None, None]
     vectors = (8.0 * odd[:, 1:] - odd[:, :-1]) / (12.0 * h)  # (part, step, instant, state)
     if one.system.section is not None and np.isfinite(orbit).all():
-        flow = rates_at(system, orbit, one.rows.parameters[0][: len(system.parameter_names)]) / scales
+        flow = rates_at(system, orbit, one.rows.parameters[0][: len(system.parameter_names)]) / units
         flow /= np.linalg.norm(flow, axis=1, keepdims=True)
         vectors = vectors - (vectors * flow).sum(axis=-1, keepdims=True) * flow
     squares = (vectors**2).sum(axis=(0, 3))

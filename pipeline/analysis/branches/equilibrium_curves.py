@@ -227,7 +227,7 @@ class EquilibriumDetector(Detector):
 
     def _rest(self, point: Point) -> Rest:
         family = self.problem.family
-        return Rest(family, point.u, family.scaled(point.value.monodromy))
+        return Rest(family, point.u, point.value.monodromy)
 
     def _others(self, point: Point) -> np.ndarray:
         """Return the eigenvalues besides the pair of a Hopf point."""
@@ -287,7 +287,7 @@ def kind_of_zero(family: Family, u: np.ndarray, value: Value) -> str:
     """
     if not value.is_finite or np.linalg.svd(value.derivative, compute_uv=False)[-1] > SINGULAR:
         return FOLD
-    rest = Rest(family, u, family.scaled(value.monodromy))
+    rest = Rest(family, u, value.monodromy)
     right, left = null_vectors(rest.matrix)
     bend = abs(left @ rest.second(right, right).real) / float(np.linalg.norm(rest.matrix))
     return PITCHFORK if bend < SINGULAR else TRANSCRITICAL

@@ -145,7 +145,7 @@ def _normalise(one: Bifurcation, case: Case) -> None:
 
 def _judge_rest(family: Family, one: Bifurcation) -> None:
     """Compute the coefficients at an equilibrium by power series, whose error is that of rounding."""
-    rest = Rest(family, one.point.u, family.scaled(one.point.value.monodromy))
+    rest = Rest(family, one.point.u, one.point.value.monodromy)
     one.coefficient_error = 0.0
     if one.kind == HOPF:
         (one.coefficient,) = lyapunov(rest, one.critical_multiplier.imag)

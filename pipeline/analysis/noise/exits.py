@@ -117,7 +117,7 @@ def region_of(model: Model, options: EscapeOptions, first: np.ndarray) -> Region
         counts = np.isfinite(given) if options.centre else np.ones(len(names), bool)
         centre = np.where(counts, given, 0.0) if options.centre else first
         sides = np.full(shape, np.inf)
-        weight = np.broadcast_to(counts / np.array(model.scales), shape)
+        weight = np.broadcast_to(counts / np.array(model.units), shape)
         return Region(np.broadcast_to(centre, shape), -sides, sides, weight, np.full((len(first), 1), options.radius))
     low, high = (
         np.array([sides.get(name, end) for name in names])

@@ -62,6 +62,7 @@ from pipeline.analysis.resilience.shocks import (
 )
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import listed, select_points
+from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
@@ -205,7 +206,7 @@ def _nearest_seeds(there: Destinations, bases: Bases, states: np.ndarray, labels
     """Return the cells nearest to each base state, as shocks from it, with their labels."""
     base, shock, label = [], [], []
     for k, state in enumerate(bases.states):
-        jumps = there.geometry.difference(states, state)
+        jumps = Geometry.in_units(there.point.integrates).difference(states, state)
         nearest = np.argsort(sizes(jumps, norm), kind="stable")[:MOST_SEEDS]
         base.append(np.full(len(nearest), k))
         shock.append(jumps[nearest])
@@ -232,7 +233,7 @@ class _Result:
         number = attractors["attractor"].values.tolist()
         self._rows = {at: {number[row]: row for row in rows} for at, rows in rows_at(attractors).items()}
         self._attracts = attractors["stability"].values == ATTRACTS
-        self._scales = np.asarray(run.model.scales)
+        self._units = np.asarray(run.model.units)
         self._values: dict[str, np.ndarray] = {}
         self._attrs: dict[str, dict[str, str]] = {}
         vector = ("float64", np.nan, ("state",), "see state_units")
@@ -250,7 +251,7 @@ class _Result:
             self._new(name, text, dtype, fill, (), units)
 
     def _new(self, name: str, text: str, dtype: str, fill: float, own: tuple[str, ...] = (), units: str = "1") -> None:
-        shape = (self._attractors.sizes[SET], *(len(self._scales) for _ in own))
+        shape = (self._attractors.sizes[SET], *(len(self._units) for _ in own))
         self._values[name] = np.full(shape, fill, dtype)
         self._attrs[name] = {"units": units.format(time_unit(self._run.model)), "long_name": text}
 
@@ -300,7 +301,7 @@ class _Result:
         assert point.parameters is not None
         for own in np.flatnonzero(there.here["stability"].values == ATTRACTS).tolist():
             one = there.here.isel(attractor=own)
-            found = local_stability(one, point.parameters, point.frequency, np.asarray(there.geometry.scales))
+            found = local_stability(one, point.parameters, point.frequency, self._units)
             for name, value in found._asdict().items():
                 self._values[name][self._rows[index][own]] = value
 
@@ -319,7 +320,7 @@ class _Result:
         point, options = there.point, self._options
         assert point.parameters is not None
         which = np.array([self._run.model.state_names.index(name) for name in _chosen(self._run, options)])
-        every = np.arange(len(self._scales))
+        every = np.arange(len(self._units))
         asked: dict[tuple[int, str], Asked] = {}
         for own in sorted(there.told):
             bases = bases_of(there.here.isel(attractor=own), point.parameters, point.frequency, options.phases)
@@ -329,20 +330,20 @@ class _Result:
             asked[own, "distance"] = Asked.of(own, bases.sections, every, options, seeds)
             for i in every.tolist():
                 asked[own, str(i)] = Asked.of(own, bases.sections, every[[i]], options)
-        for (own, what), one in search_together(asked, there).items():
+        for (own, what), one in search_together(asked, there, self._units).items():
             at = self._rows[index][own]
             if what in ("shock", "distance"):
                 self._shock(what, at, one, asked[own, what])
             else:
                 self._searched("along", (at, int(what)), one)
-                self._values["along"][at, int(what)] = one.shock[0] * self._scales[int(what)]
+                self._values["along"][at, int(what)] = one.shock[0] * self._units[int(what)]
 
     def _shock(self, what: str, at: int, one: Found, asked: Asked) -> None:
         self._searched(what, at, one)
         if one.base >= 0:
-            jump = np.zeros(len(self._scales))
+            jump = np.zeros(len(self._units))
             jump[asked.which] = one.shock
-            self._values[what][at] = jump * self._scales
+            self._values[what][at] = jump * self._units
             self._values[f"{what}_phase"][at] = asked.bases.phase[one.base]
             self._values[f"{what}_from"][at] = asked.bases.states[one.base]
 
@@ -361,7 +362,7 @@ class _Result:
         attrs |= {f"resilience_{name}": value for name, value in plain.items() if name in options}
         attrs |= {"resilience_states": ", ".join(_chosen(self._run, self._options)), N_IDS: found.attrs[N_IDS]}
         states = {k: v.variable for k, v in self._attractors.coords.items() if k in ("state", "state_units")}
-        states["state_scale"] = xr.Variable("state", self._scales, {"long_name": "size that counts as 1"})
+        states["state_scale"] = xr.Variable("state", self._units, {"long_name": "size that counts as 1"})
         return found.assign(own).assign_coords(states).drop_attrs(deep=False).assign_attrs(attrs)
 
 

@@ -1,6 +1,6 @@
 """Search the smallest shock that leads away from an attractor.
 
-A shock is a jump of some states, in units of their scales. The search has four stages, and each asks for many
+A shock is a jump of some states, in their units. The search has four stages, and each asks for many
 trajectories at once:
 
 1. shells: shocks in many directions, at every base state, of rising size, until one leads away;
@@ -431,14 +431,14 @@ class Asked:
         return cls(ShockSearch(own, len(bases.states), len(which), options, seeds).run(), bases, which)
 
 
-def search_together(asked: Mapping[K, Asked], there: Destinations) -> dict[K, Found]:
+def search_together(asked: Mapping[K, Asked], there: Destinations, units: np.ndarray) -> dict[K, Found]:
     """Run searches for shocks in step, so that their trajectories fill the engine's lanes together."""
-    n_followed, scales = 0, np.asarray(there.geometry.scales)
+    n_followed = 0
 
     def answer(trials: dict[K, Trials], results: Mapping[K, Found]) -> dict[K, np.ndarray]:
         nonlocal n_followed
         report("trajectories after shocks", n_followed, 0)
-        states, phase = zip(*(_states(trial, asked[key], scales) for key, trial in trials.items()), strict=True)
+        states, phase = zip(*(_states(trial, asked[key], units) for key, trial in trials.items()), strict=True)
         found = labels_after(there, np.concatenate(states), np.concatenate(phase))
         n_followed += len(found)
         ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
@@ -447,8 +447,8 @@ def search_together(asked: Mapping[K, Asked], there: Destinations) -> dict[K, Fo
     return run_together({key: one.search for key, one in asked.items()}, answer)
 
 
-def _states(trials: Trials, asked: Asked, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _states(trials: Trials, asked: Asked, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the shocked states and their phases."""
     states = asked.bases.states[trials.base].copy()
-    states[:, asked.which] += trials.shock * scales[asked.which]
+    states[:, asked.which] += trials.shock * units[asked.which]
     return states, asked.bases.phase[trials.base]

@@ -99,7 +99,7 @@ class _NoisyPath:
         # strengths are parameters: one compilation serves all of them
         self._model: NoisyModel = noisy(model, Disturbance(tuple((name, 1.0) for name in self.states)))
         own = [
-            strength * scale for name, scale in zip(model.state_names, model.scales, strict=True) if name in self.states
+            strength * scale for name, scale in zip(model.state_names, model.units, strict=True) if name in self.states
         ]
         self._packed = np.concatenate([place.parameters.pack(), own, [0.0]])[None]
         self._frequency, self._seed = np.array([place.frequency]), seed

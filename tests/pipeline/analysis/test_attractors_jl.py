@@ -250,5 +250,5 @@ def test_thomas__shocks_equal_by_symmetry(computed):
         own = int(there.follow(state[None]).label[0])
         bases = Bases(state[None], np.zeros(1), np.ones(1, bool))
         asked = Asked.of(own, bases, np.arange(3), ResilienceOptions(largest=6.0))
-        sizes.append(search_together({"it": asked}, there)["it"].high)
+        sizes.append(search_together({"it": asked}, there, np.ones(3))["it"].high)
     assert sizes == pytest.approx(np.full(3, sizes[0]), abs=1e-4)

@@ -227,7 +227,8 @@ def test_shocks__magnetic_pendulum_as_published(magnets):
     place, own = np.array([1.0, 0.0, 0.0, 0.0]), int(np.argmax(resting[:, 0]))
     for state, least in ((place, 0.3923), (resting[own], 0.40204)):
         bases, which = Bases(state[None], np.zeros(1), np.ones(1, bool)), np.array([0, 1])
-        one = search_together({"it": Asked.of(own, bases, which, ResilienceOptions())}, there)["it"]
+        asked, units = Asked.of(own, bases, which, ResilienceOptions()), np.asarray(there.point.integrates.units)
+        one = search_together({"it": asked}, there, units)["it"]
         assert one.high == pytest.approx(least, abs=1e-4)
         assert one.to in {0, 1, 2} - {own}
     # Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above
