@@ -65,7 +65,7 @@ IDENTIFIED = Analysis(
     "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
-    version=5,
+    version=6,
     by_point=True,
 )
 
@@ -79,7 +79,7 @@ ATTRACTORS = Analysis(
     run itself. Basin fractions are fractions of all cells, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
-    version=2,
+    version=3,
     table="pipeline.analysis.attractors.analysis:attractors_table",
     builds_on=("identified",),
     figure="attractors",

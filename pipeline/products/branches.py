@@ -122,7 +122,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=8,
+    version=9,
 )
 
 CURVES = Analysis(
@@ -137,7 +137,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
-    version=5,
+    version=6,
 )
 
 BANDS = Analysis(

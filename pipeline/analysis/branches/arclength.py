@@ -29,7 +29,7 @@ class Settings:
     first_step: float = 1e-3
     longest_step: float = 5e-3  # in units of the range that an unknown has covered, or of `size` if this is more
     shortest_step: float = 1e-7
-    size: float = 1.0  # scaled
+    size: float | np.ndarray = 1.0  # scaled; of all unknowns, or of each
     max_points: int = 4000  # points of one trace
     tolerance: float = 1e-10  # largest scaled residual of a point
     max_iterations: int = 6  # Newton steps before a step is halved
@@ -198,8 +198,7 @@ def _ahead(points: list[Point], step: float) -> np.ndarray:
 
 def _longest(here: Point, ranges: np.ndarray, settings: Settings) -> float:
     """Return the longest step at a point, for the ranges of the unknowns so far."""
-    own = np.linalg.norm(here.tangent * (settings.size / ranges))
-    return float(settings.size * settings.longest_step * (np.linalg.norm(here.tangent) / own))
+    return settings.longest_step * float(np.linalg.norm(here.tangent) / np.linalg.norm(here.tangent / ranges))
 
 
 def _is_near(here: Point, there: Point, step: float, ranges: np.ndarray, settings: Settings) -> bool:

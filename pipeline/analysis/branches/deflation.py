@@ -25,8 +25,9 @@ from magpend_core.pointwise import rates_at
 from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_EQUILIBRIUM, SAME_ON_BRANCH
 from pipeline.products.reporting import report
 
-WIDER = 1.5
-"""Side of the box of random starts, in units of that which the states seen span."""
+WIDER, WIDEST = 1.5, 10.0
+"""Sides of the least and the largest box of random starts, in units of that which the states seen span: orbits that no
+cell meets may be far from those that are seen."""
 
 ROUNDS = 6
 """Most rounds of deflated iterations; the search ends earlier with a round that finds nothing."""
@@ -38,7 +39,8 @@ ITERATIONS = 30
 """Newton steps of one iteration."""
 
 LONGEST_STEP = 0.5
-"""Longest step [scaled]; a longer one is shortened to this."""
+"""Longest step [scaled], and in units of the distance from the middle of the starts, where this is more; a longer one
+is shortened to this."""
 
 CLOSE = 1e-9
 """Scaled residual at which an iteration ends; the orbits found are polished further."""
@@ -133,7 +135,8 @@ def orbit_near(
 def starts_around(
     section: np.ndarray, n: int, seed: int, system: System, reach: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return states from which a search starts: half of them section points that were seen, half random in a box.
+    """Return states from which a search starts: half of them section points that were seen, half random in boxes of
+    all sizes around them.
 
     Parameters
     ----------
@@ -153,13 +156,12 @@ def starts_around(
         section = np.zeros((1, system.n_states)) + np.asarray(system.scales) * [[-1.0], [1.0]]
     spanned = section if reach is None else np.concatenate([section, reach])
     low, high = spanned.min(axis=0), spanned.max(axis=0)
-    middle, half = (low + high) / 2.0, WIDER * np.maximum(high - low, np.asarray(system.scales)) / 2.0
-    low, high = middle - half, middle + half
-    angles = np.flatnonzero(system.is_angle)
-    low[angles], high[angles] = -np.pi, np.pi
+    middle, half = (low + high) / 2.0, np.maximum(high - low, np.asarray(system.scales)) / 2.0
     n_drawn = n // 2
     drawn = section[generator.integers(len(section), size=n_drawn)]
-    return np.concatenate([drawn, generator.uniform(low, high, (n - n_drawn, system.n_states))])
+    sides = np.geomspace(WIDER, WIDEST, n - n_drawn)[:, None] * half
+    middle, sides = np.where(system.is_angle, 0.0, middle), np.where(system.is_angle, np.pi, sides)
+    return np.concatenate([drawn, middle + sides * generator.uniform(-1.0, 1.0, sides.shape)])
 
 
 def _iterate(
@@ -171,7 +173,7 @@ def _iterate(
     known: Sequence[FoundOrbit],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Iterate Newton's method from all starts. Return the section points to which it converged, and their periods."""
-    state, scales = starts.astype(np.float64), np.asarray(system.scales)
+    state, scales, middle = starts.astype(np.float64), np.asarray(system.scales), np.median(starts, axis=0)
     rows, done = np.arange(len(state)), []
     for _ in range(ITERATIONS):
         ends = section_map(
@@ -194,8 +196,10 @@ def _iterate(
         matrices = ends.derivatives[going] * scales / scales[:, None] - np.eye(len(scales))
         steps = _newton(matrices, mismatch[going])
         steps *= stretch(state[rows], periods[rows], steps, known, system)[:, None]
+        away = wrap_angles(state[rows] - middle, system) / scales
+        allowed = LONGEST_STEP * np.maximum(1.0, np.abs(away).max(axis=1, keepdims=True))
         longest = np.abs(steps).max(axis=1, keepdims=True)
-        steps *= np.minimum(1.0, LONGEST_STEP / np.maximum(longest, LONGEST_STEP * 1e-9))
+        steps *= np.minimum(1.0, allowed / np.maximum(longest, allowed * 1e-9))
         state[rows] = wrap_angles(state[rows] + steps * scales, system)
     ended = np.concatenate(done)
     return state[ended], periods[ended]

@@ -33,6 +33,7 @@ from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import find_root
+from pipeline.analysis.branches.center_manifold import Rest
 from pipeline.analysis.branches.codimension_two import BT, NEUTRAL, NONCENTRAL, SpecialPoint
 from pipeline.analysis.branches.following import leading_of, opposite
 from pipeline.analysis.branches.homoclinic import (
@@ -112,7 +113,9 @@ def follow_homoclinic(
     here, step = start, settings.first_step
     while not arm.end:
         watch = _Watch(problem, settings, bounds, arm)
-        rest = replace(settings, first_step=step, max_points=AT_ONCE)
+        size = np.full(problem.size, max(1.0, problem.extent))
+        size[-3:] = 1.0  # time and parameters
+        rest = replace(settings, first_step=step, max_points=AT_ONCE, size=size)
         found = yield from trace(problem, here, rest, watch.stop, watch.between)
         if found.end != "max_points" or len(arm.points) >= settings.max_points:
             arm.end = found.end
@@ -440,11 +443,17 @@ def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
     at = takens.point.u[:n]
     values = takens.point.u[-2:] + away * np.array([np.cos(angle), np.sin(angle)])
     packed = family.rows(np.append(at, values)[None]).parameters[0]
-    null = np.linalg.svd(family.scaled(takens.point.value.monodromy))[2][-1]
-    reach = np.outer(np.sqrt(away) * np.array([-1.0, -0.3, 0.3, 1.0]), null)
+    left, _, right = np.linalg.svd(family.scaled(takens.point.value.monodromy))
+    rest, q = Rest(family, np.append(at, takens.point.u[-2:]), takens.point.value.monodromy), right[-1]
+    bend = rest.second(*2 * [q * scales / rest.units]).real * rest.units / scales
+    rate = rates_at(system, (at * scales)[None], packed)[0] / scales
+    slope = family.scaled(jacobian_at(system, (at * scales)[None], packed)[0]) @ q
+    # along q, with p the left null vector, the rates are to leading order p.f + p.A q s + p.B(q, q) s**2 / 2
+    constant, linear, square = (left[:, -1] @ np.column_stack([rate, slope, 0.5 * bend])).tolist()
+    reach = max(np.sqrt(abs(constant / square)), abs(linear / square))
     with np.errstate(all="ignore"):
-        found = find_equilibria(system, (at + reach) * scales, packed)
-    good = found.converged & (np.abs(found.states / scales - at).max(axis=1) < 4.0 * np.sqrt(away))
+        found = find_equilibria(system, (at + reach * np.outer([-1.0, -0.3, 0.3, 1.0], q)) * scales, packed)
+    good = found.converged & (np.abs(found.states / scales - at).max(axis=1) < 4.0 * reach)
     ends: dict[bool, tuple[np.ndarray, np.ndarray, float]] = {}
     for state, jacobian in zip(found.states[good] / scales, found.jacobians[good], strict=True):
         values_here = np.linalg.eigvals(jacobian)

@@ -33,7 +33,7 @@ from pipeline.analysis.events.lines import (
     places_of,
 )
 from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
-from pipeline.analysis.events.one_event import are_mirrored, on_circle, with_images
+from pipeline.analysis.events.one_event import are_mirrored, is_at_one_value, on_circle, with_images
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
@@ -467,7 +467,7 @@ def _merged(named: Sequence[Event]) -> list[Event]:
             and last.stretch.attractor == one.stretch.attractor
             and (
                 last.fate.bifurcation == one.fate.bifurcation >= 0
-                or (last.what in (*CRISES, BREAKUP) and (last.what, last.fate.value) == (one.what, one.fate.value))
+                or (last.what in (*CRISES, BREAKUP) and last.what == one.what and is_at_one_value(last, one))
             )
         ):
             merged[-1] = replace(last, after=one.stretch)

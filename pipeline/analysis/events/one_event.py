@@ -91,8 +91,7 @@ def _is_seen_from_elsewhere(ds: xr.Dataset, one: Event) -> bool:
 
 def _is_same(scene: Scene, a: Event, b: Event) -> bool:
     """Tell whether two ends are one event: of one kind, at one value, and of one orbit or of mirror images."""
-    # comparisons with the errors of events that have no value, which are NaN, are false
-    if a.what != b.what or not abs(a.fate.value - b.fate.value) <= a.error + b.error:
+    if a.what != b.what or not is_at_one_value(a, b):
         return False
     if a.what == SNIC and (on_circle(scene, a, b) or on_circle(scene, b, a)):
         return True
@@ -109,11 +108,15 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
     return a.rises == b.rises and are_mirrored(scene, a, b)
 
 
+def is_at_one_value(a: Event, b: Event) -> bool:
+    """Tell whether two ends are at one value within their errors; those without a value, which is NaN, are not."""
+    return bool(abs(a.fate.value - b.fate.value) <= a.error + b.error)
+
+
 def on_circle(scene: Scene, one: Event, cycle: Event) -> bool:
     """Tell whether an equilibrium ends, from the other side, in the fold at which a cycle comes to rest."""
     ds, k = scene.located, one.fate.bifurcation
-    is_at = abs(one.fate.value - cycle.fate.value) <= one.error + cycle.error
-    if k < 0 or cycle.fate.limit != SNIC or one.rises == cycle.rises or not is_at:
+    if k < 0 or cycle.fate.limit != SNIC or one.rises == cycle.rises or not is_at_one_value(one, cycle):
         return False
     rest = ds["limit_state"].values[cycle.fate.branch, int(cycle.fate.node > 0)]
     return bool(geometry_of(scene.attractors).distance(ds["bifurcation_section"].values[k, 0], rest) <= SAME_PLACE)

@@ -51,7 +51,7 @@ class Effort(NamedTuple):
     n_phases: int  # least number at a value
 
 
-_OF_CHAOS = Effort(6, 32, 16384, 1.0 / 12.0, 60)
+_OF_CHAOS = Effort(6, 64, 16384, 1.0 / 12.0, 60)
 
 MEASURED = {
     FOLD: Effort(10, 16, 4096, 1.0 / 12.0, 60),

@@ -264,9 +264,9 @@ def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
 # ---- every analysis ends in a table or in a sentence -------------------------------------------
 
 
-def run_of(model, starts, folder, **more):
-    """Run cells of a model for 66 s, and return the run directory."""
-    quietly(sweep(model, starts, frequency_hz=1.0, lengths=(50, 16), **more), folder / "run")
+def run_of(model, starts, folder, lengths=(50, 16), **more):
+    """Run cells of a model, by default for 66 s, and return the run directory."""
+    quietly(sweep(model, starts, frequency_hz=1.0, lengths=lengths, **more), folder / "run")
     return folder / "run"
 
 
@@ -303,10 +303,10 @@ def test_derive__every_analysis_of_a_corner_case(name, tmp_path):
 # ---- ghosts and half-stable points -------------------------------------------------------------
 
 
-def found_at(equations, starts, folder):
-    """Return kind, stability and evidence of each set, and the set of each cell, after 66 s."""
+def found_at(equations, starts, folder, lengths=(50, 16)):
+    """Return kind, stability and evidence of each set, and the set of each cell."""
     model = table("point", equations, {"a": 1.0}, states={name: {"escape": 10.0} for name in equations})
-    found = dense(derive(run_of(model, starts, folder), "attractors"), points=True)
+    found = dense(derive(run_of(model, starts, folder, lengths), "attractors"), points=True)
     sets = zip(*(found[name].values.tolist() for name in ("kind", "stability", "evidence")), strict=True)
     return list(sets), found["attractor_id"].values.tolist()
 
@@ -318,7 +318,7 @@ def test_attractors__half_stable_point(turned, tmp_path):
     """
     rates = {"x": f"{turned}*x**2", "y": "-y + 0.5*x"}
     starts = [[-turned, 0.5], [-0.2 * turned, -0.5], [0.012 * turned, 0.006 * turned], [turned, 0.0]]
-    sets, ids = found_at(rates, starts, tmp_path)
+    sets, ids = found_at(rates, starts, tmp_path, lengths=(500, 16))
     assert sets[0] == (EQUILIBRIUM, UNSTABLE, BY_ONE_SIDE)
     assert ids[:2] == [0, 0]
     assert ids[2] != 0

@@ -35,8 +35,9 @@ class Equilibrium:
         # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
         fastest = float(np.abs(self.jacobian).max(initial=self.rate))
         size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * fastest
-        # rounding moves a nearly degenerate equilibrium, and its eigenvalues with it
-        moved = ROUNDING * fastest**2 / max(float(np.abs(self.eigenvalues).min()), 1e-300)
+        # rounding moves a nearly degenerate equilibrium, and its eigenvalues with it; near a fold as a square root
+        rounding = fastest * float(np.sqrt(ROUNDING))
+        moved = rounding**2 / max(float(np.abs(self.eigenvalues).min()), rounding)
         return largest_error(self.jacobian, size, real=True) + moved
 
     @cached_property

@@ -19,7 +19,7 @@ from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Work
 from pipeline.analysis.sets import Geometry
 
-DISTANCES = (0.05, 0.01)
+DISTANCES = (0.5, 0.05, 0.01)
 """Scaled distances at which trajectories start, tried in turn until one shows an approach."""
 
 LEGS, FALL, GONE = 32, 0.7, 10.0
