@@ -105,7 +105,7 @@ ANALYSES = {
 }
 
 ELSEWHERE = {"bands"}
-"""Commands that need the posterior of an identification: see tests/pipeline/analysis/test_bands.py."""
+"""Commands that need the posterior of an identification: see tests/pipeline/analysis/branches/test_bands.py."""
 
 FIGURES_OF = {
     **{name: words for name, words in ANALYSES.items() if name in FIGURES and name not in ("attractors", "basins")},
