@@ -14,7 +14,7 @@ A run has one set of attractors, on which its other analyses and its figures res
 last sought are in ``derived/attractors.json`` (`pipeline.runs.versions.attractor_options`); results that rest on
 others are stale.
 
-CONTRIBUTING.md tells how to add an analysis.
+docs/adding.md tells how to add an analysis.
 """
 
 from __future__ import annotations
