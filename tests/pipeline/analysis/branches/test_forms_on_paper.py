@@ -29,43 +29,38 @@ PLAIN = SimpleNamespace(scaled=lambda matrix: matrix)
 """A family whose states have the scale 1."""
 
 
-def coefficient(kind: str, slope, form=None) -> tuple[float, float]:
-    """Return a coefficient of a map with its fixed point at 0, from its derivative at states, and its error."""
-    n = len(slope(np.zeros(8)[: slope.n]))
+def coefficient(kind: str, n: int, slope, form=None) -> tuple[float, float]:
+    """Return a coefficient of a map of n states with its fixed point at 0, from its derivative, and its error."""
     case = Case(PLAIN, kind, np.zeros(n + 1), slope(np.zeros(n)))
     neighbours = np.array([slope(u[:n]) for u in case.neighbours()])
     value, error, _ = settled(case.coefficients(form or FORMS[kind], neighbours))
     return value, error
 
 
-def sloped(n: int):
-    """Mark a derivative with the number of its states."""
-
-    def mark(slope):
-        slope.n = n
-        return slope
-
-    return mark
-
-
 @pytest.mark.parametrize(("a", "b"), [(0.7, 0.0), (0.5, -0.1), (0.0, 0.3), (1.0, -2.0)])
 def test_doubling__of_a_map_with_square_and_cube(a: float, b: float) -> None:
-    """x -> -x + a x^2 + b x^3: a^2 + b (Kuznetsov 2004, Eq. 4.11)."""
-    found, error = coefficient(DOUBLING, sloped(1)(lambda x: np.array([[-1.0 + 2.0 * a * x[0] + 3.0 * b * x[0] ** 2]])))
+    """x -> -x + a x^2 + b x^3: a^2 + b (Kuznetsov 2004, Ch. 4)."""
+    found, error = coefficient(DOUBLING, 1, lambda x: np.array([[-1.0 + 2.0 * a * x[0] + 3.0 * b * x[0] ** 2]]))
     assert found == pytest.approx(a * a + b, abs=1e-8)
     assert error < 1e-6
 
 
 def test_doubling__along_a_centre_manifold() -> None:
     """(x, y) -> (-x + x y, y/2 + x^2): y = 2 x^2 on it, so x -> -x + 2 x^3."""
-    slope = sloped(2)(lambda s: np.array([[-1.0 + s[1], s[0]], [2.0 * s[0], 0.5]]))
-    assert coefficient(DOUBLING, slope)[0] == pytest.approx(2.0, abs=1e-8)
+
+    def slope(s: np.ndarray) -> np.ndarray:
+        return np.array([[-1.0 + s[1], s[0]], [2.0 * s[0], 0.5]])
+
+    assert coefficient(DOUBLING, 2, slope)[0] == pytest.approx(2.0, abs=1e-8)
 
 
 def test_fold__is_half_of_the_second_derivative() -> None:
     """(x, y) -> (x + a x^2 + y^2, y/2): the eigenvector is x alone, and its sign is free."""
-    slope = sloped(2)(lambda s: np.array([[1.0 - 1.5 * s[0], 2.0 * s[1]], [0.0, 0.5]]))
-    assert abs(coefficient(FOLD, slope)[0]) == pytest.approx(0.75, abs=1e-9)
+
+    def slope(s: np.ndarray) -> np.ndarray:
+        return np.array([[1.0 - 1.5 * s[0], 2.0 * s[1]], [0.0, 0.5]])
+
+    assert abs(coefficient(FOLD, 2, slope)[0]) == pytest.approx(0.75, abs=1e-9)
 
 
 @pytest.mark.parametrize("d", [-0.4, 0.25 + 0.6j])
@@ -88,16 +83,19 @@ def test_torus__of_a_rotation_with_a_cubic_term(d: complex, angle: float) -> Non
     step = 1e-6
     difference = (image(np.array([0.3 + step, 0.2])) - image(np.array([0.3 - step, 0.2]))) / (2.0 * step)
     np.testing.assert_allclose(slope(np.array([0.3, 0.2]))[:, 0], difference, atol=1e-8)
-    found, error = coefficient(TORUS, sloped(2)(slope))
+    found, error = coefficient(TORUS, 2, slope)
     assert found == pytest.approx(2.0 * np.real(d), abs=1e-7)
     assert error < 1e-6
 
 
 def test_cubic__of_a_pitchfork_along_a_centre_manifold() -> None:
     """(x, y) -> (x + x y - x^3, y/2 + x^2): y = 2 x^2, so x -> x + x^3; the square vanishes."""
-    slope = sloped(2)(lambda s: np.array([[1.0 + s[1] - 3.0 * s[0] ** 2, s[0]], [2.0 * s[0], 0.5]]))
-    assert coefficient(BRANCHING, slope, _cubic)[0] == pytest.approx(1.0, abs=1e-8)
-    assert coefficient(BRANCHING, slope, _quadratic)[0] == pytest.approx(0.0, abs=1e-9)
+
+    def slope(s: np.ndarray) -> np.ndarray:
+        return np.array([[1.0 + s[1] - 3.0 * s[0] ** 2, s[0]], [2.0 * s[0], 0.5]])
+
+    assert coefficient(BRANCHING, 2, slope, _cubic)[0] == pytest.approx(1.0, abs=1e-8)
+    assert coefficient(BRANCHING, 2, slope, _quadratic)[0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_critical_vectors__are_dual_and_belong_to_the_kind() -> None:

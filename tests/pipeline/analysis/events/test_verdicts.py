@@ -20,7 +20,7 @@ from pipeline.layout.vocabulary import TORUS as TORUS_SET
 LINE = Geometry((False,), (1.0,))
 PLANE = Geometry((False, False), (1.0, 1.0))
 LOGISTIC = (3.0, 3.449489743, 3.544090359, 3.564407266, 3.568759420)
-"""Doublings of the logistic map; its cascade accumulates at 3.5699456 (May, Nature 261, 459, 1976)."""
+"""Doublings of the logistic map; its cascade accumulates at 3.569945672 (Feigenbaum, J. Stat. Phys. 19, 25, 1978)."""
 CRITICALITIES = ("none", "supercritical", "subcritical")
 
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from pipeline.analysis.branches.kinds import KINDS as BIFURCATIONS
-from pipeline.analysis.response.analysis import LANDINGS, _landed, _own_name, _ways, measured, measured_along
+from pipeline.analysis.response.analysis import _own_name, _ways, measured, measured_along
 from pipeline.analysis.response.backbone import (
     KINDS,
     _at_ends,
@@ -27,7 +27,6 @@ from pipeline.analysis.response.resonance import (
     Curve,
     ModeProblem,
     ResonanceProblem,
-    _displaced,
     _is_within,
     mode_family,
     mode_start,
@@ -157,8 +156,6 @@ def test_ways__directions_in_which_stable_orbits_end(kind, criticality, before, 
 
 def test_own_name__parameters_that_are_called_like_a_measure() -> None:
     assert [_own_name(name) for name in ("amplitude", "phase", "F")] == ["parameter_amplitude", "parameter_phase", "F"]
-    assert _landed([], []) == []
-    assert LANDINGS["closed"] == ""
 
 
 @pytest.mark.parametrize("channel", [0, 1])
@@ -178,7 +175,6 @@ def test_is_within__ends_count() -> None:
     assert _is_within((0.0, 3.0), bounds)
     assert not _is_within((0.5, 3.1), bounds)
     assert not _is_within((np.nan, 2.5), bounds)
-    np.testing.assert_allclose(np.diff(_displaced(np.array([1.0, 2.0]))[:, 0])[0] > 0.0, True)
 
 
 def test_curve__multipliers_of_a_normal_mode_are_without_those_of_flow_and_energy() -> None:

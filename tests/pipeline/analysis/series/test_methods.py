@@ -133,7 +133,7 @@ def test_plateau__is_the_longest_range_of_one_slope() -> None:
 
 
 def test_correlation_sums__of_henons_map_have_its_dimension() -> None:
-    """Grassberger and Procaccia (1983): 1.21 +- .01 for the map, 1.25 +- .02 with better resolution."""
+    """Grassberger and Procaccia (1983) give 1.21 to 1.25."""
     found = correlation_sums(Embedding(one_piece(henon(1, 3000)[0, :, 0]), 1, 2, 5), True)
     assert found.low < 1.22 < found.high
     assert found.value == pytest.approx(1.22, abs=0.15)  # of 3000 points
