@@ -53,6 +53,7 @@ def test_identify__reference_orbits_from_random_starts(found, orbit):
     assert one["n_cells"] > 5
 
 
+@pytest.mark.slow
 def test_identify__features_of_the_reference_orbits(found):
     right, left = (row_of(found, o["section"]) for o in ORBITS[:2])
     assert found["side"].values[[right, left]].tolist() == [Side.RIGHT, Side.LEFT]
@@ -79,6 +80,7 @@ def test_identify__features_of_the_reference_orbits(found):
     assert found["energy_max"].values[right] == pytest.approx(energies.max(), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_identify__every_cell_where_it_belongs(cube, found):
     ids = found["attractor_id"].values
     assert (ids >= 0).all()

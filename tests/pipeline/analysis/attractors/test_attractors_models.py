@@ -46,6 +46,7 @@ def two():
     return cube("twin-well-periodic", 6, 400, 16)
 
 
+@pytest.mark.slow
 def test_attractors__of_a_run_without_a_swept_parameter_have_exponents(tmp_path):
     """Ueda's attractor: the mean of its trajectories' exponents, near Sprott's .1034 (appendix A.4.5)."""
     spec = magpend.Spec("sweep", "x'' = 7.5*cos(omega*t) - .05*x' - x**3").with_parameters(omega=1.0)
@@ -57,6 +58,7 @@ def test_attractors__of_a_run_without_a_swept_parameter_have_exponents(tmp_path)
     assert found["lyapunov_max"].item() == pytest.approx(0.1034, abs=0.01)
 
 
+@pytest.mark.slow
 def test_attractors__of_two_sections_that_do_not_close_yet(tmp_path):
     """A damped oscillator of which each cell keeps two points; the tail decided on an empty half."""
     spec = magpend.Spec("sweep", "x'' = cos(omega*t) - 0.2*x' - 2*x").with_parameters(omega=1.0)

@@ -149,6 +149,7 @@ def test_explore__starts_on_one_branch(resonance):
     assert len(explore(starts, Scope(0.1, 0.4, settings=Settings(longest_step=0.03)))) == 1
 
 
+@pytest.mark.slow
 def test_dataset_of__resonance(resonance):
     """Three stable segments' worth of tables: numbers as on the branch."""
     _, branch = resonance

@@ -102,6 +102,7 @@ def test_stuart_landau__curves(stuart_landau):
             assert curve.start == -1
 
 
+@pytest.mark.slow
 def test_stuart_landau__points(stuart_landau):
     """Cusps, R1, and the other resonances where the angle is 2 pi sqrt(sigma^2 - 1/4)."""
     expected = [("cusp", s / np.sqrt(3.0), np.sqrt(8.0 / 27.0)) for s in (-1.0, 1.0)]

@@ -53,6 +53,7 @@ def test_search_orbits__each_is_an_orbit_and_is_found_once(everything):
     assert any(one.search_round > 0 and one.n_hits == 0 for one in more)
 
 
+@pytest.mark.slow
 def test_search_orbits__has_the_edge_orbit(everything):
     """The saddle between the wells has the multipliers 324.501702 and .00120079844."""
     away = [np.abs(one.points[0] - [-0.099835710177, 0.007534227463]).max() for one in everything]
