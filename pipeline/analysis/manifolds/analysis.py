@@ -345,15 +345,15 @@ class _Line:
         self.points = points
         self.places = np.concatenate([[0.0], np.cumsum(steps)])
         self.spline = CubicSpline(self.places[kept], points[kept])
-        self.slope = self.spline.derivative()
+        self.slope, self.bend = self.spline.derivative(), self.spline.derivative(2)
 
     def signed_distance(self, point: np.ndarray) -> float:
         """Return the distance of a point from the spline, positive on the left of its direction."""
         k = int(np.argmin(((self.points - point) ** 2).sum(axis=1)))
         place = self.places[k]
         for _ in range(20):
-            tangent = self.slope(place)
-            step = float((point - self.spline(place)) @ tangent / (tangent @ tangent))
+            away, tangent = point - self.spline(place), self.slope(place)
+            step = float(away @ tangent / max(tangent @ tangent - away @ self.bend(place), 0.1 * tangent @ tangent))
             place = float(np.clip(place + step, self.places[0], self.places[-1]))
             if abs(step) < 1e-12:
                 break

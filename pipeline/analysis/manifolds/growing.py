@@ -23,7 +23,7 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map, wrap_angles
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_POINT
 
 FIRST = 1e-5
 """Scaled distance of the first segment from the orbit."""
@@ -322,7 +322,8 @@ def _preimages(saddle: Saddle, points: np.ndarray, guesses: np.ndarray, n_period
             if is_finite[k] and (not number or np.linalg.norm(_solve(matrices[row], residual[k])) < length):
                 found[row], matrices[row], share[row] = trial[k], scaled[k], 1.0
                 steps[row] = _solve(scaled[k], residual[k])
-                converged[row] = np.abs(steps[row]).max() < NEWTON_CLOSE
+                left = np.linalg.norm(residual[k] - scaled[k] @ steps[row])  # 0, unless the derivative is singular
+                converged[row] = np.abs(steps[row]).max() < NEWTON_CLOSE and left < SAME_POINT
                 found[row] += converged[row] * steps[row] * saddle.scales
             else:
                 share[row] *= 0.25

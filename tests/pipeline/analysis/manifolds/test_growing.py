@@ -262,3 +262,16 @@ def test_preimages__by_newton_and_nan_where_the_map_ends() -> None:
     found = _preimages(saddle, points, guesses, 1)
     expected = [[np.log(2.0), 0.0], [0.0, 1.0], [np.nan] * 2, [np.nan] * 2, [np.nan] * 2]
     np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_preimages__none_where_the_map_folds() -> None:
+    """(x, y) -> (x^2 + y, y/2) reaches (c, 0) from x = +-sqrt(c) alone: from nowhere at c < 0."""
+
+    def slope(s):
+        found = np.zeros((len(s), 2, 2))
+        found[:, 0, 0], found[:, 0, 1], found[:, 1, 1] = 2.0 * s[:, 0], 1.0, 0.5
+        return found
+
+    saddle = saddle_of(lambda s: np.stack([s[:, 0] ** 2 + s[:, 1], 0.5 * s[:, 1]], axis=-1), slope, [1.0, 0.0])
+    found = _preimages(saddle, np.array([[-1.0, 0.0], [4.0, 0.0]]), np.array([[0.0, -0.8], [1.0, 0.0]]), 1)
+    np.testing.assert_allclose(found, [[np.nan] * 2, [2.0, 0.0]], atol=1e-8)

@@ -31,7 +31,7 @@ from tests.pipeline.analysis.manifolds.test_growing import linear
 def test_line__signed_distances_from_a_circle() -> None:
     angle = np.linspace(0.0, 1.5 * np.pi, 200)
     line = _Line(2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-    for radius in (0.5, 1.9, 2.0, 2.1, 2.5):
+    for radius in (0.5, 1.9, 2.0, 2.1, 2.5, 5.0, 20.0):
         point = radius * np.array([np.cos(1.0), np.sin(1.0)])
         # positive on the left of a turn to the left: inside
         assert line.signed_distance(point) == pytest.approx(2.0 - radius, abs=1e-7)
