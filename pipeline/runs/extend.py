@@ -287,9 +287,9 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
 
 
 def _record(extension: Extension, files: Files) -> int:
-    """Write a file that lists the runs from which cells were copied; return the number of these cells.
+    """Write the file of runs from which cells were copied; return the number of cells copied.
 
-    It is smaller than planned if a source turned out to be damaged.
+    It is below the planned number if a source turned out to be damaged.
     """
     taken: dict[int, int] = {}
     with contextlib.suppress(FileNotFoundError):

@@ -629,6 +629,7 @@ def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
     ends = ", ".join(CURVE_WHY.get(end, plain(end)) for end in (told["first_end"], told["last_end"]) if end != "bound")
     what = f"{LABELS[told['kind']]} {told['kind']}, {period_words(int(told['orbit_period']))}"
     if told["kind"] == HOMOCLINIC:
-        quantity = one["saddle_quantity"].values[:n]
-        what = f"{LABELS[HOMOCLINIC]} homoclinic, saddle quantity {quantity.min():.4g} to {quantity.max():.4g} 1/s"
+        quantity = one["saddle_quantity"].values[:n]  # NaN where the saddle has become another point
+        low, high = np.nanmin(quantity), np.nanmax(quantity)
+        what = f"{LABELS[HOMOCLINIC]} homoclinic, saddle quantity {low:.4g} to {high:.4g} 1/s"
     return f"  {number}: {what}: {spans}" + (f"; ends: {ends}" if ends else "")

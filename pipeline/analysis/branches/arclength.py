@@ -4,10 +4,10 @@ The predictor extends the cubic through the last two points by a step along the 
 Newton's method in the plane normal to the tangent, so that it also passes folds in the parameter.
 Unknowns are scaled; lengths are Euclidean in them.
 
-The longest step is a share of the range that each unknown has covered so far, or of its scale if this is more. A curve
-that moves far, as at a sharp resonance, takes longer steps in the unknowns that move far, but not in the others. So the
-number of points grows with the logarithm of the distance. A free parameter, whose scale is its interval, never takes
-longer steps.
+The longest step is a share of the range that each unknown has covered so far, or of its size in the settings if this is
+more. A curve that moves far, as at a sharp resonance, takes longer steps in the unknowns that move far, but not in the
+others. So the number of points grows with the logarithm of the distance. The steps in a free parameter do not grow: its
+scale is the interval that it stays in.
 """
 
 from __future__ import annotations

@@ -61,8 +61,8 @@ def has_equilibria(model: Model) -> bool:
 
 
 def start_problems(model: Model, options: StartOptions, *others: str, word: str = FREQUENCY) -> list[str]:
-    """Return what is wrong with --start, which names all states and may name some other quantities, of which the
-    drive's rate has a word of its own in the specification.
+    """Return what is wrong with --start: it names all states, and may name some `others`. Messages call the drive's
+    rate by the specification's `word`.
     """
     if not options.start:
         return []

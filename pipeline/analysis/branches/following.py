@@ -37,8 +37,8 @@ ACROSS = 100.0
 """Step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step."""
 
 NEAR_HALF, PASSED = 0.2, 4.0
-"""Distances of two neighbouring points from the orbit of half the period, by the way to the point half a period later,
-below which the branch passes it: scaled, and in units of the step. On the way through it changes by two steps."""
+"""Largest distance between an orbit's section points half a period apart, at two neighbouring points of a branch, at
+which the branch may pass through the orbit of half the period: scaled, and in units of the step between the two."""
 
 REST = 0.5
 """At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""

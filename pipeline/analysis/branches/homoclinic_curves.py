@@ -35,6 +35,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct, kerne
 from pipeline.analysis.branches.bifurcations import find_root
 from pipeline.analysis.branches.center_manifold import Rest
 from pipeline.analysis.branches.codimension_two import BT, NEUTRAL, NONCENTRAL, SpecialPoint
+from pipeline.analysis.branches.equilibrium_curves import SINGULAR
 from pipeline.analysis.branches.following import leading_of, opposite
 from pipeline.analysis.branches.homoclinic import (
     CUTS,
@@ -419,6 +420,7 @@ class _Pair:
     saddle: np.ndarray
     focus: np.ndarray
     jacobian: np.ndarray  # at the saddle, scaled [1/s]
+    across: np.ndarray  # direction that the Jacobian at the point takes to the one from saddle to focus, scaled
     work: float  # of the damping on the loop about the focus, to leading order [1/s]
     values: np.ndarray  # (2,): scaled parameters
 
@@ -427,11 +429,9 @@ class _Pair:
         rates = leading_of(np.linalg.eigvals(self.jacobian))
         k = 0.5 * float(np.sqrt(rates[0].real * -rates[1].real))
         along = self.focus - self.saddle
-        left, sizes, right = np.linalg.svd(self.jacobian)
-        across = right[:-1].T @ ((left[:, :-1].T @ along) / sizes[:-1])
         t = np.linspace(-LOOP / k, LOOP / k, SAMPLES // 4)
         bow = 1.5 / np.cosh(k * t) ** 2
-        states = self.saddle + bow[:, None] * along + (-2.0 * k * np.tanh(k * t) * bow)[:, None] * across
+        states = self.saddle + bow[:, None] * along + (-2.0 * k * np.tanh(k * t) * bow)[:, None] * self.across
         scales = np.asarray(family.system.scales)
         return Loop(family, t - t[0], states * scales, self.saddle * scales, self.values * np.asarray(family.scales))
 
@@ -443,14 +443,15 @@ def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
     at = takens.point.u[:n]
     values = takens.point.u[-2:] + away * np.array([np.cos(angle), np.sin(angle)])
     packed = family.rows(np.append(at, values)[None]).parameters[0]
-    left, _, right = np.linalg.svd(family.scaled(takens.point.value.monodromy))
+    left, sizes, right = np.linalg.svd(family.scaled(takens.point.value.monodromy))
     rest, q = Rest(family, np.append(at, takens.point.u[-2:]), takens.point.value.monodromy), right[-1]
     bend = rest.second(*2 * [q * scales / rest.units]).real * rest.units / scales
     rate = rates_at(system, (at * scales)[None], packed)[0] / scales
     slope = family.scaled(jacobian_at(system, (at * scales)[None], packed)[0]) @ q
     # along q, with p the left null vector, the rates are to leading order p.f + p.A q s + p.B(q, q) s**2 / 2
-    constant, linear, square = (left[:, -1] @ np.column_stack([rate, slope, 0.5 * bend])).tolist()
-    reach = max(np.sqrt(abs(constant / square)), abs(linear / square))
+    constant, linear, square = np.abs(left[:, -1] @ np.column_stack([rate, slope, 0.5 * bend])).tolist()
+    is_mirrored = square <= SINGULAR * float(np.linalg.norm(bend))  # as at a pitchfork, the cubic term decides
+    reach = np.sqrt(away) if is_mirrored else max(np.sqrt(constant / square), linear / square)
     with np.errstate(all="ignore"):
         found = find_equilibria(system, (at + reach * np.outer([-1.0, -0.3, 0.3, 1.0], q)) * scales, packed)
     good = found.converged & (np.abs(found.states / scales - at).max(axis=1) < 4.0 * reach)
@@ -462,4 +463,6 @@ def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
     if len(ends) < 2:
         return None
     (saddle, jacobian, of_saddle), (focus, _, of_focus) = ends[True], ends[False]
-    return _Pair(saddle, focus, jacobian, (of_saddle + 6.0 * of_focus) / 7.0, values)
+    # the null direction is exact at the point alone: beside it, the least singular value depends on the units
+    across = right[:-1].T @ ((left[:, :-1].T @ (focus - saddle)) / sizes[:-1])
+    return _Pair(saddle, focus, jacobian, across, (of_saddle + 6.0 * of_focus) / 7.0, values)

@@ -104,13 +104,39 @@ def damped_split(b1, b2):
     return split(lambda x, y: (y, b1 + b2 * y + x * x + x * y), saddle, [[0.0, 1.0], [2.0 * saddle, b2 + saddle]])
 
 
-def test_homoclinic_curves__bogdanov_takens():
-    """b1 = -(6/25) b2**2 + ... from the point (0, 0), at which the curve ends."""
-    family = family_in(TAKENS, "b1", "b2", (1.0, 1.0))
+def takens_of(equations):
+    """The Bogdanov-Takens point of x' = y, y' = 0 + ... at 0, with the parameters b1 = b2 = 0."""
+    family = family_in(equations, "b1", "b2", (1.0, 1.0))
     jacobian = np.array([[0.0, 1.0], [0.0, 0.0]])
     value = Value(np.zeros(1), np.zeros((1, 4)), np.zeros((1, 2)), jacobian, is_rest=True)
-    takens = SpecialPoint("bogdanov_takens", family, Point(np.zeros(4), np.zeros(4), value, 0), np.zeros(2))
-    guess = loop_near(takens, 0.05)
+    return SpecialPoint("bogdanov_takens", family, Point(np.zeros(4), np.zeros(4), value, 0), np.zeros(2))
+
+
+def test_loop_near__a_point_with_a_mirror():
+    """y' = b1 x + b2 y - x**3 - x**2 y has no square term: the saddle 0 and foci at x**2 = b1, where b2 = 4/5 b1 is the
+    exact leading order (Guckenheimer and Holmes 1983, Sect. 7.3) and the guess has weights 1/7 and 6/7.
+    """
+    equations = table("mirrored_takens", {"x": "y", "y": "b1*x + b2*y - x**3 - x**2*y"}, {"b1": 0.0, "b2": 0.0})
+    guess = loop_near(takens_of(equations), 0.05)
+    assert guess.values[1] / guess.values[0] == pytest.approx(6.0 / 7.0, rel=1e-4)
+    np.testing.assert_allclose(guess.saddle, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.1, 0.01])
+def test_loop_near__in_any_units(scale):
+    """The predicted loop moves as x' = y says, whatever the scale of y, and lies where b1 = -(6/25) b2**2 + ..."""
+    states = {"x": {}, "y": {"scale": scale}}
+    equations = table("scaled_takens", {"x": "y", "y": "b1 + b2*x + x**2 + x*y"}, {"b1": 0.0, "b2": 0.0}, states=states)
+    guess = loop_near(takens_of(equations), 0.05)
+    assert guess.values[0] / guess.values[1] ** 2 == pytest.approx(-6.0 / 25.0, rel=0.05)
+    x, y = guess.states.T
+    np.testing.assert_allclose(np.gradient(x, guess.times), y, atol=0.05 * np.abs(y).max())
+
+
+def test_homoclinic_curves__bogdanov_takens():
+    """b1 = -(6/25) b2**2 + ... from the point (0, 0), at which the curve ends."""
+    takens = takens_of(TAKENS)
+    family, guess = takens.family, loop_near(takens, 0.05)
     assert guess.values[0] / guess.values[1] ** 2 == pytest.approx(-6.0 / 25.0, rel=0.05)
     (curve,) = homoclinic_curves([guess], ((-1.0, 1.0), (-0.3, 0.1)))
     assert curve.ends == ("bound", "bogdanov_takens")
