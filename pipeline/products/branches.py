@@ -122,7 +122,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=9,
+    version=10,
 )
 
 CURVES = Analysis(

@@ -40,5 +40,5 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
-    version=14,
+    version=15,
 )

@@ -331,8 +331,9 @@ def _unbounded(ds: xr.Dataset) -> list[str]:
     lines = []
     for branch, end in limits_of(ds):
         one, name = ds.isel(branch=branch, end=end), parameter_name(str(ds.attrs["parameter"]))
-        states = zip(ds["state"].values.tolist(), one["limit_state"].values.round(12), strict=True)
-        place = ", ".join(f"{state} {value + 0.0:.6g}" for state, value in states)
+        rests = [rest for rest in one["limit_state"].values.round(12) + 0.0 if np.isfinite(rest).all()]
+        named = [zip(ds["state"].values.tolist(), rest, strict=True) for rest in rests]
+        place = " and at ".join(", ".join(f"{state} {value:.6g}" for state, value in rest) for rest in named)
         own = (one["limit_eigenvalue_real"].values + 1j * one["limit_eigenvalue_imag"].values).round(12) + 0.0
         eigenvalues = ", ".join(f"{v.real:.5g}{v.imag:+.5g}i" if v.imag else f"{v.real:.5g}" for v in own)
         fitted, error, expected = (float(one[f"limit_slope{part}"]) for part in ("", "_error", "_expected"))
@@ -344,8 +345,9 @@ def _unbounded(ds: xr.Dataset) -> list[str]:
             what, law = f"homoclinic to the saddle at {place}", f"-ln|{name} - {name}_h|"
             told = f"saddle quantity {quantity:.5g} 1/s: {cycle} ends there"
         else:
-            what, law = f"saddle node on an invariant circle, at {place}", f"1/sqrt|{name} - {name}_h|"
-            told = "the cycle goes on as a saddle and a node"
+            nodes = "saddle node" if len(rests) == 1 else f"{len(rests)} saddle nodes"
+            what, law = f"{nodes} on an invariant circle, at {place}", f"1/sqrt|{name} - {name}_h|"
+            told = "the cycle goes on as " + ("a saddle and a node" if len(rests) == 1 else "saddles and nodes")
         lines += [
             f"  branch {branch}{_at(ds, branch)}: {what}; {at}",
             f"    eigenvalues {eigenvalues} [1/s]; {told}",

@@ -149,15 +149,16 @@ def _limits(branches: Sequence[Branch], sizes: Mapping[str, int], units: str, st
     found = [((i, end), (one,)) for i, b in enumerate(branches) for end, one in enumerate(b.limits) if one is not None]
     per_root = "s, or s times the root of the parameter's unit"
     slope = "slope of the period over -ln|p - p_h|, or over 1/sqrt|p - p_h| at a saddle node on a circle"
-    at = "equilibrium where the period is infinite"
+    at = "equilibria where the period is infinite"
+    sizes = {**sizes, "rest": max((len(one.states) for _, (one,) in found), default=0)}
     columns: Columns = {
         "limit_value": ((), units, "parameter value where the period is infinite", lambda one: one.value),
         "limit_error": ((), units, "error of this value", lambda one: one.error),
-        "limit_state": (("state",), states, at, lambda one: one.state),
-        **_parts("limit_eigenvalue", "1/s", f"eigenvalues of the {at}", lambda one: one.eigenvalues),
+        "limit_state": (("rest", "state"), states, at, lambda one: one.states),
+        **_parts("limit_eigenvalue", "1/s", f"eigenvalues of the first of the {at}", lambda one: one.eigenvalues),
         "limit_slope": ((), per_root, f"{slope}: fitted", lambda one: one.slope),
         "limit_slope_error": ((), per_root, "error of the fitted slope", lambda one: one.slope_error),
-        "limit_slope_expected": ((), per_root, "the same slope, from the equilibrium", lambda one: one.expected),
+        "limit_slope_expected": ((), per_root, "the same slope, from the equilibria", lambda one: one.expected),
     }
     return filled(("branch", "end"), (len(branches), 2), found, sizes, columns) if found else {}
 

@@ -62,12 +62,12 @@ class Limit:
     kind: str  # of `LIMITS`
     value: float  # limit of the parameter
     error: float  # of this value
-    state: np.ndarray  # equilibrium at which the cycles come to rest
-    eigenvalues: np.ndarray  # of this equilibrium [1/s], by falling real part
+    states: np.ndarray  # equilibria at which the cycles come to rest, (rest, state); several by symmetry
+    eigenvalues: np.ndarray  # of the first of them [1/s], by falling real part
     # slope of the period over -ln|p - p_h| [s], or over 1/sqrt|p - p_h| at a saddle node on a circle
     slope: float  # fitted to the periods of the branch
     slope_error: float
-    expected: float  # computed from the equilibrium
+    expected: float  # computed from the equilibria
 
 
 @dataclass(eq=False)

@@ -292,7 +292,7 @@ def loops_of(branches: xr.Dataset, parameters: Parameters, second: str, bounds: 
         last = one.isel(point=(int(one["n_points"]) - 1) * end, phase=0)
         here = float(parameters[second])
         values, limit = np.array([[float(last["parameter"]), here], [float(one["limit_value"][end]), here]])
-        saddle = one["limit_state"].values[end]
+        saddle = one["limit_state"].values[end, 0]
         found.append(_cycle(family, last["section"].values, values, float(last["period_s"]), saddle, limit))
     return found
 
@@ -306,8 +306,10 @@ def saddle_nodes_of(
     those of `loops_of`.
     """
     return [
-        (family, family.unknowns(one["limit_state"].values[end], [float(one["limit_value"][end]), parameters[second]]))
+        (family, family.unknowns(rest, [float(one["limit_value"][end]), parameters[second]]))
         for one, end, family in _ends_of(branches, SNIC, parameters, second, bounds, max_period)
+        for rest in one["limit_state"].values[end]
+        if np.isfinite(rest).all()
     ]
 
 

@@ -9,7 +9,8 @@ saddle's leading eigenvalues, without signs: the unstable one if the saddle quan
 stable cycles end there. If the sum is positive, the cycles are unstable.
 
 ``snic``: a saddle node on an invariant circle. The period is a + pi/sqrt(a2 b d), where x' = a2 d + b x**2 is the
-normal form of the fold of the equilibria.
+normal form of the fold of the equilibria. If several saddle nodes lie on the circle, as they do by symmetry, the period
+is a plus the sum of their terms.
 
 The law's slope is fitted to the last points, and computed from the equilibrium. An end is named if both agree.
 """
@@ -23,7 +24,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from magpend_core.equilibria import find_equilibria
-from magpend_core.orbits import crossed_state, scaled_distance
+from magpend_core.orbits import crossed_state, scaled_distance, wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
@@ -49,6 +50,9 @@ NEAR = 0.05
 
 SAMPLES, GUESSES = 4000, 8
 """Points on an orbit, and most of its slow places from which equilibria are looked for."""
+
+SAME_FOLD = 1e-9
+"""Largest distance between the values of two folds of equilibria that happen at once, in units of the interval."""
 
 AGREES = 0.05
 """Largest relative difference between the fitted and the computed slope of the period's law."""
@@ -284,7 +288,7 @@ def _homoclinic(family: Family, points: Sequence[Point], saddle: np.ndarray, eig
     slowest = min(leading_of(own), key=lambda v: abs(v.real))
     if slowest.imag:
         return "the period oscillates about its law near a saddle focus whose leading eigenvalues are complex"
-    limit = Limit("homoclinic", value, error, at.states[0], own, slope, slope_error, 1.0 / abs(slowest.real))
+    limit = Limit("homoclinic", value, error, at.states, own, slope, slope_error, 1.0 / abs(slowest.real))
     return limit if (why := _contradiction(limit, rest)) == "" else why
 
 
@@ -299,23 +303,21 @@ def _contradiction(limit: Limit, rest: float) -> str:
 
 
 def _snic(family: Family, points: Sequence[Point], states: np.ndarray) -> Limit | str | None:
-    """Fit the law of the period near a saddle node on a circle. Return the reason if it fails, None without a fold."""
+    """Fit the law of the period near saddle nodes on a circle. Return the reason if it fails, None without a fold."""
     values, seconds = _laid(points, family)
-    with np.errstate(all="ignore"):
-        fold = _fold(family, values[-1], states) if len(states) else None
-    if fold is None:
+    folds = _folds(family, values[-1], states)
+    if not folds:
         return None
-    state, value, error, expected = fold
-    size = _size(family, states)
-    if scaled_distance(states, state, family.system).min() > NEAR * size:
-        return None
+    state, value, error, _ = folds[0]
+    expected = sum(slope for *_, slope in folds)
     fitted = fit_law(root, values, seconds, [seconds[-1] * np.exp(-0.5 * reach) for reach, _ in WINDOWS])
     if fitted is None:
         return TOO_FAR
     by_law, law_error, slope, slope_error, rest = fitted
     eigenvalues = np.linalg.eigvals(jacobian_at(family.system, state[None], _packed(family, value))[0])
     eigenvalues = eigenvalues[np.lexsort((eigenvalues.imag, -eigenvalues.real))]
-    limit = Limit("snic", value, error, state, eigenvalues, slope, slope_error, expected)
+    places = wrap_angles(np.array([place for place, *_ in folds]), family.system)
+    limit = Limit("snic", value, error, places, eigenvalues, slope, slope_error, expected)
     if why := _contradiction(limit, rest):
         return why
     if abs(by_law - value) > max(3.0 * law_error, AGREES * abs(values[-1] - value)):
@@ -323,12 +325,34 @@ def _snic(family: Family, points: Sequence[Point], states: np.ndarray) -> Limit 
     return limit
 
 
-def _fold(family: Family, value: float, states: np.ndarray) -> tuple[np.ndarray, float, float, float] | None:
-    """Find the fold of equilibria near the slowest state of an orbit by Newton's method.
+Fold = tuple[np.ndarray, float, float, float]
+"""State of a fold of equilibria, its parameter value, the error of this value (the last step), and the slope of the
+period over 1/sqrt(d) [s times the root of the parameter's unit], pi over the root of the normal form's coefficients."""
 
-    Returns the state, the parameter value, its error (the last step), and the slope of the period over 1/sqrt(d) [s
-    times the root of the parameter's unit], pi over the root of the normal form's coefficients; None without a fold.
+
+def _folds(family: Family, value: float, states: np.ndarray) -> list[Fold]:
+    """Find the folds of equilibria on an orbit, given at a parameter value: that at its slowest place, and those at
+    other slow places that happen at the same value.
     """
+    if not len(states):
+        return []
+    system, size, folds = family.system, _size(family, states), list[Fold]()
+    for place in _slow(family, _packed(family, value), states):
+        with np.errstate(all="ignore"):
+            found = _fold(family, value, states[place])
+        is_near = found is not None and scaled_distance(states, found[0], system).min() <= NEAR * size
+        if found is None or not is_near:
+            if not folds:
+                return []
+            continue
+        is_known = any(scaled_distance(found[0], own, system) < NEAR * size for own, *_ in folds)
+        if not folds or (not is_known and abs(found[1] - folds[0][1]) <= SAME_FOLD * family.scales[0]):
+            folds.append(found)
+    return folds
+
+
+def _fold(family: Family, value: float, state: np.ndarray) -> Fold | None:
+    """Find the fold of equilibria near a state by Newton's method; None without a fold."""
     system, n = family.system, family.system.n_states
     scales, unit = np.asarray(system.scales), family.scales[0]
 
@@ -341,7 +365,7 @@ def _fold(family: Family, value: float, states: np.ndarray) -> tuple[np.ndarray,
     def equations(z: np.ndarray) -> np.ndarray:
         return np.concatenate([rates(z), jacobian(z) @ z[n : 2 * n], [start @ z[n : 2 * n] - 1.0]])
 
-    slowest = states[_slow(family, _packed(family, value), states)[0]] / scales
+    slowest = state / scales
     start = np.linalg.svd(jacobian(np.append(slowest, value / unit)))[2][-1]
     z, steps = np.concatenate([slowest, start, [value / unit]]), 1e-6 * np.eye(2 * n + 1)
     for _ in range(20):

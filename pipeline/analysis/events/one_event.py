@@ -37,11 +37,8 @@ def same_as(scene: Scene, named: Sequence[Event]) -> list[int]:
     """
     groups: list[list[int]] = []
     for k, one in enumerate(named):
-        own = next((group for group in groups if any(_is_same(scene, named[i], one) for i in group)), None)
-        if own is None:
-            groups.append([k])
-        else:
-            own.append(k)
+        own = [group for group in groups if any(_is_same(scene, named[i], one) for i in group)]
+        groups = [group for group in groups if group not in own] + [[*(i for group in own for i in group), k]]
     found = [0] * len(named)
     for group in groups:
         lead = min(group, key=lambda k: (_is_seen_from_elsewhere(scene.located, named[k]), k))
@@ -114,12 +111,13 @@ def is_at_one_value(a: Event, b: Event) -> bool:
 
 
 def on_circle(scene: Scene, one: Event, cycle: Event) -> bool:
-    """Tell whether an equilibrium ends, from the other side, in the fold at which a cycle comes to rest."""
+    """Tell whether an equilibrium ends, from the other side, in a fold at which a cycle comes to rest."""
     ds, k = scene.located, one.fate.bifurcation
     if k < 0 or cycle.fate.limit != SNIC or one.rises == cycle.rises or not is_at_one_value(one, cycle):
         return False
-    rest = ds["limit_state"].values[cycle.fate.branch, int(cycle.fate.node > 0)]
-    return bool(geometry_of(scene.attractors).distance(ds["bifurcation_section"].values[k, 0], rest) <= SAME_PLACE)
+    rests = ds["limit_state"].values[cycle.fate.branch, int(cycle.fate.node > 0)]
+    away = geometry_of(scene.attractors).distance(rests, ds["bifurcation_section"].values[k, 0])
+    return bool((away <= SAME_PLACE).any())
 
 
 def are_mirrored(scene: Scene, a: Event, b: Event) -> bool:

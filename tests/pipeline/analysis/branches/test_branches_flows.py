@@ -262,7 +262,7 @@ def test_explore__saddle_node_on_a_circle():
     assert (row["label"], row["type"]) == ("SNIC", "snic")
     assert row["omega"] == pytest.approx(1.0, abs=1e-10)
     (end,) = np.flatnonzero(ds["limit_value"].notnull().values[0])
-    np.testing.assert_allclose(ds["limit_state"].values[0, end], [0.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(ds["limit_state"].values[0, end], [[0.0, 1.0]], atol=1e-8)
     np.testing.assert_allclose(ds["limit_eigenvalue_real"].values[0, end], [0.0, -2.0], atol=1e-6)
     assert ds["limit_slope_expected"].values[0, end] == pytest.approx(np.sqrt(2.0) * np.pi, rel=1e-6)
     assert ds["limit_slope"].values[0, end] == pytest.approx(np.sqrt(2.0) * np.pi, rel=0.01)

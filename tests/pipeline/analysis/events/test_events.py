@@ -18,7 +18,7 @@ from pipeline.analysis.events.analysis import parts_of
 from pipeline.analysis.events.cascades import cascade_of
 from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate, Line, bifurcation_at, crossing_at, follow, lines_of
-from pipeline.analysis.events.one_event import on_circle, with_images
+from pipeline.analysis.events.one_event import on_circle, same_as, with_images
 from pipeline.analysis.events.scene import Event, Stretch
 from pipeline.analysis.ragged import ROW_SIZE
 from pipeline.analysis.sets import Geometry
@@ -211,6 +211,22 @@ def test_events__closed_forms(name, tmp_path):
 
 
 @pytest.mark.slow
+def test_events__two_saddle_nodes_on_a_circle(tmp_path):
+    """th' = I + cos(2 th): both appear at I = 1, and the cycle's period is 2 pi/sqrt(I**2 - 1)."""
+    angle = {"th": {"unit": "rad", "on_circle": True}}
+    model = magpend.model("th' = I + cos(2*th)", name="two-rests", states=angle, I=1.05)
+    section = {"of": "th", "value": 0.3}
+    run = sweep(model, tmp_path, {"th": (-3.0, 3.0)}, {"n_transient": 30}, section=section, I=[0.9, 0.95, 1.05, 1.1])
+    (told,) = [row for row in run.table("events")["sentence"] if "reaches the end" not in row]
+    assert told.startswith("A (equilibrium) ends at I = 1.0000000000 ± ")
+    assert told.endswith("where C (period 1) begins and B (equilibrium) ends too; its cells go on to C")
+    located = run.branches()
+    for name, tolerance in (("limit_slope", 2e-3), ("limit_slope_expected", 1e-6)):
+        (slope,) = located[name].values[np.isfinite(located[name].values)]
+        assert slope == pytest.approx(np.sqrt(2.0) * np.pi, rel=tolerance)
+
+
+@pytest.mark.slow
 def test_events__saddle_node_on_a_circle_at_a_value_of_the_run(tmp_path):
     """th' = I - sin(th): one event at I = 1, where no cell ends on an attractor; cells go on to the cycle."""
     angle = {"th": {"unit": "rad", "on_circle": True}}
@@ -267,7 +283,10 @@ def test_on_circle__compares_values_sides_and_states():
     """A fold elsewhere in space, at the value of a saddle node on a circle, is another event."""
     ds = xr.Dataset({
         "bifurcation_section": (("bifurcation", "phase", "state"), [[[0.0, 1.0]], [[0.0, -1.0]]]),
-        "limit_state": (("branch", "end", "state"), [[[np.nan] * 2] * 2, [[1e-9, 1.0], [np.nan] * 2]]),
+        "limit_state": (
+            ("branch", "end", "rest", "state"),
+            [[[[np.nan] * 2] * 2] * 2, [[[5.0, 0.0], [1e-9, 1.0]], [[np.nan] * 2] * 2]],
+        ),
     })  # fmt: skip
     attractors = xr.Dataset(attrs={"model": magpend.load_model("duffing").name})
     scene = SimpleNamespace(located=ds, attractors=attractors)
@@ -279,6 +298,25 @@ def test_on_circle__compares_values_sides_and_states():
     assert not on_circle(scene, replace(fold, fate=replace(fold.fate, value=1.1)), cycle)
     assert not on_circle(scene, replace(fold, rises=False), cycle)
     assert not on_circle(scene, cycle, fold)
+
+
+def test_same_as__joins_rests_by_the_cycle_on_which_they_lie():
+    """Neither equilibrium is the other one; the cycle that comes last makes one event of all three."""
+    ds = xr.Dataset({
+        "of_branch": ("bifurcation", [0, 2]),
+        "bifurcation_section": (("bifurcation", "phase", "state"), [[[0.0, 1.0]], [[0.0, -1.0]]]),
+        "limit_state": (("branch", "end", "rest", "state"), np.tile([[0.0, 1.0], [0.0, -1.0]], (3, 2, 1, 1))),
+    })  # fmt: skip
+    attractors = xr.Dataset({"attractor": ("set", [0, 1, 2])}, attrs={"model": magpend.load_model("duffing").name})
+    scene = SimpleNamespace(located=ds, attractors=attractors)
+    rests = [
+        Event(Stretch(k, SETS.index("equilibrium"), 0, (0, 1), (k, k)), True, Fate(1.0, 2 * k, 5, k), "snic", 1e-10)
+        for k in (0, 1)
+    ]
+    turns = Stretch(2, 1, 1, (2, 3), (2, 2))
+    cycle = Event(turns, False, Fate(1.0, 1, 0, limit="snic", error=1e-10), "snic", 1e-10)
+    assert same_as(scene, [*rests, cycle]) == [0, 0, 0]
+    assert same_as(scene, rests) == [0, 1]
 
 
 def cut_at(along, up, down):
