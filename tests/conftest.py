@@ -12,6 +12,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,19 @@ def _figures_are_closed() -> Iterator[None]:
     yield
     if pyplot := sys.modules.get("matplotlib.pyplot"):
         pyplot.close("all")
+
+
+def _long_steps() -> Iterator[None]:
+    """Follow branches in steps four times as long as a user's, for tests that do not ask how long steps are."""
+    from pipeline.analysis.branches.arclength import Settings
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Settings, "__init__", partialmethod(Settings.__init__, longest_step=0.02))
+        yield
+
+
+long_steps = pytest.fixture(_long_steps, name="long_steps")
+long_steps_of_a_file = pytest.fixture(_long_steps, scope="module", name="long_steps_of_a_file")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -135,6 +135,7 @@ def test_chatter__is_named_where_nothing_sticks(ball):
     assert found.status[0] != Status.CHATTER
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2])
 def test_ball__one_impact_in_n_periods_begins_and_doubles_where_published(ball, n):
     """Luck and Mehta, Phys. Rev. E 48, 3988 (1993): the fold at n pi (1 - r)/(1 + r), and the doubling."""

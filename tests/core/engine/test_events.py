@@ -164,6 +164,7 @@ def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
     assert "section.longest" in Status.NO_RETURN.sentence
 
 
+@pytest.mark.slow
 def test_section__continues_and_watches_over_a_return():
     section = Crossing("v", 0.0, "down", 40.0)
     whole = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=6, rtol=1e-8)
@@ -376,6 +377,7 @@ def test_switch__of_dry_friction_sticks_and_slips_as_in_closed_form(force, mu, f
         assert (stops > 0) == (force < 2.0)
 
 
+@pytest.mark.slow
 def test_switch__sticks_for_ever_under_a_weak_force():
     found = run_cells(STICK, dry(0.2, 0.5), 0.1, [[0.1, 0.0], [0.0, 1.0]], n_keep=3, n_transient=3)
     assert found.section[0, 0] == pytest.approx(np.tile([0.1, 0.0], (3, 1)), abs=1e-13)
@@ -469,6 +471,7 @@ def test_section__of_a_flow_with_switches_or_impacts():
     assert found.status[0, 0] == Status.NO_RETURN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("r", [0.5, 0.0])
 def test_impact__endless_ones_end_in_a_status(r):
     # bounces add up in finite time; without rebound it is at rest at once

@@ -94,6 +94,7 @@ def test_passed__is_that_of_an_integration_from_event_to_event(values):
         assert state == pytest.approx(expected, abs=2e-8)
 
 
+@pytest.mark.slow
 def test_passed__counts_each_passage_once_at_any_size():
     # cos(t + phase) passes 0 upwards at 3 pi/2 - phase and each turn later; the scale of x is free
     for size in (1e-6, 1.0, 1e6):

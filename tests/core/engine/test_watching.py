@@ -66,6 +66,7 @@ def test_extremes__of_a_linear_oscillator_are_the_closed_forms():
         assert 3.5 < slope < 6.5, kind
 
 
+@pytest.mark.slow
 def test_extremes__of_the_pendulum_are_those_of_its_dense_output():
     # the attractor of period 1 at 2.2 Hz passes the magnets and both joints reverse
     preset, start = load_preset(), [0.2, 0.2, 0.0, 0.0]

@@ -257,6 +257,7 @@ def test_drifting_sections__turns_of_angles_with_corners_among_the_kept_sections
         assert row == pytest.approx(angle(10.0, d) - (first - wrapped), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_drifting_sections__extremes_of_a_moving_parameter():
     """The parameter itself, as a quantity: exact at both ends of each period and between."""
     ramp = linear("A", 0.5, 2.0, start_s=4.0, duration_s=10.0)

@@ -342,6 +342,7 @@ def test_belt__stick_slip_cycle(name, tolerance, library):
         assert found.section[0, 0, :, 0] == pytest.approx(back, abs=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["belt", "belt-stick"])
 def test_belt__rest_and_cycle_are_parted_by_the_unstable_cycle(name, library):
     """1e-3 inside it a state spirals to the rest, as far outside it sticks and slips."""

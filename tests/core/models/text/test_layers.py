@@ -184,6 +184,7 @@ def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d
     assert found.section[0, 0, 0] == pytest.approx(piecewise(levels, 0.2), abs=2e-9)
 
 
+@pytest.mark.slow
 def test_sawtooth__jumps_where_the_period_begins(jumping):
     """x' = phase - x: at time t exactly f (t - 1) + (x0 + f) exp(-t), anew in each period."""
     found = sections(jumping.load(saw=1.0), [0.5], [[0.2]], **{**KEPT, "n_transient": 2})
@@ -298,6 +299,7 @@ def test_sticking__is_exact(rubbing):
     np.testing.assert_allclose(slipped.section[0, 0], [x, v, v], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_sticking__of_two_bodies_on_one_another_is_exact(rubbing):
     """Two masses pulled apart with less than friction can hold move as one: a = (p + q)/(m1 + m2).
 

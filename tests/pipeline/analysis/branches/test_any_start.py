@@ -12,6 +12,8 @@ from pipeline.analysis.branches.completeness import counted_lines
 from pipeline.specification.problems import SpecError
 from tests.core.flows import model_of
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
+
 
 def box_of(**ranges):
     ends = np.array(list(ranges.values()), float)

@@ -15,6 +15,8 @@ from pipeline.runs.drawing import figure
 from pipeline.specification.problems import SpecError
 from tests.pipeline.bautin import SWEEP
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
+
 
 def write_draws(path, g, h):
     """Draws of g and h; m and w are those of the identification, which a run may change."""

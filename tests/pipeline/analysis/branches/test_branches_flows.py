@@ -10,6 +10,7 @@ from scipy.optimize import brentq, fsolve
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import branches_table, table_of, windows_of
+from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, explore
@@ -23,13 +24,14 @@ from tests.core.flows import BAUTIN, HOPF, LORENZ, PAIR, ROSSLER, flow, table
 pytestmark = pytest.mark.slow
 
 
-def followed(equations, of, state, parameter, low, high, *, max_period=1, level=0.0, longest=50.0, **values):
-    """Branches from a limit cycle near a state."""
+def followed(equations, of, state, parameter, low, high, *, max_period=1, level=0.0, longest=50.0, step=0.02, **values):
+    """Branches from a limit cycle near a state, in steps that are as long as the bounds of the test allow."""
     parameters = sectioned(flow(equations), Crossing(of, level, longest=longest)).load(**values)
     model = parameters.model
     family = family_of(model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low)
     start = Start(family, np.array(state, float), parameters[parameter])
-    return dataset_of(explore([start], Scope(low, high, max_period, 2)), parameter, parameters)
+    scope = Scope(low, high, max_period, 2, settings=Settings(longest_step=step))
+    return dataset_of(explore([start], scope), parameter, parameters)
 
 
 def test_explore__fold_of_cycles():
@@ -91,7 +93,7 @@ back: y**2 = x**2 - x**3 is invariant."""
 
 def test_explore__towards_a_homoclinic_orbit():
     """The period is -ln(alpha) over the smaller eigenvalue, 1, and a constant. The end names the saddle."""
-    ds = followed(HOMOCLINIC, "x", [0.5, 0.345], "alpha", -0.1, 0.1, level=0.5, alpha=0.05)
+    ds = followed(HOMOCLINIC, "x", [0.5, 0.345], "alpha", -0.1, 0.1, level=0.5, step=0.005, alpha=0.05)
     alpha, seconds = ds["parameter"].values[0], ds["period_s"].values[0]
     near = alpha < 1e-3
     assert alpha[near].min() < 1e-6
@@ -191,7 +193,7 @@ def test_explore__unstable_cycle_of_lorenz():
     """The cycles end at the origin, at rho = 13.926 (Sparrow 1982). They are unstable, so that the period grows as
     -ln(d) over the smaller eigenvalue, 8/3, which is the stable one.
     """
-    ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 13.0, 16.5, level=10.0, rho=15.9959022)
+    ds = followed(LORENZ, "z", [8.91109, 13.3063, 10.0], "rho", 13.0, 16.5, level=10.0, step=0.01, rho=15.9959022)
     (row,) = [row for row in table_of(ds) if row["type"] == "homoclinic"]
     known = lorenz_loop(13.5, 14.5)
     assert known == pytest.approx(13.926, abs=1e-3)

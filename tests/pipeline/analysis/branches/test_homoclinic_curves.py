@@ -20,7 +20,7 @@ from pipeline.plots.regimes import plot_curves
 from tests.core.flows import LORENZ, flow, table
 from tests.pipeline.analysis.branches.test_branches_flows import followed
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("long_steps_of_a_file")]
 
 
 def family_in(equations, first, second, scales, **values):
@@ -225,7 +225,7 @@ def test_curves_from__homoclinic_orbits_of_a_neuron():
     """From the end of a branch. The fold of the equilibria lies at one current, whatever the rate of w."""
     ds = followed(NEURON, "v", [0.0365, 0.1], "y", 0.06, 0.09, level=0.0365, y=0.075)
     parameters = sectioned(flow(NEURON), Crossing("v", 0.0365, longest=50.0)).load(y=0.075)
-    found = curves_from(ds.isel(bifurcation=slice(0)), parameters, "rate", ((0.06, 0.09), (0.8, 1.6)), 1)
+    found = curves_from(ds.isel(bifurcation=slice(0)), parameters, "rate", ((0.06, 0.09), (0.9, 1.25)), 1)
     (curve,) = [one for one in found if one.kind == "homoclinic"]
     assert at_second(curve, 1.15) == pytest.approx(0.07293069625, abs=1e-9)
     for rate in (1.05, 1.2):

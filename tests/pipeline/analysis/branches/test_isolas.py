@@ -19,10 +19,13 @@ from pipeline.layout.vocabulary import parameters_of
 from tests.pipeline.analysis.cubes import swept
 from tests.pipeline.analysis.response.test_response import cycles_run
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
 OMEGA = 2.0 * np.pi
 EPS, XI, LAM, K = 0.05, 0.4, 0.2, 4.0 / 3.0
 """Mass ratio, dampings and stiffness; the model and eps, lam and k are those of Starosvetsky and Gendelman, J. Sound
 Vib. 315, 2008, 746."""
+SEARCHED = {"isolas": 8, "generations": 0}
+"""Options of the search, the same in all tests, so that its result is computed once."""
 
 
 def sink(tmp_path_factory):
@@ -42,7 +45,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(run):
-    return run.branches(isolas=8)
+    return run.branches(**SEARCHED)
 
 
 class Balance:
@@ -115,7 +118,7 @@ def test_orbits__are_as_many_as_those_of_harmonic_balance(run, found):
     assert (found["index_verdict"] == VERDICTS.index("agrees")).all()
     assert 3 in found["n_orbits"]
     # cells at rest do not lead there: without a search there is no isola
-    assert isolas_of(run.branches()) == []
+    assert isolas_of(run.branches(generations=0)) == []
     assert len(isolas_of(found)) == 1
 
 
@@ -153,8 +156,8 @@ def test_cut_isola__is_detached_within_the_interval(run, found):
 @pytest.mark.slow
 def test_fold_curve__holds_the_isola_from_its_birth_on(run):
     """The curve of its folds in the plane of frequency and force has its least force where the isola is born."""
-    plane = {"second": "A", "second_low": 0.55, "second_high": 0.8, "isolas": 8, "generations": 0}
-    curves = run.curves(**plane)
+    plane = {"second": "A", "second_low": 0.55, "second_high": 0.8}
+    curves = run.curves(**plane, **SEARCHED)
     balance = Balance(np.arange(8))
     nearest = min(range(curves.sizes["curve"]), key=lambda i: float(np.nanmin(curves["first"][i])))
     f, force = (curves[name].values[nearest] for name in ("first", "second"))
@@ -193,11 +196,11 @@ def test_deflation__needs_fewer_starts(run, monkeypatch):
 
 @pytest.mark.slow
 def test_response__names_the_isola(run):
-    response = run.response(isolas=8)
+    response = run.response(**SEARCHED)
     table = response_table(response)
     assert [line for line in table.lines if line.endswith("isola")]
     assert {row["isola"] for row in table.rows} == {False, True}
-    upper, _ = run.plot.response(isolas=8)
+    upper, _ = run.plot.response(**SEARCHED)
     assert [text.get_text() for text in upper.texts].count("isola") == 1
 
 
@@ -207,7 +210,7 @@ def test_index_sums__per_row_of_a_run(tmp_path):
     model = magpend.model("x'' = -0.1*x' - x - b*x**3 + 0.3*cos(2*pi*f*t)", name="spring", b=1.0)
     axes = {"b": [-0.3, 1.0], "frequency_hz": (1.05 / OMEGA, 2.0 / OMEGA, 4)}
     run = swept(model, tmp_path / "run", {"x": (-3, 3), "x_dot": (-3, 3)}, (300, 4), **axes)
-    ds = run.branches(parameter="frequency_hz", isolas=2)
+    ds = run.branches(parameter="frequency_hz", max_period=1, isolas=2)
     words = [VERDICTS[code] for code in ds["index_verdict"].values[:, 0]]
     assert ds["searched_b"].values.tolist() == [-0.3, -0.3, 1.0, 1.0]
     assert words == ["diverged", "diverged", "agrees", "agrees"]
@@ -219,7 +222,7 @@ def test_index_sums__per_row_of_a_run(tmp_path):
 @pytest.mark.slow
 def test_flow__cycles_but_no_equilibria(tmp_path):
     """r' = r (mu + r^2 - r^4): two cycles from mu = -1/4 to 0, one beyond; the equilibrium lies on the section too."""
-    ds = cycles_run(tmp_path).branches(isolas=3)
+    ds = cycles_run(tmp_path).branches(max_period=1, isolas=3)
     assert ds["n_orbits"].values[:, 0].tolist() == [2, 2, 1]
     assert {VERDICTS[code] for code in ds["index_verdict"].values.ravel()} == {"flow"}
     assert sorted(ds["orbit_period"].values.tolist()) == [0, 1]
@@ -230,7 +233,8 @@ def test_index_sums__on_a_circle(tmp_path):
     """A pendulum hangs or stands: two orbits, whose indices add up to the Euler characteristic of a cylinder, 0."""
     states = {"th": {"unit": "rad", "on_circle": True}}
     model = magpend.model("th'' = -0.5*th' - sin(th) + 0.1*cos(2*pi*f*t)", name="pendulum", states=states)
-    ds = swept(model, tmp_path / "run", [(0.1, 0.0)], (100, 4), frequency_hz=(0.3, 0.5, 3)).branches(isolas=2)
+    run = swept(model, tmp_path / "run", [(0.1, 0.0)], (100, 4), frequency_hz=(0.3, 0.5, 3))
+    ds = run.branches(max_period=1, isolas=2)
     assert ds["n_orbits"].values[:, 0].tolist() == [2, 2]
     assert ds["index_sum"].values[:, 0].tolist() == [0, 0]
     assert (ds["index_verdict"] == VERDICTS.index("agrees")).all()

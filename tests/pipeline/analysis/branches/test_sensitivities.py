@@ -20,10 +20,11 @@ from tests.pipeline.analysis.branches.test_bands import write_draws
 from tests.pipeline.analysis.cubes import swept
 from tests.pipeline.bautin import SWEEP, TRUTH
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
 OMEGA = 2.0 * np.pi
 
 
-def followed(model, parameter, interval, state, value, *, period=0, max_period=2, step=5e-3, hertz=1.0, **overrides):
+def followed(model, parameter, interval, state, value, *, period=0, max_period=2, step=0.02, hertz=1.0, **overrides):
     """Return the branches from one equilibrium or orbit of a model, and the parameters."""
     parameters, (low, high) = model.load(**overrides), interval
     family = Family(model.system, period, hertz, parameters.pack(), (parameter,), (high - low,))

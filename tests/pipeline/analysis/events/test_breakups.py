@@ -30,6 +30,7 @@ def sweep(model, folder, starts, **axis):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 def test_events__break_up_at_a_border_collision(tmp_path):
     starts = {"x": (0.5, 1.5), "y": (-1.0, 1.0), "z": (-0.1, 0.1)}
     table = sweep(BORDER, tmp_path, starts, mu=[-0.05, 0.08]).table("events")
@@ -51,6 +52,7 @@ def largest_exponents(a, n=6000, skip=4000):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 def test_events__locking_between_a_torus_and_chaos(tmp_path):
     """The torus of the delayed logistic map is locked before it is chaotic (Aronson, Chory, Hall and McGehee, Commun.
     Math. Phys. 83, 1982, 303), for the first time as 1/7.

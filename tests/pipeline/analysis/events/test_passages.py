@@ -78,6 +78,7 @@ def locked(force):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 def test_events__tongue_of_stuart_landau(tmp_path):
     starts = {"x": (-1, 1), "y": (-1, 1)}
     run = sweep(
@@ -117,6 +118,7 @@ TONGUES = {
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 @pytest.mark.parametrize("tongue", TONGUES)
 def test_events__tongues_of_van_der_pol(tongue, tmp_path):
     (mu, force, period), values, folds = TONGUES[tongue]
@@ -186,6 +188,7 @@ def second_touch(zeta=0.1, w=0.9, r=0.7):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 def test_events__grazing_of_the_impact_oscillator(tmp_path):
     """The linear oscillator touches the stop where its amplitude equals the gap; orbits with an impact touch again."""
     model = magpend.load_model("impact")
