@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.analysis.noise.exits import PointCells
 from pipeline.analysis.ragged import ROW_SIZE
+from pipeline.analysis.transfer import analysis
 from pipeline.analysis.transfer.analysis import (
     Pairs,
     Sets,
@@ -58,8 +59,13 @@ def test_needs_pairs__refuses(run, options, words) -> None:
         needs_pairs(run, TransferOptions(**options))
 
 
-def test_needs_pairs__takes_the_start_as_first_section_of_a_run_without_transient() -> None:
-    needs_pairs(run_of(n_transient=0, n_keep=1), TransferOptions())
+def test_needs_pairs__takes_the_start_as_first_section_of_a_run_without_transient(monkeypatch) -> None:
+    run, starts = run_of(n_transient=0, n_keep=1), np.array([[3.0, 4.0], [5.0, 6.0]])
+    monkeypatch.setattr(analysis, "inputs_at", lambda *given: SimpleNamespace(initial_states=starts))
+    needs_pairs(run, TransferOptions())  # the one section that is kept has a pair
+    found = pairs_of(run, PointCells({}, {}, starts[:, None] - 2.0, np.zeros(2, int), np.ones(2, int)), [0, 1])
+    np.testing.assert_array_equal(found.before, starts)
+    np.testing.assert_array_equal(found.after, starts - 2.0)
 
 
 def test_pairs_of__cells_that_diverged_count_in_their_first_step_only() -> None:
