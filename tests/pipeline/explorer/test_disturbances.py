@@ -89,6 +89,7 @@ def test_edges__are_orbits_at_their_own_point(wells):
     assert beside["notes"] == [f"edge states are not computed here: {command}"]
 
 
+@pytest.mark.slow
 def test_disturbances__refuse_an_index_off_the_axis(wells):
     with pytest.raises(RequestError, match="out of bounds"):
         disturbances(wells, {"amplitude": 2})
@@ -163,6 +164,7 @@ def test_noisy_start__without_noise_is_the_plain_one(watcher):
     assert noisy(watcher, noise=0.0)[0]["attractor"] is not None
 
 
+@pytest.mark.slow
 def test_noisy_start__is_refused_in_a_sentence(watcher, monkeypatch):
     assert "noise" in noisy(watcher, noise=-1.0)[0]["error"]
     assert "seed" in noisy(watcher, noise=0.1, seed=-1)[0]["error"]
@@ -170,6 +172,7 @@ def test_noisy_start__is_refused_in_a_sentence(watcher, monkeypatch):
     assert "too few for this motion" in noisy(watcher, noise=0.1)[0]["error"]
 
 
+@pytest.mark.slow
 def test_noisy_start__takes_shorter_steps_where_it_must(watcher, monkeypatch):
     plain = noisy(watcher, noise=0.05, periods=1)[0]
     monkeypatch.setattr(starting, "TOLERANCE", plain["step_error"] / 1.5)

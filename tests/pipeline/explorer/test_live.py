@@ -65,14 +65,17 @@ def test_follow__period_of_a_cell_is_that_of_its_attractor(little):
 def directories(tmp_path_factory):
     """Runs of a driven system, one of which stops when closed, and of a flow, with their attractors."""
     folder = tmp_path_factory.mktemp("live")
-    found = {
-        "whole": finished(folder / "whole", DRIVEN % (120, "false")),
-        "closing": finished(folder / "closing", DRIVEN % (200, "true")),
-        "flow": finished(folder / "flow", FLOW),
-    }
-    for directory in found.values():
-        derive(directory, "attractors")
-    return found
+    texts = {"whole": DRIVEN % (120, "false"), "closing": DRIVEN % (200, "true"), "flow": FLOW}
+
+    class Made(dict):
+        """Each run is made when it is asked for."""
+
+        def __missing__(self, name):
+            self[name] = finished(folder / name, texts[name])
+            derive(self[name], "attractors")
+            return self[name]
+
+    return Made()
 
 
 def start_of(cube, at):

@@ -82,6 +82,7 @@ def test_curve_orbit__by_another_integrator(bent):
     assert end == pytest.approx(states[0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_curve_orbit__what_is_not_there(bent):
     line, plane = bent
     with pytest.raises(RequestError, match="curve = 99"):

@@ -326,6 +326,7 @@ def test_compare__refuses_other_data(bench, tmp_path):
         compare([folder / "out", tmp_path / "other"])
 
 
+@pytest.mark.slow
 def test_identify__what_the_model_lacks_is_found_in_the_residuals(without_cubic):
     """The residuals of a law that lacks something are autocorrelated, and the intervals say so."""
     result = d.read_result(without_cubic)

@@ -35,6 +35,7 @@ def test_draw_curves__data_are_readings_and_bumps(outcome, figures):
     np.testing.assert_allclose(row["bump"], expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_draw_numbers__the_joint_law_is_that_of_the_readings(figures):
     data = figures["fig7"].data
     locked = np.radians(data["fine_locked"].values)
@@ -44,6 +45,7 @@ def test_draw_numbers__the_joint_law_is_that_of_the_readings(figures):
     assert data.sizes["curve"] == 18
 
 
+@pytest.mark.slow
 def test_draw_map__is_the_models_torque(figures):
     data = figures["fig8"].data
     p = load_model("pendulum").load(**TRUE)
@@ -53,6 +55,7 @@ def test_draw_map__is_the_models_torque(figures):
     np.testing.assert_allclose(data["transition"], np.degrees(line.slope * locked + line.offset), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_draw_comparison__what_is_left_over_is_readings_less_models(outcome, figures):
     data = figures["fig9"].data
     assert np.abs(data["left_by_fit"]).max() < 1e-8

@@ -109,6 +109,7 @@ def test_measured_steps__bad_input_exits_with_2(main, files, change, says):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_measured__what_does_not_fit_is_refused_before_anything_is_read(main, files, run_directory, tmp_path):
     sine, rig = files / "sine.toml", files / "rig.toml"
     sine.write_text(rig.read_text().replace('"pendulum"', '"pendulum-sine"', 1), "utf-8")

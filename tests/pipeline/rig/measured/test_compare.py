@@ -86,6 +86,7 @@ def test_compare__the_winner_is_the_attractor_that_the_rig_was_on(compared, run_
     assert (compared["runner_up"].values > 20 * compared["noise_floor"].values).all()
 
 
+@pytest.mark.slow
 def test_compare__the_true_model_is_a_noise_floor_away(compared):
     """Away from the doubling, where both settle slowly: about 1, with the polynomials' bias up to 2."""
     settled = np.isin(np.round(compared["frequency"].values, 2), [2.46, 2.54])
