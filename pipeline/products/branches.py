@@ -122,7 +122,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=10,
+    version=11,
 )
 
 CURVES = Analysis(

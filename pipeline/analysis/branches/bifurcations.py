@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, TORUS
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import OneParameter, Problem, doubling_test, hopf_test, torus_test
+from pipeline.analysis.branches.problems import FollowedProblem, Problem, doubling_test, hopf_test, torus_product
 
 CONTRADICTORY = "contradictory"
 """Criticality of a period doubling or pitchfork whose coefficient and whose other branch disagree."""
@@ -47,7 +47,7 @@ def multipliers_of(point: Point) -> np.ndarray:
     """Return the Floquet multipliers by falling modulus, shape (state,); NaN for an equilibrium."""
     if point.value.is_rest:
         return np.full(len(point.value.monodromy), complex(np.nan, np.nan))
-    found = np.linalg.eigvals(point.value.monodromy)
+    found = point.value.multipliers
     return found[np.argsort(-np.abs(found), kind="stable")]
 
 
@@ -55,22 +55,22 @@ def eigenvalues_of(point: Point) -> np.ndarray:
     """Return the eigenvalues of an equilibrium by falling real part [1/s], shape (state,); NaN for an orbit."""
     if not point.value.is_rest:
         return np.full(len(point.value.monodromy), complex(np.nan, np.nan))
-    found = np.linalg.eigvals(point.value.monodromy)
+    found = point.value.multipliers
     return found[np.lexsort((found.imag, -found.real))]
 
 
 def n_unstable(point: Point) -> int:
     """Count the multipliers outside the unit circle, or the eigenvalues with positive real parts."""
     if point.value.is_rest:
-        return int((np.linalg.eigvals(point.value.monodromy).real > 0.0).sum())
-    return int((np.abs(np.linalg.eigvals(point.value.monodromy)) > 1.0).sum())
+        return int((point.value.multipliers.real > 0.0).sum())
+    return int((np.abs(point.value.multipliers) > 1.0).sum())
 
 
 def _margin(point: Point) -> float:
     """Return the distance of the nearest multiplier from the unit circle, or of an eigenvalue from the imaginary axis,
     relative to the largest one.
     """
-    values = np.linalg.eigvals(point.value.monodromy)
+    values = point.value.multipliers
     if point.value.is_rest:
         return float(np.abs(values.real).min() / max(np.abs(values).max(), np.finfo(float).tiny))
     return float(np.abs(np.abs(values) - 1.0).min())
@@ -88,7 +88,7 @@ def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
 TESTS: dict[str, Test] = {
     FOLD: lambda point: float(point.tangent[-1]),
     DOUBLING: _of_orbits(doubling_test),
-    TORUS: _of_orbits(torus_test),
+    TORUS: lambda point: 1.0 if point.value.is_rest else torus_product(point.value.multipliers),
     BRANCHING: _branching_test,
     HOPF: lambda point: hopf_test(point.value.monodromy) if point.value.is_rest else 1.0,
 }
@@ -144,7 +144,7 @@ _CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1, HOPF: 2}
 class Watch:
     """Detector of bifurcations between successive points of a branch; it stores the located bifurcations."""
 
-    problem: OneParameter
+    problem: FollowedProblem
     settings: Settings
     skip_first: bool = False
     found: list[Bifurcation] = field(default_factory=list)
@@ -222,7 +222,7 @@ def _explains(kinds: list[str], change: int) -> bool:
 
 
 def locate(
-    problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings, shifts: Sequence[float] = (0.0,)
+    problem: FollowedProblem, a: Point, b: Point, kind: str, settings: Settings, shifts: Sequence[float] = (0.0,)
 ) -> Steps[Bifurcation | None]:
     """Locate the bifurcation between two points of a branch where its test function vanishes; None if Newton's method
     fails, also at the `shifts` of its guesses.
@@ -339,7 +339,7 @@ def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int
 def _beyond(one: Bifurcation, point: Point, count: int) -> int:
     """Return the number of unstable multipliers on the other side of a bifurcation, from a point on one side."""
     change = _CHANGES.get(one.kind, 1)
-    values = np.linalg.eigvals(point.value.monodromy)
+    values = point.value.multipliers
     critical = values[np.argmin(np.abs(values - one.critical_multiplier))]
     is_unstable = critical.real > 0.0 if point.value.is_rest else abs(critical) > 1.0
     return count - change if is_unstable else count + change

@@ -14,6 +14,7 @@ from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstab
 from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem, Problem
+from pipeline.analysis.branches.steep_orbits import CutProblem, cut_where_steep, is_steep, is_steeper, whole_orbit
 from pipeline.analysis.branches.strobe import other_side
 
 ENDS = (
@@ -39,6 +40,19 @@ ACROSS = 100.0
 NEAR_HALF, PASSED = 0.2, 4.0
 """Largest distance between an orbit's section points half a period apart, at two neighbouring points of a branch, at
 which the branch may pass through the orbit of half the period: scaled, and in units of the step between the two."""
+
+_MORE_CUTS = "more_cuts"
+"""End of a part of a branch of cut orbits, where they need more cuts."""
+
+STEEPER = 6.0
+"""Natural logarithm of the factor by which the period's slope along the branch rises, if the period grows."""
+
+KEEPS_GROWING = 0.6
+"""Least growth of the period over the second half of this rise, in units of that over the first half.
+
+Towards a homoclinic orbit both are equal, since the period grows by the same time whenever the distance in the
+parameter halves. Towards an end with a finite period, as at a square root, the second is many times less.
+"""
 
 REST = 0.5
 """At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""
@@ -205,9 +219,15 @@ def half_branch(
     found = yield from trace(
         problem, start, settings, stop, watch.between, lambda here: beyond_strobe(problem, here, settings)
     )
+    steep = yield from _past_steep(family, found, watch, stop, settings)
     n_last = len(found.points) - 2
     if found.end == "bound":
-        yield from _cut(problem, found, low, high, settings)
+        own: Problem = problem if steep is None else steep[0]
+        before, beyond = found.points[-2:] if steep is None else steep[1]
+        on_it = yield from _cut(own, family, before, beyond, (low, high), settings)
+        found.points.pop()
+        if on_it is not None:
+            found.points.append(on_it if steep is None else steep[0].plain(on_it))
         inside = [low <= family.values(b.point.u)[0] <= high for b in watch.found]
         watch.found = [b for b, good in zip(watch.found, inside, strict=True) if good]
     elif found.end == "equilibrium":
@@ -221,6 +241,82 @@ def half_branch(
         # the last step repeats the first one
         watch.found = [b for b in watch.found if b.after < n_last or not _is_known(b, watch.found)]
     return Half(found, watch.found)
+
+
+def _past_steep(
+    family: Family, found: Trace, watch: Watch, stop: _Stop, settings: Settings
+) -> Steps[tuple[CutProblem, list[Point]] | None]:
+    """Follow a branch on by multiple shooting where it is stuck since its orbits are steep; in place.
+
+    Returns the last equations with the last points in their unknowns; None if the branch is not followed on.
+    """
+    last: tuple[CutProblem, list[Point]] | None = None
+    is_cut = found.end == "stuck" and is_steep(found.points[-1], family) and not _nears_rest(found.points)
+    while is_cut:
+        problem, u = whole_orbit(family, found.points[-1]) if last is None else (last[0], last[1][-1].u)
+        cut = yield from cut_where_steep(problem, u, found.points[-1].tangent, settings)
+        found.end = "stuck"
+        if cut is None:
+            break
+        problem, start = cut
+        own = Watch(problem, settings, n_steps=len(found.points) - 1)
+        rest = replace(settings, max_points=settings.max_points - len(found.points) + 1)
+        piece = yield from trace(problem, start, rest, _StopCut(problem, stop, found.points), own.between)
+        found.end, is_cut = piece.end.replace(_MORE_CUTS, "stuck"), piece.end == _MORE_CUTS
+        watch.found += [replace(one, point=problem.plain(one.point)) for one in own.found]
+        last = problem, piece.points[-2:]
+    return last
+
+
+@dataclass(frozen=True, eq=False)
+class _StopCut:
+    """Rule that ends a part of a branch whose orbits are cut, as `stop` does or where they need more cuts.
+
+    It adds the points to `points`, those of the branch so far in the unknowns of `OrbitProblem`.
+    """
+
+    problem: CutProblem
+    stop: _Stop
+    points: list[Point]
+
+    def __call__(self, points: list[Point]) -> str:
+        self.points.append(self.problem.plain(points[-1]))
+        end = self.stop(self.points) or ("stuck" if _nears_rest(self.points) else "")
+        return end or (_MORE_CUTS if is_steeper(points[-1]) else "")
+
+
+def _nears_rest(points: list[Point]) -> bool:
+    """Return whether the period grows without bound towards the end of a branch: no cuts lead on."""
+    return grows_without_bound(np.array([p.u for p in points]), np.array([p.value.seconds for p in points]))
+
+
+def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
+    """Return whether the period grows towards the end of a branch as it does towards infinity.
+
+    The slope of the period along the branch must rise towards the end, by the factor exp(`STEEPER`) at least, and
+    the growth that this takes must not fade (`KEEPS_GROWING`).
+
+    Parameters
+    ----------
+    unknowns
+        Section points and parameter values, scaled, shape (point, unknown), in order to the end.
+    seconds
+        Period at the points, shape (point,) [s].
+    """
+    growth, middle = np.diff(seconds), 0.5 * (seconds[1:] + seconds[:-1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steepness = np.log(growth / np.linalg.norm(np.diff(unknowns, axis=0), axis=1))
+    rises = np.isfinite(steepness) & (growth > 0.0)
+    rises[:-1] &= steepness[1:] > steepness[:-1]
+    first = len(rises) - int(np.argmin(np.append(rises[::-1], False)))
+    steepness, middle = steepness[first:], middle[first:]
+    far = np.flatnonzero(steepness[-1:] - steepness >= STEEPER)
+    if len(steepness) < 3 or not len(far):
+        return False
+    begin = min(int(far[-1]), len(steepness) - 3)
+    ends = np.array([steepness[begin], 0.5 * (steepness[begin] + steepness[-1]), steepness[-1]])
+    first_half, second_half = np.diff(np.interp(ends, steepness, middle))
+    return bool(second_half >= KEEPS_GROWING * first_half)
 
 
 def beyond_strobe(problem: OneParameter, here: Point, settings: Settings) -> Steps[tuple[Point, Point] | None]:
@@ -256,10 +352,13 @@ def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
     )
 
 
-def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
-    """Replace the last point of a branch, which is beyond a parameter bound, by the solution on the bound."""
-    family = problem.family
-    before, beyond = found.points[-2:]
+def _cut(
+    problem: Problem, family: Family, before: Point, beyond: Point, bounds: tuple[float, float], settings: Settings
+) -> Steps[Point | None]:
+    """Return the solution on a parameter bound, between a point and the next one, which is beyond the bound; None if
+    it is the first of them, or Newton's method fails.
+    """
+    low, high = bounds
     values = [family.values(p.u)[0] for p in (before, beyond)]
     bound = low if values[1] < low else high
     share = (bound - values[0]) / (values[1] - values[0])
@@ -268,9 +367,7 @@ def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings:
     guess = before.u + share * (beyond.u - before.u)
     guess[-1] = bound / family.scales[0]
     on_it = yield from correct(problem, guess, normal, settings, along=before.tangent)
-    found.points.pop()
-    if on_it is not None and share > 1e-9:
-        found.points.append(on_it)
+    return on_it if share > 1e-9 else None
 
 
 def joined(family: Family, backward: Half, forward: Half) -> Branch:

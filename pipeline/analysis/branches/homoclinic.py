@@ -24,7 +24,6 @@ from scipy.linalg import expm, schur
 from scipy.optimize import brentq
 
 from magpend_core.engine.system import System
-from magpend_core.engine.variational import with_tangents
 from magpend_core.equilibria import find_equilibria
 from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
@@ -33,6 +32,7 @@ from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Rows, Value
+from pipeline.analysis.branches.steep_orbits import flown
 from pipeline.analysis.tolerances import BRANCH_RTOL
 
 SETTINGS = Settings(first_step=5e-3, longest_step=0.04, max_points=400, tolerance=1e-9, max_iterations=8)
@@ -153,7 +153,7 @@ class HomoclinicProblem:
         shifts = self._step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         unknowns = [np.column_stack([parts.nodes[:-1], np.tile(parts.values + s, (m, 1))]) for s in shifts]
         rows = self.family.rows(np.concatenate(unknowns))
-        images, tangents = flown(self.family, rows, parts.seconds / m, self.atol)
+        images, tangents = flown(self.family, rows, np.full(5 * m, parts.seconds / m), self.atol)
         images = (images / scales).reshape(5, m, n)
         here = self.family.rows(np.append(parts.nodes[0], parts.values)[None]).parameters[0]
         speeds = rates_at(self.system, images[0] * scales, here) / scales
@@ -217,21 +217,6 @@ class HomoclinicProblem:
         by[:, -2] = (rates[1] - rates[2]) / (2.0 * self._step)
         by[:, -1] = (rates[3] - rates[4]) / (2.0 * self._step)
         return rates[0] * self.unit / self.radius, by * self.unit / self.radius, jacobian
-
-
-def flown(family: Family, rows: Rows, seconds: float, atol: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return states after a time, shape (m, n_states), and their derivatives by the start, (m, n_states, n_states)."""
-    states = rows.states
-    n, sizes = family.system.n_states, np.asarray(family.system.sizes)
-    system = replace(with_tangents(family.system, n), n_controlled=None)
-    starts = np.concatenate([states, np.tile(np.diag(sizes).ravel(), (len(states), 1))], axis=1)
-    drive = Drive(np.array([seconds]))
-    which = np.zeros(len(states), np.int64)
-    found = sample(
-        system, rows.parameters, starts, [np.array([seconds])], piece=which, drives=[drive], rtol=BRANCH_RTOL, atol=atol
-    )
-    ends = found.states[:, 0]
-    return ends[:, :n], ends[:, n:].reshape(-1, n, n).transpose(0, 2, 1) / sizes
 
 
 def left_spaces(family: Family, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -29,21 +29,11 @@ from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.following import Branch, Limit, leading_of, opposite, problem_of
+from pipeline.analysis.branches.following import Branch, Limit, grows_without_bound, leading_of, opposite, problem_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.vocabulary import parameter_name
-
-STEEPER = 6.0
-"""Natural logarithm of the factor by which the period's slope along the branch rises, if the period grows."""
-
-KEEPS_GROWING = 0.6
-"""Least growth of the period over the second half of this rise, in units of that over the first half.
-
-Towards a homoclinic orbit both are equal, since the period grows by the same time whenever the distance in the
-parameter halves. Towards an end with a finite period, as at a square root, the second is many times less.
-"""
 
 NEAR = 0.05
 """Largest distance of an equilibrium that is near to an orbit, in units of the orbit's size."""
@@ -68,35 +58,6 @@ LEAST_RANGE = 2.5
 """Least natural logarithm of the first range of distances, if it is to confirm a law."""
 
 TOO_FAR = "the last points are too few, or too far from a limit, to confirm a law of the period"
-
-
-def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
-    """Return whether the period grows towards the end of a branch as it does towards infinity.
-
-    The slope of the period along the branch must rise towards the end, by the factor exp(`STEEPER`) at least, and
-    the growth that this takes must not fade (`KEEPS_GROWING`).
-
-    Parameters
-    ----------
-    unknowns
-        Section points and parameter values, scaled, shape (point, unknown), in order to the end.
-    seconds
-        Period at the points, shape (point,) [s].
-    """
-    growth, middle = np.diff(seconds), 0.5 * (seconds[1:] + seconds[:-1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steepness = np.log(growth / np.linalg.norm(np.diff(unknowns, axis=0), axis=1))
-    rises = np.isfinite(steepness) & (growth > 0.0)
-    rises[:-1] &= steepness[1:] > steepness[:-1]
-    first = len(rises) - int(np.argmin(np.append(rises[::-1], False)))
-    steepness, middle = steepness[first:], middle[first:]
-    far = np.flatnonzero(steepness[-1:] - steepness >= STEEPER)
-    if len(steepness) < 3 or not len(far):
-        return False
-    begin = min(int(far[-1]), len(steepness) - 3)
-    ends = np.array([steepness[begin], 0.5 * (steepness[begin] + steepness[-1]), steepness[-1]])
-    first_half, second_half = np.diff(np.interp(ends, steepness, middle))
-    return bool(second_half >= KEEPS_GROWING * first_half)
 
 
 def towards(branch: Branch, end: int) -> list[Point]:

@@ -81,7 +81,8 @@ class Value:
     orbit.
 
     `images` are the orbit's sections, `monodromy` its monodromy matrix, `seconds` its period [s]. For an
-    equilibrium (`is_rest`) they are its state, the Jacobian [1/s] and NaN.
+    equilibrium (`is_rest`) they are its state, the Jacobian [1/s] and NaN. `graded` are multipliers with more digits
+    than the matrix holds, if they are known.
     """
 
     residual: np.ndarray
@@ -90,6 +91,12 @@ class Value:
     monodromy: np.ndarray
     seconds: float = np.nan
     is_rest: bool = False
+    graded: np.ndarray | None = None
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Floquet multipliers, or the eigenvalues of an equilibrium [1/s], in no order."""
+        return np.linalg.eigvals(self.monodromy) if self.graded is None else self.graded
 
     @property
     def is_finite(self) -> bool:
@@ -332,12 +339,16 @@ def doubling_test(monodromy: np.ndarray) -> float:
 
 
 def torus_test(monodromy: np.ndarray) -> float:
+    """Compute the test function of `torus_product` from the monodromy matrix M."""
+    return torus_product(np.linalg.eigvals(monodromy))
+
+
+def torus_product(multipliers: np.ndarray) -> float:
     """Compute the product of ``mu_i * mu_j - 1`` over all pairs of multipliers; it is zero at a torus bifurcation.
 
     The determinant of the bialternate product of M with itself, minus 1 (Kuznetsov, Elements of Applied
     Bifurcation Theory, 3rd ed., 2004, Sect. 10.2.2).
     """
-    multipliers = np.linalg.eigvals(monodromy)
     pairs = [multipliers[i] * multipliers[j] - 1.0 for i, j in combinations(range(len(multipliers)), 2)]
     return float(np.prod(pairs).real)
 
@@ -424,6 +435,14 @@ class EquilibriumProblem(FamilyProblem):
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))
             self._unit = 1.0 / norm if norm > 0.0 and np.isfinite(norm) else 1.0
         return self._unit
+
+
+class FollowedProblem(Problem, Protocol):
+    """Equations of the orbits of a family, whose solutions are a branch."""
+
+    @property
+    def family(self) -> Family:
+        """Family of the orbits."""
 
 
 OneParameter = OrbitProblem | EquilibriumProblem

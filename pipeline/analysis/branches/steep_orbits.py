@@ -1,0 +1,328 @@
+"""Follow steep limit cycles by multiple shooting.
+
+Where the tangents of a limit cycle grow by many orders over one period, an error of its section point grows as well,
+and rounding decides whether the image comes back to the point. So the orbit is cut into segments, on each of which
+tangents grow little. With nodes x_1 ... x_m in scaled states, the durations T_j of the returns to the section, and the
+segments' shares s_k of these, the equations are
+
+* phi(x_k, s_k T_j) = x_(k+1): the flow joins the nodes, and the last one to the first;
+* the first node of each return lies on the section.
+
+The unknowns are the nodes, the durations and the parameter. Multipliers are those of the product of the segments'
+derivatives, which is never multiplied out: it is kept as triangular factors, so that the small multipliers have as many
+digits as the large ones (see `graded_multipliers`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from magpend_core.engine.system import System
+from magpend_core.engine.variational import with_tangents
+from magpend_core.orbits import crossed_state, on_section_derivative, wrap_angles
+from magpend_core.pointwise import rates_packed
+from magpend_core.precision import tolerances_at
+from magpend_core.sampling import Drive, sample
+from magpend_core.sizes import LEVEL
+from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
+from pipeline.analysis.branches.lockstep import Query, Steps, integrated
+from pipeline.analysis.branches.problems import ONE_SIDED_STEP, Ends, Family, Rows, Value
+from pipeline.analysis.tolerances import BRANCH_RTOL
+
+
+@dataclass(frozen=True)
+class CutSettings:
+    """Settings of the cuts of an orbit."""
+
+    steep: float = 1e4  # norm of the scaled monodromy matrix from which an orbit may be cut
+    # norms of a segment's derivative, in units of the orbit's extents: above the first it is halved, and above the
+    # second all are looked at again; more growth makes fewer segments, from which Newton's method converges less far
+    growth: float = 20.0
+    most_growth: float = 200.0
+    least_segments: int = 16
+    most_segments: int = 400
+    sweeps: int = 12  # most sweeps of `graded_multipliers`; each separates moduli by their ratio
+    separated: float = 1e-8  # part of one subspace in the next at which the multipliers of both are told apart
+
+
+CUTS = CutSettings()
+
+
+def is_steep(point: Point, family: Family) -> bool:
+    """Return whether a limit cycle of a flow is too steep for shooting over its whole period."""
+    if not family.period or crossed_state(family.system) is None:
+        return False
+    return bool(np.linalg.norm(family.scaled(point.value.monodromy), 2) > CUTS.steep)
+
+
+def is_steeper(point: Point) -> bool:
+    """Return whether a cut orbit needs more cuts."""
+    assert isinstance(point.value, CutValue)
+    return bool(point.value.steepest.max() > CUTS.most_growth)
+
+
+def flown(family: Family, rows: Rows, seconds: np.ndarray, atol: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return states after a time each, shape (m, n_states), and their derivatives by the start, (m, n_states,
+    n_states).
+    """
+    states = rows.states
+    n, sizes = family.system.n_states, np.asarray(family.system.sizes)
+    system = replace(with_tangents(family.system, n), n_controlled=None)
+    starts = np.concatenate([states, np.tile(np.diag(sizes).ravel(), (len(states), 1))], axis=1)
+    times, which = np.unique(seconds, return_inverse=True)
+    found = sample(
+        system,
+        rows.parameters,
+        starts,
+        [np.array([time]) for time in times],
+        piece=which,
+        drives=[Drive(np.array([time])) for time in times],
+        rtol=BRANCH_RTOL,
+        atol=atol,
+    )
+    ends = found.states[:, 0]
+    return ends[:, :n], ends[:, n:].reshape(-1, n, n).transpose(0, 2, 1) / sizes
+
+
+@dataclass(frozen=True, eq=False)
+class CutValue(Value):
+    """Value of the equations of a cut orbit, with its segments: their first nodes (m, n), their derivatives by these
+    (m, n, n) and by the parameter (m, n), and the rates at the nodes (m, n), all scaled.
+    """
+
+    nodes: np.ndarray = None  # type: ignore[assignment]
+    tangents: np.ndarray = None  # type: ignore[assignment]
+    slopes: np.ndarray = None  # type: ignore[assignment]
+    speeds: np.ndarray = None  # type: ignore[assignment]
+
+    @property
+    def steepest(self) -> np.ndarray:
+        """Norms of the segments' derivatives, in units of the orbit's extents."""
+        extents = np.ptp(self.nodes, axis=0)
+        extents = np.where(extents > 0.0, extents, 1.0)
+        return np.asarray(np.linalg.norm(self.tangents * extents / extents[:, None], 2, axis=(1, 2)))
+
+    @cached_property
+    def multipliers(self) -> np.ndarray:  # type: ignore[override]
+        """Floquet multipliers by falling modulus; 0 stands for the flow's own."""
+        return graded_multipliers(self.tangents, self.speeds)
+
+
+def graded_multipliers(tangents: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Return the multipliers of a closed orbit of a flow from the derivatives of its segments.
+
+    Sweeps of QR decompositions along the orbit turn an orthonormal basis, in the states modulo the flow's direction,
+    until its first vectors span the directions that grow most (Dieci and Van Vleck, Numer. Algorithms 14, 1997). The
+    product of the triangular factors then has the multipliers on its diagonal, in blocks of like moduli.
+
+    Parameters
+    ----------
+    tangents
+        Derivatives of the segments in their order, shape (segment, state, state).
+    speeds
+        Rates at their starts, shape (segment, state).
+
+    Returns
+    -------
+    ndarray of complex
+        Shape (state,), by falling modulus; the last one is 0, for the flow's own direction.
+    """
+    n = tangents.shape[1]
+    across = np.array([np.linalg.qr(np.column_stack([speed, np.eye(n)]))[0][:, 1:] for speed in speeds])
+    factors = np.roll(across, -1, axis=0).transpose(0, 2, 1) @ tangents @ across
+    basis = np.eye(n - 1)
+    for _ in range(CUTS.sweeps):
+        turned, product = basis, np.eye(n - 1)
+        for factor in factors:
+            turned, triangle = np.linalg.qr(factor @ turned)
+            product = triangle @ product
+        back = basis.T @ turned
+        basis = turned
+        if not (np.abs(np.tril(back, -1)) >= CUTS.separated).any():
+            break
+    ends = [i for i in range(1, n - 1) if np.abs(back[i:, :i]).max() < CUTS.separated]
+    blocks = [slice(i, j) for i, j in zip([0, *ends], [*ends, n - 1], strict=True)]
+    # what is left below the blocks is rounding, which the large factors would raise
+    each = [np.linalg.eigvals(back[block, block] @ product[block, block]) for block in blocks]
+    found = np.concatenate([*each, [0.0]]).astype(complex)
+    return np.asarray(found[np.argsort(-np.abs(found), kind="stable")])
+
+
+@dataclass(frozen=True, eq=False)
+class CutProblem:
+    """Equations of a limit cycle of a flow that is cut into segments, along one free parameter."""
+
+    family: Family
+    shares: np.ndarray  # (segment,): of the duration of its return
+    returns: np.ndarray  # (segment,): number of its return
+    unit: float  # duration that counts as 1 [s]
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.shares) * self.system.n_states + self.family.period + 1
+
+    @property
+    def system(self) -> System:
+        """System whose orbits they are."""
+        return self.family.system
+
+    @property
+    def _weight(self) -> float:
+        """Weight of the nodes in the arclength, which makes it their root mean square."""
+        return 1.0 / float(np.sqrt(len(self.shares)))
+
+    def packed_up(self, nodes: np.ndarray, seconds: np.ndarray, value: float) -> np.ndarray:
+        """Return the vector of unknowns: scaled nodes, durations [s], and the scaled parameter."""
+        return np.concatenate([self._weight * nodes.ravel(), seconds / self.unit, [value]])
+
+    def parts(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return scaled nodes, the durations [s] and the scaled parameter from the unknowns, or a change of them."""
+        m, n = len(self.shares), self.system.n_states
+        return u[: m * n].reshape(m, n) / self._weight, u[m * n : -1] * self.unit, float(u[-1])
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """Return no trajectories to a section: the segments last a given time."""
+        return self.family.rows(np.zeros((0, self.system.n_states + 1)))
+
+    def value(self, u: np.ndarray, ends: Ends) -> CutValue:
+        """Compute the gaps between the segments and the distances of returns from the section, with derivatives; NaN
+        if a return lasts longer than any may.
+        """
+        nodes, seconds, at = self.parts(u)
+        m, n, scales = len(nodes), self.system.n_states, np.asarray(self.system.scales)
+        if not (np.isfinite(u).all() and 0.0 < seconds.min() <= seconds.max() <= 1.0 / self.family.frequency_hz):
+            nothing = np.full((self.size - 1, self.size), np.nan)
+            return CutValue(nothing[:, 0], nothing, nodes[:1] * scales, nothing[:n, :n])
+        own = np.column_stack([nodes, np.full(m, at)])
+        rows = self.family.rows(np.concatenate([own, own + ONE_SIDED_STEP * np.eye(n + 1)[-1]]))
+        durations = np.tile(self.shares * seconds[self.returns], 2)
+        images, tangents = flown(self.family, rows, durations, tolerances_at(BRANCH_RTOL)["atol"])
+        here = replace(rows, states=np.concatenate([rows.states[:m], images[:m]]))
+        rates = rates_packed(self.system, here.states, rows.parameters[np.r_[:m, :m]], rows.frequency_hz) / scales
+        scaled = np.array([self.family.scaled(one) for one in tangents[:m]])
+        slopes = self._wrapped((images[m:] - images[:m]) / scales) / ONE_SIDED_STEP
+        by = self._by_unknowns(scaled, slopes, rates[m:])
+        gaps = self._wrapped(images[:m] / scales - np.roll(nodes, -1, axis=0)).ravel()
+        heights, by_heights = self._heights(nodes, rows.parameters[[0, m]])
+        return CutValue(
+            self._weight * np.concatenate([gaps, heights]),
+            self._weight * np.concatenate([by, by_heights]),
+            self._sections(nodes),
+            self._monodromy(scaled, rates[0] * scales),
+            float(seconds.sum()),
+            nodes=nodes,
+            tangents=scaled,
+            slopes=slopes,
+            speeds=rates[:m],
+        )
+
+    def _by_unknowns(self, tangents: np.ndarray, slopes: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the gaps, from those of the segments and the rates at their ends."""
+        m, n = slopes.shape
+        by = np.zeros((m, n, self.size))
+        for k in range(m):
+            by[k, :, n * k : n * (k + 1)] += tangents[k] / self._weight
+            after = (k + 1) % m
+            by[k, :, n * after : n * (after + 1)] -= np.eye(n) / self._weight
+            by[k, :, m * n + self.returns[k]] = speeds[k] * self.shares[k] * self.unit
+        by[:, :, -1] = slopes
+        return by.reshape(m * n, -1)
+
+    def _heights(self, nodes: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distances of the returns from the section, with their derivatives."""
+        crossed, n = crossed_state(self.system), self.system.n_states
+        assert crossed is not None
+        scale, weight = self.system.scales[crossed], self._weight
+        levels = packed[:, self.system.parameter_names.index(LEVEL)] / scale
+        firsts = np.searchsorted(self.returns, np.arange(self.family.period))
+        away = np.zeros((len(firsts), n))
+        away[:, crossed] = nodes[firsts, crossed] - levels[0]
+        by = np.zeros((len(firsts), self.size))
+        by[np.arange(len(firsts)), firsts * n + crossed] = 1.0 / weight
+        by[:, -1] = (levels[0] - levels[1]) / ONE_SIDED_STEP
+        return self._wrapped(away)[:, crossed], by
+
+    def _sections(self, nodes: np.ndarray) -> np.ndarray:
+        firsts = np.searchsorted(self.returns, np.arange(self.family.period))
+        return wrap_angles(np.roll(nodes[firsts], -1, axis=0) * np.asarray(self.system.scales), self.system)
+
+    def _monodromy(self, tangents: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Return the derivative of the return map, from the segments' derivatives and the rates at the section."""
+        scales, product = np.asarray(self.system.scales), np.eye(self.system.n_states)
+        for one in tangents:
+            product = one @ product
+        crossed = crossed_state(self.system)
+        assert crossed is not None
+        return on_section_derivative((product * scales[:, None] / scales)[None], rates[None], crossed)[0]
+
+    def _wrapped(self, difference: np.ndarray) -> np.ndarray:
+        scales = np.asarray(self.system.scales)
+        return np.asarray(wrap_angles(difference * scales, self.system) / scales)
+
+    def halved(self, u: np.ndarray, chosen: np.ndarray) -> tuple[CutProblem, np.ndarray]:
+        """Halve some segments of an orbit; return the new equations and the unknowns."""
+        nodes, seconds, at = self.parts(u)
+        own = np.flatnonzero(chosen)
+        rows = self.family.rows(np.column_stack([nodes[own], np.full(len(own), at)]))
+        halves = 0.5 * self.shares[own] * seconds[self.returns[own]]
+        middles, _ = flown(self.family, rows, halves, tolerances_at(BRANCH_RTOL)["atol"])
+        shares = np.insert(np.where(chosen, 0.5, 1.0) * self.shares, own + 1, 0.5 * self.shares[own])
+        nodes = np.insert(nodes, own + 1, middles / np.asarray(self.system.scales), axis=0)
+        problem = replace(self, shares=shares, returns=np.insert(self.returns, own + 1, self.returns[own]))
+        return problem, problem.packed_up(nodes, seconds, at)
+
+    def plain(self, point: Point) -> Point:
+        """Return a point in the unknowns of `OrbitProblem`: the section point and the parameter."""
+        n, value = self.system.n_states, point.value
+        assert isinstance(value, CutValue)
+        crossed = crossed_state(self.system)
+        found = [np.append(nodes[0], at) for nodes, _, at in (self.parts(point.u), self.parts(point.tangent))]
+        by = np.eye(n, n + 1)
+        for tangent, slope in zip(value.tangents, value.slopes, strict=True):
+            by = tangent @ by
+            by[:, -1] += slope
+        by = by - np.outer(value.speeds[0], by[crossed] / value.speeds[0, crossed])
+        by[crossed], by[:, crossed] = 0.0, 0.0
+        gaps = np.abs(value.residual[: len(self.shares) * n] / self._weight).reshape(-1, n).max(axis=0)
+        whole = Value(
+            gaps, by - np.eye(n, n + 1), value.images, value.monodromy, value.seconds, graded=value.multipliers
+        )
+        return Point(found[0], found[1] / np.linalg.norm(found[1]), whole, point.n_iterations)
+
+
+def whole_orbit(family: Family, point: Point) -> tuple[CutProblem, np.ndarray]:
+    """Return the equations of an orbit that is cut at the section alone, and the unknowns."""
+    n, scales = family.system.n_states, np.asarray(family.system.scales)
+    nodes = np.concatenate([point.u[None, :n], point.value.images[: family.period - 1] / scales])
+    rows = family.rows(np.column_stack([nodes, np.full(len(nodes), point.u[-1])]))
+    (ends,) = integrated([replace(rows, period=1)], family.system)
+    seconds = ends.times[:, 0]
+    problem = CutProblem(family, np.ones(len(nodes)), np.arange(len(nodes)), float(seconds.sum()))
+    return problem, problem.packed_up(nodes, seconds, float(point.u[-1]))
+
+
+def cut_where_steep(
+    problem: CutProblem, u: np.ndarray, along: np.ndarray, settings: Settings
+) -> Steps[tuple[CutProblem, Point] | None]:
+    """Halve the segments of an orbit on which tangents grow too much, and refine the orbit.
+
+    `along` is the direction of the branch, in the unknowns of `OrbitProblem`. Returns None on failure.
+    """
+    value = yield Query(problem, u)
+    while value.is_finite and isinstance(value, CutValue) and len(problem.shares) < CUTS.most_segments:
+        chosen = (value.steepest > CUTS.growth) | (len(problem.shares) < CUTS.least_segments)
+        if not chosen.any():
+            break
+        problem, u = problem.halved(u, chosen)
+        value = yield Query(problem, u)
+    if not value.is_finite:
+        return None
+    tangent = kernel_of(value)
+    nodes, _, at = problem.parts(tangent)
+    tangent = tangent * (1.0 if np.append(nodes[0], at) @ along >= 0.0 else -1.0)
+    point = yield from correct(problem, u, tangent, settings)
+    return None if point is None else (problem, point)
