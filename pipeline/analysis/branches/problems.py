@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from typing import ClassVar, Protocol
 
@@ -93,7 +94,7 @@ class Value:
     is_rest: bool = False
     graded: np.ndarray | None = None
 
-    @property
+    @cached_property
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers, or the eigenvalues of an equilibrium [1/s], in no order."""
         return np.linalg.eigvals(self.monodromy) if self.graded is None else self.graded

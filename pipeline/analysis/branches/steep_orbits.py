@@ -87,16 +87,16 @@ def flown(family: Family, rows: Rows, seconds: np.ndarray, atol: float) -> tuple
     return ends[:, :n], ends[:, n:].reshape(-1, n, n).transpose(0, 2, 1) / sizes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CutValue(Value):
     """Value of the equations of a cut orbit, with its segments: their first nodes (m, n), their derivatives by these
     (m, n, n) and by the parameter (m, n), and the rates at the nodes (m, n), all scaled.
     """
 
-    nodes: np.ndarray = None  # type: ignore[assignment]
-    tangents: np.ndarray = None  # type: ignore[assignment]
-    slopes: np.ndarray = None  # type: ignore[assignment]
-    speeds: np.ndarray = None  # type: ignore[assignment]
+    nodes: np.ndarray
+    tangents: np.ndarray
+    slopes: np.ndarray
+    speeds: np.ndarray
 
     @property
     def steepest(self) -> np.ndarray:
@@ -106,7 +106,7 @@ class CutValue(Value):
         return np.asarray(np.linalg.norm(self.tangents * extents / extents[:, None], 2, axis=(1, 2)))
 
     @cached_property
-    def multipliers(self) -> np.ndarray:  # type: ignore[override]
+    def multipliers(self) -> np.ndarray:
         """Floquet multipliers by falling modulus; 0 stands for the flow's own."""
         return graded_multipliers(self.tangents, self.speeds)
 
@@ -196,7 +196,8 @@ class CutProblem:
         m, n, scales = len(nodes), self.system.n_states, np.asarray(self.system.scales)
         if not (np.isfinite(u).all() and 0.0 < seconds.min() <= seconds.max() <= 1.0 / self.family.frequency_hz):
             nothing = np.full((self.size - 1, self.size), np.nan)
-            return CutValue(nothing[:, 0], nothing, nodes[:1] * scales, nothing[:n, :n])
+            segments = {"nodes": nodes, "tangents": nothing[:n, :n], "slopes": nodes, "speeds": nodes}
+            return CutValue(nothing[:, 0], nothing, nodes[:1] * scales, nothing[:n, :n], **segments)
         own = np.column_stack([nodes, np.full(m, at)])
         rows = self.family.rows(np.concatenate([own, own + ONE_SIDED_STEP * np.eye(n + 1)[-1]]))
         durations = np.tile(self.shares * seconds[self.returns], 2)
