@@ -26,6 +26,7 @@ from tests.core.cells import run_cells, scipy_end, stroboscopic_map
 from tests.core.flows import model_of
 
 DUFFING, VAN_DER_POL = load_model("duffing").system, load_model("forced-van-der-pol").system
+LONG = Settings(longest_step=0.02)
 
 
 def coefficients(parameters):
@@ -94,7 +95,7 @@ def test_explore__linear_oscillator():
     """The exact orbit and multipliers at every frequency."""
     damping, linear, amplitude = 0.3, 4.0, 1.0
     orbits = family(0.2, [damping, linear, 0, amplitude], "frequency", 0.5)
-    (branch,) = explore([Start(orbits, np.zeros(2), 0.2)], Scope(0.1, 0.6))
+    (branch,) = explore([Start(orbits, np.zeros(2), 0.2)], Scope(0.1, 0.6, settings=LONG))
     assert branch.ends == ("bound", "bound")
     assert not branch.bifurcations
     np.testing.assert_array_equal(branch.values[[0, -1]], [0.1, 0.6])
@@ -226,9 +227,9 @@ def test_explore__symmetry_breaking():
     """The symmetric orbit of a symmetric spring; scipy finds the pitchfork with the half-period map."""
     parameters = [0.1, 0.0, 1.0, 0.3]
     orbits = family(1.0 / (2.0 * np.pi), parameters, "amplitude", 1.0)
-    branches = explore(
-        [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)], Scope(0.1, 2.5, max_period=1)
-    )
+    settings = Settings(longest_step=0.01)
+    scope = Scope(0.1, 2.5, max_period=1, settings=settings)
+    branches = explore([Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)], scope)
     pitchfork = only(branches[0], "pitchfork")[0]
     broken = pitchfork.child
     assert broken is not None
@@ -250,7 +251,7 @@ def test_explore__symmetry_breaking():
     arm, symmetric = Start(orbits, orbits.state(broken.points[i].u), float(broken.values[i])), branches[0]
     ends = broken.points[0], broken.points[-1], symmetric.points[-1]
     at_bound = [Start(orbits, orbits.state(point.u), 2.5) for point in ends]
-    again = explore([arm, *at_bound], Scope(0.1, 2.5, max_period=1))
+    again = explore([arm, *at_bound], scope)
     assert len(again) == 2
     (same,) = [b for branch in again for b in only(branch, "pitchfork")]
     assert same.child is again[0]
@@ -273,7 +274,7 @@ def test_explore__symmetry_breaking():
     for tangent in (plane[0], plane.sum(axis=0) / np.sqrt(2.0)):
         pitchfork.child = None
         pitchfork.point.tangent[:] = tangent
-        cross([(branches[0], pitchfork)], branches[:1], (0.1, 2.5), Settings())
+        cross([(branches[0], pitchfork)], branches[:1], (0.1, 2.5), settings)
         assert pitchfork.child is not None
         ends = [orbits.values(pitchfork.child.points[i].u)[0] for i in (0, -1)]
         assert ends == pytest.approx([2.5, 2.5])  # the symmetric branch ends at 0.1
@@ -289,7 +290,7 @@ def test_explore__pitchforks_of_a_doubled_orbit():
         parameters[None], np.array([frequency]), np.array([[0.5, 0.1]]), 400, system=model.system
     )
     orbits = family(frequency, parameters, "d", 0.3, period=2, system=model.system)
-    scope = Scope(0.05, 0.35, max_period=2, max_generations=0)
+    scope = Scope(0.05, 0.35, max_period=2, max_generations=0, settings=LONG)
     (branch,) = explore([Start(orbits, reached[0, -1], 0.3)], scope)
     rows = table_of(dataset_of([branch], "d", None))
     assert [row["type"] for row in rows] == ["pitchfork", "pitchfork"]

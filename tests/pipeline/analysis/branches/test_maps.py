@@ -81,7 +81,7 @@ def henon(tmp_path_factory):
 
 def test_henon__fold_and_doublings(henon):
     """With b = .3: fold at -(1 - b)**2/4; doublings at 3 (1 - b)**2/4, and at (1 - b)**2 + (1 + b)**2/4 of period 2."""
-    found = [row for row in located(henon, -0.2, 0.95, "a") if row[2] < 4]
+    found = located(henon, -0.2, 0.95, "a", max_period=2)
     wanted = [(-0.1225, "fold", 1), (0.3675, "period_doubling", 1), (0.9125, "period_doubling", 2)]
     assert [row[1:3] for row in found] == [row[1:] for row in wanted]
     assert [row[0] for row in found] == pytest.approx([row[0] for row in wanted], abs=1e-10)
@@ -129,6 +129,7 @@ def logistic(folder, values, model=LOGISTIC):
     return magpend.run(spec.with_integration(n_transient=4000, n_keep=60, max_orbit_period=16), folder, workers=0)
 
 
+@pytest.mark.usefixtures("long_steps")
 def test_logistic__grid_values_on_bifurcations(tmp_path):
     """Cells at r = 1 and 3 end on an orbit of twice the period, but for their error: each branch is there once."""
     for values, ends, known, periods in (
@@ -208,6 +209,7 @@ def texts(panels):
     return " ".join(text.get_text() for text in np.atleast_1d(panels)[0].figure.findobj(Text))
 
 
+@pytest.mark.usefixtures("long_steps")
 def test_words__count_iterations(henon, command, tmp_path):
     """Neither table nor figure of a map names seconds, hertz or a drive."""
     run = magpend.Run.open(henon)

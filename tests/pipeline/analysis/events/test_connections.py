@@ -75,7 +75,9 @@ def test_rests_in__only_a_set_that_contains_one(monkeypatch):
 
 
 @pytest.mark.slow
-def test_connection_of__on_another_section():
+def test_connection_of__on_another_section(monkeypatch):
+    judged, lost = [], connections._lost
+    monkeypatch.setattr(connections, "_lost", lambda *given: judged.append(given) or lost(*given))
     along = lorenz_map()
     own = sample_of(along, 26.0, np.array([6.0, 5.0, 23.0]), EFFORT)
     found = connection_of(along, own, (26.0, 24.0, 16.0), EFFORT)
@@ -86,4 +88,6 @@ def test_connection_of__on_another_section():
     # the set lives on
     assert "meet no unstable orbit" in connection_of(along, own, (26.0, 25.0, 16.0), EFFORT)
     # lifetimes that are too long show no loss
-    assert "do not show" in connection_of(along, own, (26.0, 24.0, 23.9), EFFORT)
+    ((_, _, edge, contact, far, _),) = judged
+    assert far == 16.0
+    assert "do not show" in lost(along, own, edge, contact, 23.9, EFFORT)
