@@ -12,7 +12,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from functools import partialmethod
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -92,7 +92,8 @@ def _long_steps() -> Iterator[None]:
     from pipeline.analysis.branches.arclength import Settings
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Settings, "__init__", partialmethod(Settings.__init__, longest_step=0.02))
+        defaults = {**{field.name: field.default for field in fields(Settings)}, "longest_step": 0.02}
+        patch.setattr(Settings.__init__, "__defaults__", tuple(defaults.values()))
         yield
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -38,21 +39,28 @@ EACH_POINT, A_ROW = (8, 8), (24, 24)
 """Fewest and most cells of a block, for blocks of one point and of one row."""
 
 
-@pytest.fixture
-def copy(computed, tmp_path):
-    """Copies of the run, without results."""
+@pytest.fixture(scope="module")
+def copied(computed):
+    """Copies of a run, without results, in a folder."""
 
-    def make(name: str, text: str = MAP) -> AnalysedRun:
-        shutil.copytree(computed(text), tmp_path / name, ignore=shutil.ignore_patterns("derived"))
-        return AnalysedRun.of(tmp_path / name)
+    def make(folder, name: str, text: str = MAP) -> AnalysedRun:
+        shutil.copytree(computed(text), folder / name, ignore=shutil.ignore_patterns("derived"))
+        return AnalysedRun.of(folder / name)
 
     return make
 
 
+@pytest.fixture
+def copy(copied, tmp_path):
+    """Copies of the run, without results."""
+    return partial(copied, tmp_path)
+
+
 def files_of(run, name):
-    """Return all files of a stored result."""
-    (folder,) = (run.directory / "derived").glob(f"{name}-*.zarr")
-    return contents(folder)
+    """Return all files of the stored results of an analysis."""
+    found = {folder.name: contents(folder) for folder in (run.directory / "derived").glob(f"{name}-*.zarr")}
+    assert found
+    return found
 
 
 @pytest.fixture
@@ -66,10 +74,10 @@ def sizes(monkeypatch):
     return put
 
 
-@pytest.fixture
-def whole(copy):
+@pytest.fixture(scope="module")
+def whole(copied, tmp_path_factory):
     """The run analysed at once, which stays below the size of a block."""
-    run = copy("whole")
+    run = copied(tmp_path_factory.mktemp("blocks"), "whole")
     assert len(blocks.blocks_of(run)) == 1
     derive(run, "attractors")
     return run
@@ -102,7 +110,10 @@ def test_in_blocks__same_bytes_for_all_blocks_and_workers(copy, sizes, whole, mo
     assert {place.resolved() for place in places} == {where or "processes"}
 
 
-CHAOTIC = f"""{MAP.replace("twin-well-periodic", "twin-well").replace("n_keep = 32", "n_keep = 256")}
+FEWER = MAP.replace("num = 4", "num = 3").replace(
+    "start = 0.1, stop = 0.5, num = 3", "start = 0.3, stop = 0.5, num = 2"
+)
+CHAOTIC = f"""{FEWER.replace("twin-well-periodic", "twin-well").replace("n_keep = 32", "n_keep = 256")}
 [products]
 lyapunov = {{ n_transient = 20, n_periods = 64 }}
 """
@@ -116,7 +127,7 @@ NOISY = (
     )
 )
 OPTIONS = {
-    "resilience": [{"directions": 8, "confirmations": 8, "phases": 2, "timed": 8}],
+    "resilience": [{"directions": 4, "confirmations": 4, "phases": 1, "timed": 2}],
     "escapes": [{"high": {"x": 0.8}}, {}],
 }
 BY_POINT = [(name, given) for name, one in ANALYSES.items() if one.by_point for given in OPTIONS.get(name, [{}])]
@@ -124,11 +135,22 @@ NUMBERS = {"chaos": "attractor_lyapunov", "dimension": "correlation_dimension", 
 """A number of each result that is known only if the analysis has work to do."""
 
 
+@pytest.fixture(scope="module")
+def pairs(copied, tmp_path_factory):
+    """Two copies of each run, whose attractors are found once: at once in the first, in blocks in the second."""
+
+    @cache
+    def make(text):
+        folder = tmp_path_factory.mktemp("pair")
+        return copied(folder, "one", text), copied(folder, "other", text)
+
+    return make
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), BY_POINT)
-def test_in_blocks__every_analysis_of_points(name, options, copy, sizes):
-    text = NOISY if ANALYSES[name].motions == ("noisy",) else CHAOTIC
-    one, other = copy("one", text), copy("other", text)
+def test_in_blocks__every_analysis_of_points(name, options, pairs, sizes):
+    one, other = pairs(NOISY if ANALYSES[name].motions == ("noisy",) else CHAOTIC)
     assert len(blocks.blocks_of(one)) == 1
     found = derive(one, name, options, workers=0)
     if name in NUMBERS:
@@ -139,6 +161,7 @@ def test_in_blocks__every_analysis_of_points(name, options, copy, sizes):
     assert files_of(other, name) == files_of(one, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("workers", "threads"), [(0, 1), (1, 1), (3, 3)])
 def test_derive__workers_are_threads_without_blocks(copy, monkeypatch, workers, threads):
     seen, real = [], analysis.attractors
@@ -152,6 +175,7 @@ def test_derive__workers_are_threads_without_blocks(copy, monkeypatch, workers, 
     assert seen == [threads]
 
 
+@pytest.mark.slow
 def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkeypatch):
     run, computed, real = copy("run"), [], blocks.compute_block
     sizes(*A_ROW)
@@ -191,6 +215,7 @@ def test_prune__removes_blocks_that_were_left(copy, sizes, monkeypatch):
     assert not list((run.directory / "derived").iterdir())
 
 
+@pytest.mark.slow
 def test_run__analyse(main, write_spec):
     words = ("run", write_spec(MAP), "--out", "run", "--workers", 1, "--analyse")
     for names, said in (("attractor", "unknown analysis 'attractor'"), ("edge", "between: missing")):

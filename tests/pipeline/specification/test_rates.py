@@ -21,6 +21,8 @@ from pipeline.runs.naming import named
 from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import RATES
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
+
 SPRING = "x'' = F*cos(omega*t) - 0.1*x' - x - x**3\nF = 0.3"
 
 
@@ -51,12 +53,14 @@ def test_cells__have_frequencies(runs):
 @pytest.mark.slow
 def test_tables__have_the_word_of_the_specification(runs):
     """Located folds and jumps: values converted, directions of a period turned round."""
-    hertz, omega, period = (runs[word].branches().magpend.table() for word in ("frequency_hz", "omega", "period"))
+    hertz, omega, period = (
+        runs[word].branches(max_period=1).magpend.table() for word in ("frequency_hz", "omega", "period")
+    )
     folds = hertz["frequency_hz"].values
     assert len(folds) == 2
     np.testing.assert_allclose(omega["omega"], 2 * pi * folds, rtol=1e-7)
     np.testing.assert_allclose(np.sort(period["drive_period"]), np.sort(1 / folds), rtol=1e-7)
-    rises = {word: in_own_words(runs[word].response())["jump_rises"].values.tolist() for word in runs}
+    rises = {word: in_own_words(runs[word].response(max_period=1))["jump_rises"].values.tolist() for word in runs}
     assert rises["omega"] == rises["frequency_hz"] == [1 - turned for turned in rises["period"]]
 
 
@@ -114,6 +118,7 @@ def test_start__has_the_rate_in_any_of_its_words(runs):
             named(runs["omega"], StateOptions(**given) if "at" in given else BranchOptions(**given))
 
 
+@pytest.mark.slow
 def test_left_out__has_the_word_of_the_specification(runs):
     found = runs["omega"].branches(parameter="omega", low=1.25, high=1.35, start={"x": 1e9, "x_dot": 0.0, "omega": 1.3})
     lines = in_own_words(found).attrs["left_out"].splitlines()
@@ -126,11 +131,12 @@ def test_left_out__has_the_word_of_the_specification(runs):
         )
 
 
+@pytest.mark.slow
 def test_options__take_values_in_the_word_that_they_name(runs):
-    part = runs["frequency_hz"].branches(parameter="omega", low=1.3, high=1.5)
+    part = runs["frequency_hz"].branches(parameter="omega", low=1.3, high=1.5, max_period=1)
     assert (part.attrs["parameter"], len(part["value"])) == ("frequency", 1)
     np.testing.assert_allclose(part["parameter"].max(), 1.5 / (2 * pi), rtol=1e-12)
-    own = runs["period"].branches(low=2 * pi / 1.5, high=2 * pi / 1.3)  # of the only axis, so in its word
+    own = runs["period"].branches(low=2 * pi / 1.5, high=2 * pi / 1.3, max_period=1)  # of the only axis, so in its word
     np.testing.assert_allclose(own["value"], part["value"], rtol=1e-7)
     cell = runs["frequency_hz"].cube().magpend.sel_cell(omega=1.3)
     np.testing.assert_allclose(float(cell.frequency), 1.3 / (2 * pi), rtol=1e-15)
@@ -147,9 +153,10 @@ def test_options__second_parameter_has_the_unit_of_its_own_name(tmp_path):
         assert (found.second_low, found.second_high) == pytest.approx((0.1, 0.3), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_figures__are_labelled_as_the_user_wrote(runs):
     for word, label in (("omega", r"$\omega$"), ("period", "drive period")):
-        upper, _ = runs[word].plot.response()
+        upper, _ = runs[word].plot.response(max_period=1)
         low, high = upper.get_xlim()
         wanted = (1.2, 1.9) if word == "omega" else (2 * pi / 1.9, 2 * pi / 1.2)
         assert low < wanted[0] < wanted[1] < high < 1.2 * wanted[1]

@@ -192,6 +192,7 @@ def told(table):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 # matching tries orbits that do not return
 @pytest.mark.filterwarnings("ignore:invalid value encountered in det:RuntimeWarning")
 @pytest.mark.parametrize("name", RUNS)
@@ -206,7 +207,8 @@ def test_events__closed_forms(name, tmp_path):
     assert not (table["what"] == "not_decided").any(), table["evidence"].tolist()
     # unstable parts of branches tell nothing that these events need
     brief, full = run.branches(stable=True), run.branches()
-    assert told(run.table("events", stable=True))[0] == events
+    stable = run.table("events", stable=True, orbits=name == "lorenz")  # whose crisis rests on no branch
+    assert told(stable)[0] == [one for one in events if name != "lorenz" or one[3] != "boundary_crisis"]
     assert int(brief["n_points"].sum()) < int(full["n_points"].sum()) + (name in ("delayed", "soft", "lorenz"))
 
 
@@ -227,6 +229,7 @@ def test_events__two_saddle_nodes_on_a_circle(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 def test_events__saddle_node_on_a_circle_at_a_value_of_the_run(tmp_path):
     """th' = I - sin(th): one event at I = 1, where no cell ends on an attractor; cells go on to the cycle."""
     angle = {"th": {"unit": "rad", "on_circle": True}}
@@ -239,6 +242,7 @@ def test_events__saddle_node_on_a_circle_at_a_value_of_the_run(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 @pytest.mark.parametrize("name", ["circle", "logistic"])
 def test_events__seen_at_the_very_value_of_a_bifurcation(name, tmp_path):
     """There cells end on the orbit of the bifurcation, with an id or a period of its own: it is no third attractor."""
@@ -450,6 +454,7 @@ def fold_of(force, omega, first, n=6):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("long_steps")
 def test_events__both_folds_of_duffing_in_one_bracket(tmp_path):
     starts = {"x": (-3, 3), "x_dot": (-3, 3)}
     run = sweep(DUFFING, tmp_path, starts, F=[0.05, 0.1], omega=[1.0, 1.1, 1.3, 1.4])

@@ -17,6 +17,8 @@ from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import swept
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
+
 OMEGA = 2.0 * np.pi
 
 MEASURED = ((0.1, 0.1, 0.2, 0.1), (0.3, 0.2, 0.9, 0.4), (0.25, 0.15, 0.5, 0.2))
@@ -41,7 +43,7 @@ def response(hardening):
 
 def points_of(ds):
     """Indices (branch, point) of a few orbits of all branches."""
-    return [(i, j) for i in range(ds.sizes["branch"]) for j in range(0, int(ds["n_points"][i]), 40)]
+    return [(i, j) for i in range(ds.sizes["branch"]) for j in range(0, int(ds["n_points"][i]), 10)]
 
 
 def balanced(force, omega, guess, n=9):
