@@ -18,7 +18,7 @@ from pipeline.runs.derive import derive
 from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import finished
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("long_steps_of_a_file")]
 
 HOSTILE = "<script>alert(1)</script> & friends"
 SWEEP = f"""

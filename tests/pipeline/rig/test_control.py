@@ -16,6 +16,8 @@ from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 from tests.pipeline.factories import duffing, finished
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
+
 SWEEP = duffing(
     "amplitude = { start = 0.05, stop = 1.8, num = 8 }",
     'kind = "list"\npoints = [[0.0, 0.0], [1.8, 0.0]]',
