@@ -20,6 +20,8 @@ from matplotlib.text import Text
 import magpend
 from pipeline.products.registry import COMMANDS, FIGURES
 
+pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
+
 SWEEP = """
 kind = "sweep"
 title = "Duffing, a plane of two parameters"

@@ -589,6 +589,7 @@ def test_explore__brute_force_agrees(right_family):
     assert set(np.unique(ds["side"].values[:, 0])) == {Side.RIGHT}
 
 
+@pytest.mark.slow
 def test_explore__doubled_branch_that_turns_at_once():
     """Of x' = -(1 + e) x - a x^3 + b x^5, orbits +-x at e = b x^4 - a x^2: subcritical, with a fold at -a^2/(4 b)."""
     a, b = 0.03, 1500.0

@@ -88,6 +88,7 @@ def test_equilibria__both_folds_in_one_step(x):
     assert [x for _, x in folds] == pytest.approx([c, -c], abs=2e-6)
 
 
+@pytest.mark.slow
 def test_explore__a_start_at_a_fold_lies_on_the_branch_that_turns_there():
     """m = x^2: the branch is the same from (1, 1) and from its fold, beyond all points of it."""
     model = model_of({"x": "x^2 - m"}, {"m": 0.5})

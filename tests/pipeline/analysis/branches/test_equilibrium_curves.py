@@ -117,6 +117,7 @@ def bent(states):
     return [value + SHIFT for value in found]
 
 
+@pytest.mark.slow
 def test_bogdanov_takens():
     """x' = y, y' = p + q x + 1.4 x^2 - .7 x y: folds at q^2 = 5.6 p, Hopf points at p = 0 > q."""
     rates = {"x": "y", "y": "p + q*x + 7*x^2/5 - 7*x*y/10", "z": "-z + x^2 - y^2"}
@@ -136,6 +137,7 @@ def test_bogdanov_takens():
     np.testing.assert_allclose([row["a"], row["b"]], [1.4, -0.7], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_generalised_hopf():
     """z' = (p + i w) z + q z |z|^2 + 3 z |z|^4: with z = sqrt(2) w, lyapunov2 = 4 * 3 / 1.7."""
     rates = {**BAUTIN, "z": "-z + x^2 - x*y/3"}
@@ -146,6 +148,7 @@ def test_generalised_hopf():
     assert row["lyapunov2"] == pytest.approx(12.0 / 1.7, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fold", "hopf"])
 def test_zero_hopf(kind):
     """x' = p - .8 x^2 + .5 |z|^2, z' = (q + 1.3 i) z + (.6 - .2 i) x z + .9 x^2 z, in another time."""
@@ -165,6 +168,7 @@ def test_zero_hopf(kind):
     np.testing.assert_allclose([row["s"], row["theta"], row["e"]], [-1.0, -0.75, 0.9], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_double_hopf():
     """Two oscillators: p11 = -.5, p12 = .3, p21 = -.4, p22 = .7; with z = sqrt(2) w the coefficients double."""
     model = disguised(OSCILLATORS, {"p": 0.0, "q": 0.0})
@@ -179,6 +183,7 @@ def test_double_hopf():
     np.testing.assert_allclose(found, [1.4, -1.0, -0.4 / -0.5, 0.3 / 0.7], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "kind"), [("-x^3", "pitchfork"), ("+x^2", "transcritical")])
 def test_branch_points(rate, kind):
     """Branch points at p + q^2 = 0; an imperfect one is not followed."""
@@ -206,6 +211,7 @@ def test_branch_points__double_zero():
     only_at_origin(curves, "bogdanov_takens")
 
 
+@pytest.mark.slow
 def test_branch_points__without_a_quadratic_or_cubic_term():
     """x' = p x + q x^2 - 1.3 x^3 has a cusp; x' = p x + q x^3 - .6 x^5, where folds with q^2 = -2.4 p begin."""
     model = disguised({"x": "p*x + q*x^2 - 13*x^3/10", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
@@ -358,6 +364,7 @@ def cubic_lyapunov(mass, damping, stiffness, cubic):
     return float(-np.vdot(p[2:], np.linalg.solve(mass, force)).real)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "matrices", "bounds", "at"),
     [

@@ -183,6 +183,7 @@ def test_normal_mode__of_a_pendulum_softens_towards_its_upper_rest(tmp_path):
     assert run.plot.backbone(undamped={"c": 0.0}, low=0.06).get_xlabel() == "frequency [Hz]"
 
 
+@pytest.mark.slow
 def test_normal_mode__needs_orbits_that_close():
     """Cubic damping leaves imaginary eigenvalues, and no orbit."""
     base = load_model(magpend.model("x'' = -x - d*x'**3", name="cubic", d=0.1)).load(None)

@@ -138,6 +138,7 @@ def test_quantities__are_measured_like_states(response):
     assert float(own["dominant_order"]) == 2.0
 
 
+@pytest.mark.slow
 def test_linear__is_exact():
     """x'' + 2 z x' + x = F sin(w t): amplitude and lag in closed form, whatever the drive's phase."""
     model = load_model(magpend.model("x'' = -2*z*x' - x + F*sin(2*pi*f*t)", name="linear", z=0.05, F=1.5))
@@ -157,6 +158,7 @@ def test_linear__is_exact():
     assert np.isnan(lags[:, 0, 1:]).all()  # harmonics that vanish have no phase
 
 
+@pytest.mark.slow
 def test_subharmonics__and_turning_angles():
     """A pendulum that turns, and one with period 2, against scipy's dense output."""
     model = load_model(
