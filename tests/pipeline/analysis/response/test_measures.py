@@ -10,6 +10,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from pipeline.analysis.branches.kinds import KINDS as BIFURCATIONS
+from pipeline.analysis.branches.problems import Value
 from pipeline.analysis.response.analysis import _own_name, _ways, measured, measured_along
 from pipeline.analysis.response.backbone import (
     KINDS,
@@ -180,13 +181,17 @@ def test_is_within__ends_count() -> None:
 def test_curve__multipliers_of_a_normal_mode_are_without_those_of_flow_and_energy() -> None:
     problem = ModeProblem(mode_family(DUFFING, 0.2), DUFFING, np.zeros(2), ((0.1, 0.3), (0.0, 1.0)))
     matrix = np.diag([1.0 + 1e-9, np.exp(0.5), np.exp(-0.5), 1.0 - 1e-9])
-    value = SimpleNamespace(monodromy=matrix, is_rest=False)
     curve = Curve(problem, [], ("linear_mode", "bound"))
-    point = SimpleNamespace(value=value, u=np.zeros(3))
+
+    def point_of(monodromy: np.ndarray) -> SimpleNamespace:
+        value = Value(np.zeros(4), np.zeros((4, 5)), np.zeros((1, 4)), monodromy)
+        return SimpleNamespace(value=value, u=np.zeros(3))
+
+    point = point_of(matrix)
     np.testing.assert_allclose(sorted(curve.multipliers(point).real), [np.exp(-0.5), np.exp(0.5)])
     assert curve.n_unstable(point) == 1
     assert curve.kind == "normal_mode"
-    value.monodromy = np.diag([1.0, 1.0, 1.0 + 0.5 * NEUTRAL, 1.0 - 0.5 * NEUTRAL])
+    point = point_of(np.diag([1.0, 1.0, 1.0 + 0.5 * NEUTRAL, 1.0 - 0.5 * NEUTRAL]))
     assert curve.n_unstable(point) == 0  # within the slack of a conservative system
     family = mode_family(DUFFING, 0.2)
     resonance = Curve(ResonanceProblem(family, DUFFING, 0, ()), [], ("bound", "bound"))
