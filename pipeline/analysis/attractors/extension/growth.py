@@ -236,11 +236,17 @@ def volumes_of(
         Function that returns the rates at states (n, state).
     """
     if crossed is None:
-        return np.asarray(np.linalg.slogdet(derivatives)[1])
+        return _log_areas(derivatives)
     kept = [k for k in range(derivatives.shape[-1]) if k != crossed]
-    areas = np.linalg.slogdet(derivatives[:, kept][:, :, kept])[1] if kept else np.zeros(len(before))
+    areas = _log_areas(derivatives[:, kept][:, :, kept]) if kept else np.zeros(len(before))
     speeds = np.abs(np.stack([flow(before)[:, crossed], flow(after)[:, crossed]]))
     return np.asarray(areas + np.log(speeds[1] / speeds[0]))
+
+
+def _log_areas(derivatives: np.ndarray) -> np.ndarray:
+    """Return the logarithms of the determinants' moduli; NaN where a derivative is not known."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.linalg.slogdet(derivatives)[1])
 
 
 def _weighted(values: np.ndarray) -> np.ndarray:

@@ -22,9 +22,9 @@ from pipeline.analysis.sets import Geometry
 DISTANCES = (0.5, 0.05, 0.01)
 """Scaled distances at which trajectories start, tried in turn until one shows an approach."""
 
-LEGS, FALL, GONE = 32, 0.7, 10.0
-"""Number of legs, the largest share of the distance left after them that shows an approach, and the share beyond which
-a trajectory has left, even if it comes back from the other side."""
+LEGS, FALL, GONE, WHOLE = 32, 0.7, 10.0, 1.0
+"""Number of legs, the largest share of the distance left after them that shows an approach, and the share, or the
+scaled distance, beyond which a trajectory has left, even if it comes back from the other side."""
 
 
 def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
@@ -93,7 +93,7 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
         state, step = leg.state, np.where(waits, 0.0, leg.step)
         sections = np.where(waits[:, None, None], leg.state[:, None], leg.section[:, LEG // 2 :])
         away = _distance(sections, points, geometry)
-        if (_distance(leg.section, points, geometry) > GONE * size)[~waits].any():
+        if (_distance(leg.section, points, geometry) > min(GONE * size, WHOLE))[~waits].any():
             return False
         if (away > np.minimum(before, 2.0 * size) + 1e-9).any():
             return False
