@@ -19,6 +19,8 @@ from matplotlib.text import Text
 
 import magpend
 from pipeline.products.registry import COMMANDS, FIGURES
+from pipeline.runs.derive import stored_each
+from tests.pipeline.results import complaints
 
 pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
 
@@ -200,6 +202,15 @@ def test_analyse(runs, name):
         assert not {"side", "rotation_psi1"} & set(rows[0])
         assert not re.search(r"\bpsi[12]|\brad\b", out)
     assert "magpend" not in out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ELSEWHERE])
+def test_result__each_variable_is_declared_and_says_what_it_is_and_in_which_unit(runs, day, name):
+    runs("analyse", name, *ANALYSES[name].split())
+    run = magpend.Run.open(day / ANALYSES[name].split()[0])
+    for ds in stored_each(run, name):
+        assert not list(complaints(ds, name, run.cube()))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,9 @@ import xarray as xr
 
 from pipeline.analysis.ragged import SET, dims_of, index_of_rows, is_ragged
 from pipeline.layout.conventions import shown_unit
-from pipeline.products.product import padded
+from pipeline.layout.vocabulary import FREQUENCY_DIM
+from pipeline.products.product import Table, padded
+from pipeline.specification.tables import FREQUENCY, RATES
 
 FEW_POINTS = 6
 """Most parameter points that get a table each."""
@@ -27,6 +29,9 @@ MOST_ROWS = 30
 
 FRACTION = ("fraction", "low", "high")
 """Names of a fraction and its interval."""
+
+_NAMING = ("parameter", "first_parameter", "second_parameter", "path", "moving")
+"""Attributes of results that name a parameter."""
 
 Row = dict[str, Any]
 Words = Mapping[str, str | None]
@@ -48,6 +53,77 @@ def values(one: xr.Dataset, *names: str) -> Row:
     """
     found = {name: one[name].item() for name in names if name in one}
     return {n: words_of(one[n])[v] if "flag_meanings" in one[n].attrs else v for n, v in found.items()}
+
+
+def shown(ds: xr.Dataset, table: Callable[[xr.Dataset], Table]) -> Table:
+    """Return the table of a result. A parameter that has the name of a column has the column ``parameter_NAME``.
+
+    Parameters
+    ----------
+    ds
+        Result of an analysis.
+    table
+        Returns the table of a result.
+    """
+    axes = [str(d) for d in ds.dims if d in ds.coords and ds[d].dtype.kind == "f"]
+    names = dict.fromkeys([*axes, *(str(ds.attrs[key]) for key in _NAMING if key in ds.attrs)])
+    names = {name: None for name in names if name and name not in _RATES}
+    # while the table is made, each has a name that no column has, of the same length
+    marked = {name: chr(_PRIVATE + k) + name[1:] for k, name in enumerate(names)}
+    held = ds.rename({d: marked[d] for d in axes if d in marked})
+    for variable in held.variables.values():  # values of fixed parameters are known by this
+        if (name := str(variable.attrs.get("long_name", "")).removeprefix("value of ")) in marked:
+            variable.attrs = {**variable.attrs, "long_name": f"value of {marked[name]}"}
+    held.attrs = {key: marked.get(v, v) if key in _NAMING else v for key, v in ds.attrs.items()}
+    found = table(held)
+    columns = dict.fromkeys(name for row in [*found.rows, dict.fromkeys(found.header)] for name in row)
+    own = {marked[name]: f"parameter_{name}" if name in columns else name for name in names}
+    plain_names = {mark: name for name, mark in marked.items()}
+    return Table(
+        [{own.get(key, key): value for key, value in row.items()} for row in found.rows],
+        [_replaced(line, plain_names) for line in found.lines],
+        found.nothing,
+        _replaced(found.graph, plain_names),
+        [own.get(key, key) for key in found.header],
+    )
+
+
+_RATES = {FREQUENCY, FREQUENCY_DIM, *(rate.column for rate in RATES.values())}
+"""Names of the drive's rate, which tables know."""
+
+_PRIVATE = 0xE000
+"""First of the characters that Unicode leaves to private use."""
+
+
+def _replaced(value: Any, names: Mapping[str, str]) -> Any:
+    """Return a text, or all texts in nested data, with some names in place of others."""
+    if isinstance(value, str):
+        for old, new in names.items():
+            value = value.replace(old, new)
+        return value
+    if isinstance(value, Mapping):
+        return {_replaced(key, names): _replaced(one, names) for key, one in value.items()}
+    return [_replaced(one, names) for one in value] if isinstance(value, list) else value
+
+
+def header_of(ds: xr.Dataset, dim: str, row: Callable[[xr.Dataset], Row]) -> tuple[str, ...]:
+    """Return the names of a table's columns from the function that makes its rows, for a result that may have none.
+
+    Parameters
+    ----------
+    ds
+        Result of the analysis.
+    dim
+        Dim of the rows.
+    row
+        Returns the row of a place on this dim.
+    """
+    sizes = {str(d): max(n, 1) for d, n in ds.sizes.items()}
+    names = {
+        name: ([d for d in v.dims if d != dim], np.zeros([sizes[str(d)] for d in v.dims if d != dim], v.dtype), v.attrs)
+        for name, v in ds.variables.items()
+    }
+    return tuple(row(xr.Dataset(names, attrs=ds.attrs)))
 
 
 def state_columns(names: Iterable[str], taken: Iterable[str]) -> dict[str, str]:

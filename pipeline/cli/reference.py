@@ -371,6 +371,22 @@ def variables() -> str:
     return table(("variable", "own dims", "type", "unit", "meaning", "product"), rows)
 
 
+def results() -> str:
+    """Return the Markdown text on the variables of the result of each analysis."""
+    from pipeline.products.column import POINTS, STARTS
+    from pipeline.products.registry import ANALYSES, COMMANDS
+
+    dims = {POINTS: "swept parameters", STARTS: "starts"}
+    parts = []
+    for name in COMMANDS:
+        rows = [
+            (f"`{c.name}`", ", ".join(dims.get(d, f"`{d}`") for d in c.dims.split()), c.unit, c.text)
+            for c in ANALYSES[name].columns
+        ]
+        parts.append(f"## {name}\n\n{table(('variable', 'dims', 'unit', 'meaning'), rows)}")
+    return "\n\n".join(parts)
+
+
 def conventions() -> str:
     """Return the Markdown table of the attributes that describe the variables of an opened cube or result."""
     from pipeline.layout.conventions import ADDED
@@ -436,6 +452,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "study": study,
     "measures": measures,
     "variables": variables,
+    "results": results,
     "conventions": conventions,
     "statuses": statuses,
     "models": models,

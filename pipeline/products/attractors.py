@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Self
 
+from pipeline.products.column import STATES, Columns, in_parts, only, over, with_parts
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.attractors.analysis"
@@ -60,14 +61,60 @@ class HysteresisOptions(Options):
     )
 
 
+IDENTIFIED_COLUMNS: Columns = (
+    *over("*", n_sets="number of sets", ran_out="whether the extension's budget ended"),
+    *over("*", growth_length="sections over which the distance of growing cells from where they began grew"),
+    *over("*", growth_factor="factor by which it grew"),
+    *over("*", "1/s", growth_rate="relative growth of these cells, at the end of their extension"),
+    *over("* +", attractor_id="attractor of the cell, -1 none", decision="how the cell was decided"),
+    *over("* +", status="what became of the cell"),
+    *over(
+        "set",
+        attractor="attractor",
+        kind="kind of set",
+        stability="what has been shown of the set",
+        evidence="what the stability rests on",
+        orbit_period="period in {periods}, 0 if bounded or absent",
+        is_polished="whether Newton's method converged",
+        residual="scaled distance of the orbit's first point from its image",
+        multiplier_error="error of the largest modulus of the multipliers",
+        closes_above="period of cells that seem to close above the longest looked for",
+        dimension="dimension of a torus, 0 of any other set",
+        share="share of all cells of the parameter point",
+        n_cells="cells on the attractor",
+        n_points="stored section points",
+        n_sampled="cells of the set, and neighbours, that were extended",
+        n_left="extended cells that left the set",
+        n_leaving="extended cells that were near their end from the start",
+        time_at_risk="time on the set in all, {periods}",
+        mean_lifetime="mean lifetime, {periods}",
+        mirror_partner="attractor that is the mirror image, -1 none",
+        mirror_distance="distance from the mirror image",
+        side="class of the motion, by the model's classifier",
+    ),
+    *in_parts(over("set", lifetime="mean lifetime, {periods}"), "low", "high"),
+    *over("set", "s", period_s="period of a polished orbit"),
+    *over("set", "1/{time}", lyapunov_max="largest Lyapunov exponent"),
+    *in_parts(over("set", "1/{time}", lyapunov="largest Lyapunov exponent"), "low", "high"),
+    *in_parts(over("set multiplier", multiplier="Floquet multipliers"), "real", "imag"),
+    *in_parts(over("set multiplier", "1/{time}", eigenvalue="eigenvalues at rest"), "real", "imag"),
+    *over("set state", STATES, state_min="least value of the state", state_max="largest value of the state"),
+    *over("set angle", rotation="mean rotation, turns per {period}"),
+    *over("sample state", STATES, attractor_points="section points"),
+    *over("transition", from_set="row of the set that was left", to="set of the end", n_to="cells that left"),
+)
+
 IDENTIFIED = Analysis(
     "identified",
     "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
+    columns=IDENTIFIED_COLUMNS,
     version=6,
     by_point=True,
 )
+
+ATTRACTORS_COLUMNS: Columns = (*IDENTIFIED_COLUMNS, *over("set", match_basis="what the id rests on"))
 
 ATTRACTORS = Analysis(
     "attractors",
@@ -79,10 +126,28 @@ ATTRACTORS = Analysis(
     run itself. Basin fractions are fractions of all cells, with 95 % intervals.""",
     AttractorOptions,
     compute=f"{_ROOM}:attractors",
+    columns=ATTRACTORS_COLUMNS,
     version=3,
     table="pipeline.analysis.attractors.analysis:attractors_table",
     builds_on=("identified",),
     figure="attractors",
+)
+
+HYSTERESIS_COLUMNS: Columns = (
+    *over("*", differs="up and down meet other attractors"),
+    *over("* direction attractor", present="met by a branch"),
+    *over("attractor", attractor="attractor"),
+    *over("direction", direction="direction of the walk"),
+    *over("loop", loop_points="points"),
+    *over("loop", "{path}", loop_from="first value of the path", loop_to="last value of the path"),
+    *over("loop attractor", only_down="points at which only down meets it", only_up="points at which only up meets it"),
+    *over("jump", jump_count="branches", jump_direction="direction of the walk, 1 up, -1 down"),
+    *over("jump", jump_from_id="attractor before", jump_to_id="attractor after"),
+    *over("jump", "{path}", jump_from="value of the path before", jump_to="value of the path after"),
+    *over(
+        "jump", jump_event="number of the event at which the attractor ends, -1 none", jump_what="name of this event"
+    ),
+    *with_parts(over("jump", "{path}", jump_value="parameter value of this event"), "error"),
 )
 
 HYSTERESIS = Analysis(
@@ -90,10 +155,20 @@ HYSTERESIS = Analysis(
     "List where a continuation follows different attractors upwards and downwards, and where it jumps.",
     HysteresisOptions,
     compute="pipeline.analysis.attractors.hysteresis:hysteresis",
+    columns=HYSTERESIS_COLUMNS,
     table="pipeline.analysis.attractors.hysteresis:hysteresis_table",
     needs="pipeline.analysis.attractors.hysteresis:needs_directions",
     builds_on=("attractors", "events"),
     figure="attractors",
+)
+
+SETTLING_COLUMNS: Columns = (
+    *only(
+        IDENTIFIED_COLUMNS,
+        "n_sets ran_out attractor kind stability evidence orbit_period closes_above n_cells n_sampled n_left n_leaving "
+        "time_at_risk mean_lifetime lifetime_low lifetime_high lyapunov_max lyapunov_low lyapunov_high from_set to "
+        "n_to",
+    ),
 )
 
 SETTLING = Analysis(
@@ -104,6 +179,7 @@ SETTLING = Analysis(
     Transient lifetimes are in drive periods or returns.""",
     Options,
     compute="pipeline.analysis.attractors.settling:settling",
+    columns=SETTLING_COLUMNS,
     table="pipeline.analysis.attractors.settling:settling_table",
     builds_on=("attractors",),
 )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from pipeline.products.column import STATES, Columns, in_parts, over
 from pipeline.products.product import Analysis, Options, option
+from pipeline.products.response import CHANNEL_COLUMNS, measured
 
 _ROOM = "pipeline.analysis.response.backbone"
 
@@ -28,6 +30,21 @@ class BackboneOptions(Options):
     )
 
 
+COLUMNS: Columns = (
+    *CHANNEL_COLUMNS,
+    *over(
+        "curve", kind="kind of curve", n_points="points of the curve", first_end="why it begins", last_end="why it ends"
+    ),
+    *over("curve", "Hz", linear_frequency="frequency of the linear mode"),
+    *over("curve point", "Hz", parameter="frequency"),
+    *over("curve point", "{force}", force="value of the parameter that scales the drive"),
+    *over("curve point", n_unstable="multipliers outside the unit circle, -1 beyond the curve"),
+    *over("curve point", residual="scaled gap between the ends of the orbit"),
+    *over("curve point state", STATES, section="point of the orbit"),
+    *in_parts(over("curve point multiplier", multiplier="multipliers that decide the stability"), "real", "imag"),
+    *measured("curve point"),
+)
+
 BACKBONE = Analysis(
     "backbone",
     """Follow phase resonance (motion and drive in quadrature) in frequency and force; and nonlinear normal modes.
@@ -38,6 +55,7 @@ BACKBONE = Analysis(
     zero state.""",
     BackboneOptions,
     compute=f"{_ROOM}:backbone",
+    columns=COLUMNS,
     table=f"{_ROOM}:backbone_table",
     settle=f"{_ROOM}:settle_backbone",
     builds_on=("branches", "response"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.products.column import STATES, UNITS, Column, Columns, in_parts, only, over, with_parts
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.branches.analysis"
@@ -110,6 +111,80 @@ class OrbitOptions(StartOptions):
     seed: int = option(0, "Seed of the random starts.", ge=0)
 
 
+BRANCH_COLUMNS: Columns = (
+    *over(
+        "branch",
+        orbit_period="period in {periods}, 0 for equilibria",
+        n_points="points of the branch",
+        origin="bifurcation it sprang from, -1 none",
+        first_end="why it begins",
+        last_end="why it ends",
+    ),
+    *over("branch", "Hz", frequency="drive frequency, NaN if it varies"),
+    *over("branch angle", rotation="turns per {period}"),
+    *over("angle", angle="angle"),
+    *over("branch point", "{parameter}", parameter="value of the parameter"),
+    *over("branch point", n_unstable="multipliers outside the unit circle, -1 beyond the branch"),
+    *over("branch point", residual="scaled distance of the point from its image", side="class of the whole orbit"),
+    *over("branch point", "s", period_s="period of the orbit"),
+    *over("branch point phase state", STATES, section="section points of the orbit"),
+    *in_parts(over("branch point multiplier", multiplier="Floquet multipliers"), "real", "imag"),
+    *in_parts(over("branch point multiplier", "1/s", eigenvalue="eigenvalues of an equilibrium"), "real", "imag"),
+    *over(
+        "branch end",
+        "{parameter}",
+        limit_value="parameter value where the period is infinite",
+        limit_error="error of this value",
+    ),
+    *over("branch end rest state", STATES, limit_state="equilibria where the period is infinite"),
+    *in_parts(over("branch end multiplier", "1/s", limit_eigenvalue="eigenvalues of the first of them"), "real", "imag"),
+    *over(
+        "branch end",
+        "s, or s times the root of the parameter's unit",
+        limit_slope="fitted slope of the period over -ln|p - p_h|; at a saddle node on a circle over 1/sqrt|p - p_h|",
+        limit_slope_error="error of the fitted slope",
+        limit_slope_expected="the same slope, from the equilibria",
+    ),
+    *over(
+        "bifurcation",
+        kind="kind of bifurcation",
+        of_branch="branch on which it lies",
+        after="point of the branch that it comes after",
+        to_branch="other branch through it, -1 none",
+        image="bifurcation that is its mirror image, -1 none",
+        bifurcation_side="class of the orbit there",
+        n_unstable_before="unstable multipliers before, along the branch",
+        n_unstable_after="unstable multipliers after, along the branch",
+        rises_before="1 if the parameter rises along the branch before",
+        criticality="criticality",
+        normal_form="normal form coefficient; of a Hopf point in 1/s",
+        normal_form_error="error of the coefficient",
+    ),
+    *in_parts(over("bifurcation", critical="critical multiplier, or eigenvalue in 1/s"), "real", "imag"),
+    *over("bifurcation", "{parameter}", value="parameter value of the bifurcation"),
+    *over("bifurcation", "{parameter}", bracket="width of the bracket in the parameter"),
+    *over("bifurcation", "s", bifurcation_period_s="period of the orbit, or of a Hopf point's cycles"),
+    *over("bifurcation phase state", STATES, bifurcation_section="section points of the orbit there"),
+    *in_parts(over("bifurcation multiplier", bifurcation_multiplier="multipliers there"), "real", "imag"),
+    *over("searched", "{parameter}", searched_value="value of the parameter at which orbits were sought"),
+    *over("searched", coverage="share of starts that lead to a known orbit"),
+    *over("times", times="multiple of a {period}"),
+    *over(
+        "searched times",
+        n_orbits="orbits of this least period",
+        index_sum="sum of the indices of the orbits that close in so many {periods}",
+        index_verdict="whether the indices add up to what they must",
+    ),
+    *over("box", "{parameter}", box_value="value of the parameter at which equilibria were counted"),
+    *over(
+        "box",
+        n_equilibria="equilibria in the box",
+        n_stable_equilibria="stable equilibria in the box",
+        equilibria_index_sum="sum of the signs of det(-J); of a bounded flow known for all equilibria",
+        box_verdict="whether the number is proved",
+    ),
+)
+
 BRANCHES = Analysis(
     "branches",
     """Follow periodic orbits and equilibria along a parameter, stable or not; locate and name their bifurcations.
@@ -118,11 +193,46 @@ BRANCHES = Analysis(
     the option that includes them.""",
     BranchOptions,
     compute=f"{_ROOM}:branches",
+    columns=BRANCH_COLUMNS,
     table="pipeline.analysis.branches.analysis:branches_table",
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
     version=11,
+)
+
+COEFFICIENTS = {
+    **{"a": "1/s2", **dict.fromkeys(("b", "c", "e", "p11", "p22", "quintic"), "1/s")},
+    **dict.fromkeys(("lyapunov2", "s", "theta", "delta"), "1"),
+}
+"""Coefficients of the normal forms of equilibria at points of codimension two, with their units (`center_manifold`)."""
+
+CURVE_COLUMNS: Columns = (
+    *over(
+        "curve",
+        kind="kind of bifurcation",
+        orbit_period="period in {periods}, 0 for equilibria",
+        start="located point from which it was followed",
+        n_points="points of the curve",
+        n_missed="sign changes that could not be located",
+        first_end="why it begins",
+        last_end="why it ends",
+    ),
+    *over("curve point", "{first_parameter}", first="value of the first parameter"),
+    *over("curve point", "{second_parameter}", second="value of the second parameter"),
+    *over("curve point state", STATES, section="a section point, or the saddle"),
+    *over("curve point", residual="largest residual, test function included"),
+    *over("curve point", "1/s", saddle_quantity="sum of the leading eigenvalues of the saddle of a homoclinic orbit"),
+    *over(
+        "special",
+        special_kind="kind of point",
+        special_curve="curve on which it was located",
+        special_period="period in {periods}, 0 for equilibria",
+    ),
+    *with_parts(over("special", "{first_parameter}", special_first="value of the first parameter"), "error"),
+    *with_parts(over("special", "{second_parameter}", special_second="value of the second parameter"), "error"),
+    *over("special state", STATES, special_section="a section point"),
+    *(Column(f"special_{n}", "special", f"normal form coefficient {n}", unit) for n, unit in COEFFICIENTS.items()),
 )
 
 CURVES = Analysis(
@@ -133,11 +243,32 @@ CURVES = Analysis(
     branches end.""",
     CurveOptions,
     compute=f"{_ROOM}:curves",
+    columns=CURVE_COLUMNS,
     table="pipeline.analysis.branches.analysis:curves_table",
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
     version=6,
+)
+
+BAND_COLUMNS: Columns = (
+    *only(BRANCH_COLUMNS, "kind value of_branch bifurcation_section"),
+    *over("bifurcation", orbit_period="period in {periods}, 0 for equilibria"),
+    *over("bifurcation", is_border="1 if a stable orbit begins or ends there"),
+    *over(
+        "draw bifurcation", "{parameter}", bifurcation_value="value for the draw, NaN where it has no such bifurcation"
+    ),
+    *over("level", level="level of a quantile over the draws"),
+    *over("level orbit phase state", STATES, section_level="quantiles of the section points of an orbit"),
+    *over("orbit", "{parameter}", parameter_value="value of the parameter"),
+    *over(
+        "orbit",
+        branch="branch on which the orbit lies",
+        run="number of the stretch of the branch",
+        step="place of the orbit on the stretch",
+        is_stable="1 if the orbit is stable",
+        share="share of the draws that have the orbit",
+    ),
 )
 
 BANDS = Analysis(
@@ -148,12 +279,30 @@ BANDS = Analysis(
     median, low and high are those of the draws that have the bifurcation.""",
     BandOptions,
     compute="pipeline.analysis.branches.bands:bands",
+    columns=BAND_COLUMNS,
     table="pipeline.analysis.branches.bands:bands_table",
     settle="pipeline.analysis.branches.bands:settle_bands",
     builds_on=("branches",),
     figure="branches",
     # the digest says which draws
     ignores=("posterior",),
+)
+
+SENSITIVITY_COLUMNS: Columns = (
+    *only(BRANCH_COLUMNS, "kind of_branch bifurcation_side value"),
+    *over("bifurcation", orbit_period="period in {periods}, 0 for equilibria"),
+    *over("bifurcation", "{parameter}", deviation="standard deviation of the value, to first order"),
+    *over("bifurcation parameter", status="whether the derivative is known"),
+    *over("bifurcation parameter", UNITS, parameter_value="value of the parameter"),
+    *with_parts(
+        over("bifurcation parameter", "{parameter} per unit", derivative="derivative of the value by the parameter"),
+        "error",
+    ),
+    *with_parts(
+        over("bifurcation parameter", elasticity="relative change of the value over that of the parameter"), "error"
+    ),
+    *over("parameter", parameter="name of the parameter", unit="unit of the parameter"),
+    *over("parameter", UNITS, parameter_deviation="standard deviation of the parameter"),
 )
 
 SENSITIVITIES = Analysis(
@@ -164,12 +313,29 @@ SENSITIVITIES = Analysis(
     of the parameters (--deviation, --posterior) also that of the bifurcation, to first order.""",
     SensitivityOptions,
     compute="pipeline.analysis.branches.sensitivities:sensitivities",
+    columns=SENSITIVITY_COLUMNS,
     table="pipeline.analysis.branches.sensitivities:sensitivities_table",
     settle="pipeline.analysis.branches.sensitivities:settle_sensitivities",
     builds_on=("branches",),
     figure="sensitivities",
     # the digest says which draws
     ignores=("posterior",),
+)
+
+ORBIT_COLUMNS: Columns = (
+    *over(
+        "orbit",
+        orbit_period="least period in {periods}",
+        n_unstable="multipliers outside the unit circle",
+        index="sign of det(1 - M)",
+        n_hits="starts of the first round that led to it",
+        search_round="round in which it was found, from 0",
+    ),
+    *over("orbit", "s", period_s="least period"),
+    *over("orbit phase state", STATES, section="section points of the orbit"),
+    *in_parts(over("orbit multiplier", multiplier="Floquet multipliers"), "real", "imag"),
+    *over("times", times="multiple of a {period}"),
+    *over("times", index_sum="sum of the indices of the orbits that close in so many {periods}"),
 )
 
 ORBITS = Analysis(
@@ -180,6 +346,7 @@ ORBITS = Analysis(
     indices. --start adds the orbit near a state, also of a longer period.""",
     OrbitOptions,
     compute="pipeline.analysis.branches.orbit_search:orbits",
+    columns=ORBIT_COLUMNS,
     table="pipeline.analysis.branches.orbit_search:orbits_table",
     needs="pipeline.analysis.branches.orbit_search:needs_point",
     version=2,
@@ -196,6 +363,26 @@ class TongueOptions(PlaneOptions):
     at: dict[str, float] = option({}, "Value of a further axis of the run: the row on which tongues are searched.")
 
 
+TONGUE_COLUMNS: Columns = (
+    *CURVE_COLUMNS,
+    *over("curve", numerator="numerator of the rotation number", denominator="denominator of the rotation number"),
+    *over(
+        "tongue",
+        tongue_numerator="numerator of the rotation number",
+        tongue_denominator="denominator of the rotation number",
+        n_branches="branches that lie in the tongue",
+        tongue_low_kind="what ends the tongue below",
+        tongue_high_kind="what ends the tongue above",
+    ),
+    *over(
+        "tongue",
+        "{first_parameter}",
+        tongue_low="lower end of the tongue on the row",
+        tongue_high="upper end of the tongue on the row",
+        tongue_error="largest error of the two ends",
+    ),
+)
+
 TONGUES = Analysis(
     "tongues",
     """Find the Arnold tongues p/q of a plane: where motions lock to the drive, p turns in q drive periods.
@@ -204,6 +391,7 @@ TONGUES = Analysis(
     the edges of each tongue in the plane of two parameters.""",
     TongueOptions,
     compute=f"{_ROOM}:tongues",
+    columns=TONGUE_COLUMNS,
     table=f"{_ROOM}:tongues_table",
     needs=f"{_ROOM}:needs_rotation",
     settle=f"{_ROOM}:settle_tongues",

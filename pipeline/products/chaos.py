@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pipeline.products.attractors import IDENTIFIED_COLUMNS
+from pipeline.products.column import Columns, only, over, with_parts
+from pipeline.products.lyapunov import LyapunovFlag
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.chaos.analysis"
@@ -27,6 +30,53 @@ class DimensionOptions(Options):
     floor: float = option(1e-6, "Smallest resolved distance, in units of the states' scales.", gt=0.0)
 
 
+CHAOS_COLUMNS: Columns = (
+    *only(
+        IDENTIFIED_COLUMNS,
+        "n_sets attractor_id status attractor kind stability evidence orbit_period period_s share n_cells lyapunov_max "
+        "lyapunov_low lyapunov_high multiplier_real multiplier_imag eigenvalue_real eigenvalue_imag",
+    ),
+    *over(
+        "* +",
+        motion="kind of motion by its exponents",
+        contradicts="closed, and yet with a positive exponent",
+        is_transient="the chaos ended within the blocks",
+        drift_sigma="drift in standard errors",
+        zero_one="0-1 test, median over frequencies",
+        zero_one_low="0-1 test, lower quartile over frequencies",
+        zero_one_high="0-1 test, upper quartile over frequencies",
+        zero_one_stderr="0-1 test, standard error of the median from the choice of the frequencies",
+        zero_one_half="0-1 test of the later half of the sections",
+        oversampling="range of the observable over its mean step",
+    ),
+    *with_parts(over("* +", kaplan_yorke_dimension="Kaplan-Yorke dimension of the section"), "stderr"),
+    *over("* +", "1/{time}", drift="largest exponent, later minus earlier half"),
+    *over("* +", "1/{time}", audit="sum of the exponents minus the divergence"),
+    *with_parts(
+        over("* + exponent", lyapunov_per_period="Lyapunov exponents per {period}, in falling order"), "stderr"
+    ),
+    *over(
+        "set",
+        nature="what the attractor is",
+        exponents_from="where the exponents are from",
+        median_zero_one="0-1 test, median over the cells",
+        least_zero_one="0-1 test, least over the cells",
+        largest_zero_one="0-1 test, largest over the cells",
+        n_drifting="cells whose largest exponent drifts",
+        n_transient="cells whose chaos ended",
+        n_contradicting="cells that closed, and yet have a positive exponent",
+        attractor_correlation="correlation dimension of the section",
+        attractor_correlation_spread="slope of the lower half of the range minus the upper",
+        attractor_correlation_stderr="sampling error of the correlation dimension",
+    ),
+    *over("set", **{f"n_{flag.name.lower()}": f"cells flagged: {flag.sentence}" for flag in LyapunovFlag if flag > 1}),
+    *with_parts(over("set", attractor_kaplan_yorke="Kaplan-Yorke dimension of the section"), "stderr"),
+    *over("set rank", "1/{time}", attractor_lyapunov="Lyapunov exponents per unit time"),
+    *over("set rank", "1/{time}", attractor_lyapunov_stderr="their standard errors"),
+    *over("set rank", "1/{time}", attractor_lyapunov_between="standard deviation between cells beyond their errors"),
+    *over("rank", rank="exponents in falling order"),
+)
+
 CHAOS = Analysis(
     "chaos",
     """Tell regular from chaotic attractors: exponents, multipliers, dimensions, 0-1 test.
@@ -36,10 +86,28 @@ CHAOS = Analysis(
     lyapunov in the run's specification. The 0-1 test needs 200 sections.""",
     ChaosOptions,
     compute=f"{_ROOM}:chaos",
+    columns=CHAOS_COLUMNS,
     table="pipeline.analysis.chaos.analysis:chaos_table",
     builds_on=("attractors",),
     figure="lyapunov",
     by_point=True,
+)
+
+DIMENSION_COLUMNS: Columns = (
+    *only(IDENTIFIED_COLUMNS, "n_sets attractor kind stability share n_cells n_sampled n_left lifetime_low"),
+    *over(
+        "set",
+        n_points="points of the set",
+        reason="why there is no dimension",
+        correlation_dimension="correlation dimension of the section",
+        correlation_dimension_stderr="sampling error of the correlation dimension",
+        correlation_dimension_spread="slope of the lower half of the range minus the upper",
+        largest_resolved="largest dimension that so many points can show",
+        fit_low="least radius of the fit, scaled",
+        fit_high="largest radius of the fit, scaled",
+    ),
+    *over("set radius", log_radius="natural logarithm of the scaled radius"),
+    *over("set radius", log_correlation_sum="natural logarithm of the correlation sum"),
 )
 
 DIMENSION = Analysis(
@@ -51,6 +119,7 @@ DIMENSION = Analysis(
     of sections.""",
     DimensionOptions,
     compute=f"{_ROOM}:dimension",
+    columns=DIMENSION_COLUMNS,
     table="pipeline.analysis.chaos.analysis:dimension_table",
     needs=f"{_ROOM}:needs_dimension",
     settle=f"{_ROOM}:settle_dimension",

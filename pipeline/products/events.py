@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pipeline.products.branches import BranchOptions
+from pipeline.products.column import Columns, over, with_parts
 from pipeline.products.product import Analysis, option
 
 _ROOM = "pipeline.analysis.events.analysis"
@@ -25,6 +26,57 @@ class EventOptions(BranchOptions):
     )
 
 
+COLUMNS: Columns = (
+    *over(
+        "event",
+        attractor="id of the attractor",
+        set="kind of the attractor",
+        period="period of the attractor, 0 none",
+        period_after="period beyond a change, -1 none",
+        rises="1 if it ends as the parameter rises",
+        what="name of the event",
+        criticality="criticality",
+        evidence="what decided the event, or what was tried",
+        same_as="number of the event that this end belongs to",
+        bifurcation="number of the bifurcation, -1 none",
+        branch="branch of the attractor, -1 none",
+        other_branch="other branch there, -1 none",
+        is_own="1 if the bifurcation lies on its branch, 0 if the branch springs from it",
+        n_cells="cells of the attractor",
+        ratio="ratio of the last two intervals of a cascade",
+        exponent="minus the power of the distance with which times grow",
+        exponent_error="error of this exponent",
+        rotation="rotation number p/q of a locked orbit",
+        met_period="period of the unstable orbit that is met, 0 none",
+        twin="id of the set with which it merges, -1 none",
+        lives_beyond="1 if the set beyond meets the orbit",
+        stretch_of="stretch that ends",
+        stretch_after="stretch beyond a change, -1 none",
+    ),
+    *over(
+        "event",
+        "{parameter}",
+        value="parameter value of the event",
+        value_error="error of the value",
+        seen="last value with cells",
+        beyond="next value of the run beyond the event",
+    ),
+    *over("event doubling", "{parameter}", doublings="values of the doublings of a cascade"),
+    *over(
+        "event outcome",
+        to_attractor="ids on which the cells go on, -2 they diverge, -1 none",
+        to_cells="cells that go on on each",
+        to_stretch="stretches on which they go on, -2 they diverge, -1 none",
+    ),
+    *over("stretch", stretch_attractor="id of the attractor", stretch_set="kind of the attractor"),
+    *over("stretch", stretch_period="period of the attractor, 0 none"),
+    *over(
+        "stretch", "{parameter}", stretch_low="least value of the stretch", stretch_high="largest value of the stretch"
+    ),
+    *over("stretch end", stretch_side="class of motion, by the model's classifier"),
+    *with_parts(over("stretch end", stretch_fraction="basin fraction"), "low", "high"),
+)
+
 EVENTS = Analysis(
     "events",
     """Name the bifurcation at which each attractor begins, changes its period and ends along the swept parameter.
@@ -35,6 +87,7 @@ EVENTS = Analysis(
     prove them; all others are not decided.""",
     EventOptions,
     compute=f"{_ROOM}:events",
+    columns=COLUMNS,
     table="pipeline.analysis.events.sentences:events_table",
     needs=f"{_ROOM}:needs_one_axis",
     settle=f"{_ROOM}:settle_events",

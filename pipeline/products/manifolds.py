@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pipeline.products.branches import OrbitOptions
+from pipeline.products.column import STATES, Columns, over
 from pipeline.products.product import Analysis, option
 
 _ROOM = "pipeline.analysis.manifolds.analysis"
@@ -30,6 +31,20 @@ class TangencyOptions(OrbitOptions):
     chord: float = option(0.01, "Longest chord, in units of the states' scales.", gt=0.0)
 
 
+MANIFOLD_COLUMNS: Columns = (
+    *over(
+        "curve",
+        orbit="number of the orbit",
+        orbit_period="period of the orbit in {periods}",
+        stable="1 for a stable manifold",
+        direction="side of the orbit, 1 or -1",
+        n_points="points of the curve",
+        end="why the curve ends",
+    ),
+    *over("curve point", generation="generation and place within it"),
+    *over("curve point state", STATES, section="points of the curve"),
+)
+
 MANIFOLDS = Analysis(
     "manifolds",
     """Grow the stable and unstable manifolds of the saddle orbits at a parameter point, as curves.
@@ -38,10 +53,23 @@ MANIFOLDS = Analysis(
     if it has one stable multiplier.""",
     ManifoldOptions,
     compute=f"{_ROOM}:manifolds",
+    columns=MANIFOLD_COLUMNS,
     table=f"{_ROOM}:manifolds_table",
     needs="pipeline.analysis.branches.orbit_search:needs_point",
     builds_on=("orbits",),
     figure="manifolds",
+)
+
+TANGENCY_COLUMNS: Columns = (
+    *over(
+        "tangency",
+        orbit="number of the orbit",
+        orbit_period="period of the orbit in {periods}",
+        stable_side="side of the stable manifold, 1 or -1",
+        unstable_side="side of the unstable manifold, 1 or -1",
+        why_not="why there is no value",
+    ),
+    *over("tangency", "{parameter}", value="value of the parameter at the tangency"),
 )
 
 TANGENCY = Analysis(
@@ -51,6 +79,7 @@ TANGENCY = Analysis(
     For section maps with two states. Each pair of sides of the unstable and the stable manifold is examined.""",
     TangencyOptions,
     compute=f"{_ROOM}:tangency",
+    columns=TANGENCY_COLUMNS,
     table=f"{_ROOM}:tangency_table",
     needs=f"{_ROOM}:needs_tangency",
     builds_on=("orbits",),

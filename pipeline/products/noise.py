@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.products.column import STATES, Columns, over, with_parts
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.noise"
@@ -33,6 +34,41 @@ class DensityOptions(Options):
     skip: int = option(0, "Sections at the begin of the record that are not counted.", ge=0)
 
 
+ESCAPES_COLUMNS: Columns = (
+    *over(
+        "* set",
+        n_cells="cells that begin in the set",
+        n_left="cells that left",
+        at_risk="intervals at whose begin a cell was in the set",
+        left_share="share of the cells that left",
+        left_low="lower end of the interval of this share",
+        left_high="upper end of the interval of this share",
+        constant_p="p-value of a constant rate along the record",
+    ),
+    *over("* set", "s", interval="time between two looks at a cell"),
+    *with_parts(over("* set", "1/s", rate="rate of escape"), "low", "high"),
+    *over("* set", "1/s", rate_halved="rate of escape with halved steps"),
+    *over("* set to", n_to="cells that left, by the set to which they went"),
+    *over("* set state", STATES, exit_mean="mean state at which cells leave"),
+    *over("* set state", STATES, exit_std="standard deviation of the states at which cells leave"),
+    *over("* set lag", path_n="cells whose state is known so long before they leave"),
+    *over("* set lag state", STATES, path_mean="mean state before leaving"),
+    *over("* set lag state", STATES, path_std="standard deviation of the states before leaving"),
+    *over("set", set="set in which cells begin"),
+    *over("lag", lag="sections after the exit"),
+    *with_parts(
+        over("* set", "square of a strength", barrier="slope of the log rate over -1/strength^2, by Kramers' law"),
+        "low",
+        "high",
+    ),
+    *over(
+        "* set",
+        log_factor="natural logarithm of the factor of Kramers' law, of a rate in 1/s",
+        n_fitted="strengths that were fitted",
+        misfit_p="p-value of the misfit of Kramers' law",
+    ),
+)
+
 ESCAPES = Analysis(
     "escapes",
     """Measure how cells with noise leave a set: rates with intervals, where they go, and their last stretch.
@@ -41,12 +77,27 @@ ESCAPES = Analysis(
     begins in, by the model's classifier. Over an axis of a strength, rates are fitted by Kramers' law.""",
     EscapeOptions,
     compute=f"{_ROOM}.escapes:escapes",
+    columns=ESCAPES_COLUMNS,
     table=f"{_ROOM}.escapes:escapes_table",
     needs=f"{_ROOM}.escapes:needs_set",
     figure="escapes",
     motions=("noisy",),
     by_point=True,
     finish=f"{_ROOM}.escapes:finish_escapes",
+)
+
+DENSITY_COLUMNS: Columns = (
+    *over("* value", "1/{density_of}", density="density of the section points", smoothed="smoothed density"),
+    *over("*", n_points="section points", n_effective="independent points with the same error of the mean"),
+    *over("*", n_peaks="peaks of the smoothed density"),
+    *over("*", "{density_of}", bandwidth="bandwidth of the kernel"),
+    *over("*", "square of {density_of}", variance="variance of the state"),
+    *over("*", skewness="skewness of the state", kurtosis="excess kurtosis of the state"),
+    *over("* rank", "{density_of}", peak="places of the peaks, from the highest on"),
+    *over("* state", STATES, mean="mean of the state"),
+    *over("* state other_state", "units of the two states", covariance="covariance of two states"),
+    *over("value", "{density_of}", value="value of the state"),
+    *over("other_state", other_state="component of the state"),
 )
 
 DENSITY = Analysis(
@@ -56,6 +107,7 @@ DENSITY = Analysis(
     Over an axis this is a stochastic bifurcation diagram.""",
     DensityOptions,
     compute=f"{_ROOM}.density:density",
+    columns=DENSITY_COLUMNS,
     table=f"{_ROOM}.density:density_table",
     figure="density",
     motions=("noisy",),

@@ -23,6 +23,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_serializer
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from pipeline.products.column import Columns
+
 
 @dataclass(frozen=True)
 class Variable:
@@ -153,17 +155,21 @@ class Table:
         Reason for an empty result, if that is an error of the command; else empty.
     graph : dict, optional
         Node-link data that take the place of the rows in JSON.
+    header : sequence of str
+        Names of the columns, for a table that may have no rows.
     """
 
     rows: Sequence[Mapping[str, Any]]
     lines: Sequence[str]
     nothing: str = ""
     graph: Mapping[str, Any] | None = None
+    header: Sequence[str] = ()
 
     def csv(self) -> str:
         """Return the table's rows as CSV text, with NaN as empty fields."""
         text = io.StringIO()
-        writer = csv.DictWriter(text, dict.fromkeys(name for row in self.rows for name in row), lineterminator="\n")
+        names = dict.fromkeys(name for row in self.rows for name in row) or self.header
+        writer = csv.DictWriter(text, names, lineterminator="\n")
         writer.writeheader()
         writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in self.rows)
         return text.getvalue()
@@ -240,6 +246,9 @@ class Analysis:
     compute : str
         ``"module:function"``: ``compute(run, options)`` returns a Dataset. ``run.cube()`` is the cube, and
         ``run.derive(name, **options)`` another analysis of the same cells.
+    columns : tuple of Column
+        Variables of the Dataset, see `pipeline.products.column`. The dims and coordinates of the cube, and a variable
+        for each state, parameter or quantity of the model, are not among them.
     table : str
         ``"module:function"``: ``table(ds)`` returns a `Table`. Empty for a result that other analyses use and
         that has no command.
@@ -272,6 +281,7 @@ class Analysis:
     help: str
     options: type[Options]
     compute: str
+    columns: Columns = ()
     table: str = ""
     needs: str = ""
     settle: str = ""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pipeline.products.attractors import IDENTIFIED_COLUMNS
+from pipeline.products.column import STATES, Columns, in_parts, only, over, with_parts
 from pipeline.products.product import Analysis, Options, option
 
 
@@ -56,6 +58,53 @@ class EdgeOptions(Options):
     seed: int = option(0, "Seed that chooses the pairs.", ge=0)
 
 
+def _shock_columns(name: str, dims: str, text: str, of: str) -> Columns:
+    """Return the columns of a search for the smallest shock, of those of its results that are kept."""
+    meanings = {
+        "low": "no smaller shock leads away, as far as tried",
+        "high": "size of the smallest shock found that leads away",
+        "phase": "share of the period at which it happens",
+        "to": "attractor where it leads: -1 none, -2 diverges, -3 none of the run's",
+        "safe": "largest size of which all directions stayed",
+        "n_below": "smaller shocks that were tried and stayed",
+        "n_undecided": "smaller shocks whose end is not known",
+    }
+    return over(dims, **{f"{name}_{one}": f"{text}: {meanings[one]}" for one in of.split()})
+
+
+_SEARCHED = "low high phase to safe n_below n_undecided"
+
+RESILIENCE_COLUMNS: Columns = (
+    *only(IDENTIFIED_COLUMNS, "n_sets attractor kind stability orbit_period n_cells"),
+    *over("state", "see state_units", state_scale="size that counts as 1"),
+    *over("set state", STATES, shock="smallest critical shock: jump of each state"),
+    *over("set state", STATES, shock_from="smallest critical shock: state before it"),
+    *_shock_columns("shock", "set", "smallest critical shock", _SEARCHED),
+    *over("set state", STATES, distance="shortest way out of the basin: jump of each state"),
+    *over("set state", STATES, distance_from="shortest way out of the basin: state before it"),
+    *_shock_columns("distance", "set", "shortest way out of the basin", _SEARCHED),
+    *over("set state", STATES, along="boundary along a state: jump"),
+    *_shock_columns("along", "set state", "boundary along a state", "low high to n_undecided"),
+    *with_parts(over("set", basin_stability="share of the cells that end on it"), "low", "high"),
+    *with_parts(over("set", weighted_stability="share of the density that ends on it"), "low", "high"),
+    *over("set", n_effective="independent cells of equal weight with the same error"),
+    *with_parts(over("set", arrived="share of initial states that have arrived in time"), "low", "high"),
+    *over(
+        "set",
+        mean_time="mean time until arrival, {periods}",
+        mean_time_stderr="standard error of the mean time",
+        longest_time="longest time until arrival, {periods}",
+        n_timed="timed initial states that end on it",
+        weighted_time="mean time until arrival, weighed by the density, {periods}",
+        weighted_arrived="share of the density that has arrived in time",
+        amplification="largest factor by which a small disturbance grows",
+        quantity="quantity of the option",
+    ),
+    *over("set", "1/{time}", reactivity="largest growth rate of a small disturbance, at any phase"),
+    *over("set", "{time}", amplification_time="time after the disturbance at which it is largest"),
+    *over("set", "{time}", return_time="time in which small disturbances shrink by e at last"),
+)
+
 RESILIENCE = Analysis(
     "resilience",
     """Measure how attractors respond to shocks: critical shocks, distances to the boundary, arrival times.
@@ -65,6 +114,7 @@ RESILIENCE = Analysis(
     interval of a size.""",
     ResilienceOptions,
     compute="pipeline.analysis.resilience.analysis:resilience",
+    columns=RESILIENCE_COLUMNS,
     table="pipeline.analysis.resilience.analysis:resilience_table",
     needs="pipeline.analysis.resilience.analysis:needs_sweep",
     settle="pipeline.analysis.resilience.analysis:settle_resilience",
@@ -72,6 +122,24 @@ RESILIENCE = Analysis(
     figure="resilience",
     by_point=True,
     version=2,
+)
+
+EDGE_COLUMNS: Columns = (
+    *over(
+        "edge",
+        kind="kind of set",
+        orbit_period="period in {periods}",
+        residual="scaled residual of Newton's method",
+        n_points="section points",
+        n_pairs="pairs of cells whose paths end on it",
+    ),
+    *over("edge", "s", period_s="period"),
+    *over("edge point state", STATES, section="section points"),
+    *in_parts(over("edge multiplier", multiplier="Floquet multipliers"), "real", "imag"),
+    *in_parts(over("edge multiplier", "1/s", eigenvalue="eigenvalues at rest"), "real", "imag"),
+    *over("pair", pair_edge="edge state, -1 none", pair_reason="why there is none", n_steps="sections of the path"),
+    *over("pair side state", STATES, pair_start="initial states"),
+    *over("pair step state", STATES, path="path along the boundary"),
 )
 
 EDGE = Analysis(
@@ -82,6 +150,7 @@ EDGE = Analysis(
     equilibrium, Newton's method refines it.""",
     EdgeOptions,
     compute="pipeline.analysis.resilience.edge:edge",
+    columns=EDGE_COLUMNS,
     table="pipeline.analysis.resilience.edge:edge_table",
     needs="pipeline.analysis.resilience.edge:needs_pair",
     settle="pipeline.analysis.resilience.edge:settle_edge",

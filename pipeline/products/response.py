@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pipeline.products.branches import BranchOptions
+from pipeline.products.branches import BRANCH_COLUMNS, BranchOptions
+from pipeline.products.column import UNITS, Columns, only, over
 from pipeline.products.product import Analysis, option
 
 
@@ -11,6 +12,53 @@ class ResponseOptions(BranchOptions):
 
     harmonics: int = option(5, "Number of harmonics of the drive, or of the orbit of a flow.", ge=1, le=100)
 
+
+CHANNEL_COLUMNS: Columns = (
+    *over("channel", channel="state or quantity", unit="unit of the channel"),
+    *over("harmonic", harmonic="order of the harmonic"),
+)
+"""Coordinates of the measures of orbits."""
+
+
+def measured(dims: str, prefix: str = "") -> Columns:
+    """Return the columns of the measures of orbits that lie along some dims."""
+    amounts = {
+        "amplitude": "half of peak to peak",
+        "mean": "mean over the period",
+        "rms": "root of the mean square over the period",
+        "error": "largest error of the amplitudes",
+    }
+    channel, harmonic = f"{dims} channel", f"{dims} channel harmonic"
+    return (
+        *over(channel, UNITS, **{f"{prefix}{name}": text for name, text in amounts.items()}),
+        *over(
+            channel, **{f"{prefix}dominant_order": "order of the largest component, in units of the drive's frequency"}
+        ),
+        *over(harmonic, UNITS, **{f"{prefix}harmonic_amplitude": "amplitude of the harmonic"}),
+        *over(harmonic, "rad", **{f"{prefix}phase": "lag of the harmonic behind that of the drive"}),
+    )
+
+
+COLUMNS: Columns = (
+    *only(
+        BRANCH_COLUMNS,
+        "orbit_period n_points origin first_end last_end frequency rotation angle parameter n_unstable side period_s "
+        "kind of_branch after to_branch image bifurcation_side n_unstable_before n_unstable_after rises_before "
+        "criticality normal_form normal_form_error critical_real critical_imag value bracket bifurcation_period_s",
+    ),
+    *CHANNEL_COLUMNS,
+    *measured("branch point"),
+    *measured("bifurcation", "bifurcation_"),
+    *over("jump", "{parameter}", jump_beyond="value of the parameter beyond the bifurcation"),
+    *over(
+        "jump",
+        jump_bifurcation="bifurcation at which a stable orbit ends",
+        jump_rises="1 if the parameter rises",
+        jump_landing="where a trajectory lands",
+        jump_period="period of the orbit on which it lands",
+    ),
+    *over("jump channel", UNITS, jump_amplitude="half of peak to peak of the orbit on which it lands"),
+)
 
 RESPONSE = Analysis(
     "response",
@@ -21,6 +69,7 @@ RESPONSE = Analysis(
     where it lands.""",
     ResponseOptions,
     compute="pipeline.analysis.response.analysis:response",
+    columns=COLUMNS,
     table="pipeline.analysis.response.analysis:response_table",
     settle="pipeline.analysis.branches.analysis:settle_branches",
     builds_on=("branches",),

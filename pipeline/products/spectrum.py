@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pipeline.products.column import OWN, UNITS, Columns, over
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.spectrum.analysis"
@@ -53,6 +54,37 @@ class SpectrumOptions(SpectraOptions, CellOptions):
     """Options of spectra."""
 
 
+SPECTRUM_COLUMNS: Columns = (
+    *over("spectrum bin", "{unit}", amplitude="amplitude of the channel"),
+    *over("spectrum bin", OWN, power="power of the channel"),
+    *over("spectrum bin", "Hz", frequency_hz="frequency"),
+    *over("spectrum bin", order="multiple of the drive frequency"),
+    *over(
+        "spectrum",
+        attractor="attractor id",
+        kind="kind of set",
+        stability="what has been shown of the set",
+        orbit_period="period in {periods}",
+        share="share of the initial conditions",
+        estimate="how the spectrum was estimated",
+        n_averages="number of averaged segments",
+        kept="share of the variance in the bins",
+        n_interpolated="samples that were interpolated",
+        explained="share of a torus' power at combinations of its two frequencies",
+    ),
+    *over("spectrum", "{unit}", error="largest error of the amplitudes"),
+    *over("spectrum", OWN, variance="variance of the channel"),
+    *over(
+        "spectrum",
+        "Hz",
+        rate_hz="frequency of the drive, or mean rate of returns",
+        resolution_hz="distance of two bins",
+        bandwidth_hz="equivalent noise bandwidth of the window",
+        first_hz="first frequency of a torus: the drive's, or that of its strongest line",
+        second_hz="second frequency of a torus, up to its sign and multiples of the first",
+    ),
+)
+
 SPECTRUM = Analysis(
     "spectrum",
     """Measure the spectrum of each attractor: lines of closed orbits, otherwise a density with its resolution.
@@ -62,11 +94,44 @@ SPECTRUM = Analysis(
     frequency is given, if all its lines are combinations of two.""",
     SpectrumOptions,
     compute=f"{_ROOM}:spectrum",
+    columns=SPECTRUM_COLUMNS,
     table=f"{_ROOM}:spectrum_table",
     needs=f"{_ROOM}:needs_channel",
     settle=f"{_MOTIONS}:settle_motion",
     builds_on=("attractors",),
     figure="spectrum",
+)
+
+SERIES_COLUMNS: Columns = (
+    *over("quantity", quantity="quantity of the series", unit="unit of the quantity", reason="why there is no value"),
+    *over(
+        "quantity",
+        UNITS,
+        value="value of the quantity",
+        low="lower end of its interval",
+        high="upper end of its interval",
+    ),
+    *over("", attractor="attractor id"),
+    *over("lag", mutual_information="mutual information of the series and itself after a lag"),
+    *over("lag", "s", lag="lag"),
+    *over("dimension", dimension="dimension of the embedding", false_neighbours="share of false nearest neighbours"),
+    *over("elapsed", "s", elapsed="time since neighbours were nearest"),
+    *over(
+        "elapsed",
+        divergence="mean log distance of neighbours, of random pairs 0",
+        fit_line="line that was fitted to it",
+    ),
+    *over("embedding", embedding="dimension of the embedding"),
+    *over("radius", radius="radius over the standard deviation"),
+    *over("embedding radius", correlation_sum="share of pairs of vectors within the radius"),
+    *over("", fit_low="least radius of the fit", fit_high="largest radius of the fit"),
+    *over("return", "{unit}", maximum="height of a maximum", next_maximum="height of the next maximum"),
+    *over("delayed coordinate", "{unit}", vector="value, and value after the delay"),
+    *over("row", "s", row="time of a vector"),
+    *over("column", "s", column="time of a vector"),
+    *over("row column", recurrent="1 if the two vectors are near each other"),
+    *over("bin", "Hz", frequency_hz="frequency"),
+    *over("bin", OWN, power="density of the channel"),
 )
 
 SERIES = Analysis(
@@ -78,6 +143,7 @@ SERIES = Analysis(
     SeriesOptions,
     version=2,
     compute=f"{_SERIES}:series",
+    columns=SERIES_COLUMNS,
     table=f"{_SERIES}:series_table",
     needs=f"{_MOTIONS}:needs_motion",
     settle=f"{_MOTIONS}:settle_motion",

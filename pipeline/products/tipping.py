@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.products.column import STATES, Columns, over
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.tipping"
@@ -38,6 +39,34 @@ class DelayOptions(Options):
     static: float | None = option(None, "Value of the bifurcation at a parameter that does not move.", unit="SI")
 
 
+TIPPING_COLUMNS: Columns = (
+    *over("* +", outcome="attractor reached, -2 diverged, -1 none"),
+    *over(
+        "attractor",
+        attractor_kind="kind of set",
+        attractor_period="period in {periods}, 0 none",
+        attractor_n_cells="cells that end on it",
+        attractor_group="group of final parameters",
+    ),
+    *over("attractor state", STATES, attractor_point="section point"),
+    *over("group", final_parameters="values of the parameters at the end"),
+    *over(
+        "critical",
+        critical_start="initial condition",
+        critical_from="attractor below, -2 diverged",
+        critical_to="attractor above, -2 diverged",
+        critical_decided="1 if every one reached an attractor",
+        critical_n_evaluated="trajectories of the bisection",
+    ),
+    *over(
+        "critical",
+        "{parameter}",
+        critical_value="critical value of the parameter",
+        critical_low="last value with the first attractor",
+        critical_high="first value with the second one",
+    ),
+)
+
 TIPPING = Analysis(
     "tipping",
     """Find which attractor each trajectory reaches after its parameters have moved, and the critical rates.
@@ -46,10 +75,19 @@ TIPPING = Analysis(
     as by `attractors`. Where neighbouring values of the swept number lead to different attractors, it is bisected.""",
     TippingOptions,
     compute=f"{_ROOM}.analysis:tipping",
+    columns=TIPPING_COLUMNS,
     table=f"{_ROOM}.analysis:tipping_table",
     needs=f"{_ROOM}.analysis:needs_drift",
     figure="drift",
     motions=("drifting",),
+)
+
+OVERLAPS_COLUMNS: Columns = (
+    *over("", n_unknown="starts whose end is not known before or after"),
+    *over("before", before="attractor before, -2 diverges"),
+    *over("after", after="attractor after, -2 diverges"),
+    *over("before after", count="starts in both basins", probability="tipping probability"),
+    *over("before after", low="lower end of the interval", high="upper end of the interval"),
 )
 
 OVERLAPS = Analysis(
@@ -60,9 +98,16 @@ OVERLAPS = Analysis(
     after with the fraction of the basin that lies in basin j. Nothing is integrated for it.""",
     OverlapOptions,
     compute=f"{_ROOM}.overlaps:overlaps",
+    columns=OVERLAPS_COLUMNS,
     table=f"{_ROOM}.overlaps:overlaps_table",
     needs=f"{_ROOM}.overlaps:needs_basins",
     builds_on=("attractors",),
+)
+
+DELAY_COLUMNS: Columns = (
+    *over("* +", "{moving}", left="value of the moving parameter at which the cell leaves"),
+    *over("* +", "{moving}", delay="this value minus that of the static bifurcation"),
+    *over("* +", left_index="section at which it leaves, or -1"),
 )
 
 DELAY = Analysis(
@@ -73,6 +118,7 @@ DELAY = Analysis(
     --static the delay behind the bifurcation at a constant parameter is listed.""",
     DelayOptions,
     compute=f"{_ROOM}.delay:delay",
+    columns=DELAY_COLUMNS,
     table=f"{_ROOM}.delay:delay_table",
     needs=f"{_ROOM}.delay:needs_sections",
     figure="drift",

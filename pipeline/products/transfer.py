@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.products.column import UNITS, Columns, over, with_parts
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.transfer.analysis"
@@ -23,6 +24,43 @@ class TransferOptions(Options):
     seed: int = option(0, "Seed of the resamples.", ge=0)
 
 
+COLUMNS: Columns = (
+    *over(
+        "*",
+        n_pairs="pairs of sections",
+        n_boxes="boxes in which a pair begins",
+        outside="share of pairs that end outside the grid",
+        unknown="share of pairs that end in a box in which no pair begins",
+        n_closed="closed sets, which no path leaves",
+        n_sets="number of sets",
+    ),
+    *over("* mode", eigenvalue="slow eigenvalues on the one closed set, real part"),
+    *over("* mode", eigenvalue_imaginary="slow eigenvalues on the one closed set, imaginary part"),
+    *over("* axis", UNITS, width="width of the boxes"),
+    *over("axis", axis="state of the grid", unit="unit of the state"),
+    *over(
+        "set",
+        is_closed="1 if no path leaves the set",
+        measure="share of the stationary measure",
+        share="mean committor over all boxes: of a closed set, its share of the sampled states",
+        kept="share of its measure that stays in a step",
+        n_points="boxes of the set",
+    ),
+    *with_parts(over("set", "1/step", escape_rate="rate of escape"), "low", "high", "coarse"),
+    *with_parts(
+        over("set target", "steps", passage="mean steps from its core to the core of another set"),
+        "low",
+        "high",
+        "coarse",
+    ),
+    *over("sample axis", UNITS, place="centre of a box"),
+    *over("sample", density="stationary measure of a box, within its set"),
+    *with_parts(
+        over("sample", committor="probability to reach the core of its set before the others"), "low", "high", "coarse"
+    ),
+    *over("sample", is_core="1 in the core of its set"),
+)
+
 TRANSFER = Analysis(
     "transfer",
     """Estimate the transfer operator of the section map: almost invariant sets, committors, passage and escape.
@@ -31,6 +69,7 @@ TRANSFER = Analysis(
     pair leaves are closed; where there are not two of them, almost invariant sets are found.""",
     TransferOptions,
     compute=f"{_ROOM}:transfer",
+    columns=COLUMNS,
     table=f"{_ROOM}:transfer_table",
     needs=f"{_ROOM}:needs_pairs",
     figure="transfer",

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.precision import Precision
+from pipeline.layout.columns import described
 from pipeline.layout.conventions import conventional
 from pipeline.layout.own_words import in_own_words, rate_attribute
 from pipeline.layout.vocabulary import overrides_attribute
@@ -190,8 +191,9 @@ def derive(
 
 def shown_table(name: str, ds: xr.Dataset) -> Table:
     """Return the table of an analysis' result, in the words of the run's specification."""
-    found: Table = function_of(ANALYSES[name].table)(in_own_words(ds))
-    return found
+    from pipeline.analysis.tabular import shown
+
+    return shown(in_own_words(ds), function_of(ANALYSES[name].table))
 
 
 def analyses_in(text: str) -> list[str]:
@@ -336,6 +338,7 @@ def _compute(run: AnalysedRun, analysis: Analysis, options: Options, *, can_keep
             result = function_of(analysis.compute)(run, options)
         if analysis.finish:
             result = function_of(analysis.finish)(result, options)
+        result = described(result, analysis.columns, run.model)
     run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
     return result
 

@@ -18,62 +18,7 @@ Schema
 parameter point, in the order of the points), ``sample``, ``transition``, ``state``, ``multiplier``, and the
 dim of the model's angles. Coordinates are those of the cube, and ``attractor`` (set), the id. `ragged` reads rows.
 
-======================== ===================================== ============ ==================================
-variable                 dims                                  dtype, fill  meaning
-======================== ===================================== ============ ==================================
-``attractor_id``         parameter dims, start dims            int32, -1    which set; -1: see `status`
-``decision``             parameter dims, start dims            int8, 0      how it was decided, see below
-``status``               parameter dims, start dims            int8         as in the cube
-``ran_out``              parameter dims                        int8, 0      1 if the budget of the extension
-                                                                            ended before all was decided
-``growth_rate``          parameter dims                        float64, NaN of cells that grow: relative growth of
-``growth_factor``                                              float64, NaN their distance from where they began, at
-``growth_length``                                              int64, 0     the end [1/s], its factor, and sections
-``kind``                 set                                   int8, 0      `vocabulary.KINDS`
-``stability``            set                                   int8, 0      `vocabulary.STABILITIES`
-``evidence``             set                                   int8, 0      evidence for the stability:
-                                                                            `vocabulary.EVIDENCE`
-``orbit_period``         set                                   int32, 0     drive periods; 0 if not periodic
-``n_cells``              set                                   int64, 0     cells
-``share``                set                                   float64, 0   of all cells of the point; 0 of a set
-                                                                            that does not attract
-``n_sets``               parameter dims                        int32        rows of the point
-``attractor_points``     sample, state                         float64      section points, row after row
-``n_points``             set                                   int32        section points of the row
-``rotation``             set, angle                            float64, NaN mean turns per drive period
-``side``                 set                                   int8, 0      codes of the model's classifier
-``state_min``,           set, state                            float64, NaN range, below
-``state_max``
-``energy_min``,          set                                   float64, NaN range of the model's energy, below
-``energy_max``
-``mirror_partner``       set                                   int32, -1    set that is its image
-``mirror_distance``      set                                   float64, NaN nearest set to the image
-``multiplier_real``,     set, multiplier                       float64, NaN Floquet multipliers over the
-``multiplier_imag``                                                         orbit's period, by falling modulus
-``multiplier_error``     set                                   float64, NaN error of the largest modulus
-``residual``             set                                   float64, NaN certificate of Newton's method
-``is_polished``          set                                   int8, 0      1 if Newton's method converged
-``lyapunov_max``,        set                                   float64, NaN largest exponent [1/s], and its
-``lyapunov_low``,                                                           interval of 3 standard errors
-``lyapunov_high``
-``period_s``             set                                   float64, NaN period of a polished orbit [s]
-``eigenvalue_real``,     set, multiplier                       float64, NaN of an equilibrium [1/s], by
-``eigenvalue_imag``                                                         falling real part
-``n_sampled``            set                                   int64, 0     its cells that were extended, and
-                                                                            neighbours of them
-``n_left``               set                                   int64, 0     extended cells that left it
-``n_leaving``            set                                   int64, 0     extended cells near their end
-                                                                            from the start
-``n_to``, ``from_set``,  transition                            int64        cells that left, the row that they
-``to``                                                                      left, the id of the set of their end
-``time_at_risk``         set                                   float64, NaN sum over cells [drive periods]
-``mean_lifetime``,       set                                   float64, NaN lifetime and its interval, or its
-``lifetime_low``,                                                           lower bound and infinity [drive
-``lifetime_high``                                                           periods]; see `intervals`
-``dimension``            set                                   int8, 0      of a torus; 0 of any other set
-``closes_above``         set                                   int32, 0     period that cells seem to close
-                                                                            with, above the longest looked for
-======================== ===================================== ============ ==================================
+`pipeline.products.attractors` lists the variables.
 
 `attractor_points` holds an orbit's points in the order of time, or a sample of any other set. A model
 without angles, classifier, energy or symmetry lacks the variables that need it. For a polished orbit, ranges
@@ -229,18 +174,16 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
         for name, values in growth.items():
             values[index] = getattr(one, name)
         n_sets[index], ran_out[index] = len(one.features), one.ran_out
-    result[ROW_SIZE] = (dims, n_sets, {"units": "1", "long_name": "number of sets", "sample_dimension": SET})
-    result["ran_out"] = (dims, ran_out, {"units": "1", "long_name": "whether the extension's budget ended"})
-    for name, (units, text) in _GROWTH.items():
-        result[name] = (dims, growth[name], {"units": units, "long_name": text})
-    result["attractor_id"] = (cell_dims, ids, {"units": "1", "long_name": "attractor of the cell, -1 none"})
-    how = {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))}
-    result["decision"] = (cell_dims, decisions, how)
-    about = {"units": "1", "long_name": "what became of the cell", **ds["status"].attrs}
-    result["status"] = (cell_dims, ds["status"].transpose(*cell_dims).values, about)
+    result[ROW_SIZE] = (dims, n_sets, {"sample_dimension": SET})
+    result["ran_out"] = (dims, ran_out)
+    for name, values in growth.items():
+        result[name] = (dims, values)
+    result["attractor_id"] = (cell_dims, ids)
+    result["decision"] = (cell_dims, decisions, _flags(" ".join(DECISIONS)))
+    result["status"] = (cell_dims, ds["status"].transpose(*cell_dims).values, ds["status"].attrs)
     own = {*cell_dims, "state", *result["rotation"].dims} if "rotation" in result else {*cell_dims, "state"}
     result = result.assign_coords({k: v for k, v in ds.coords.items() if set(v.dims) <= own})
-    number = (SET, np.concatenate([np.arange(n, dtype=np.int32) for n in n_sets.ravel()]), _ID)
+    number = (SET, np.concatenate([np.arange(n, dtype=np.int32) for n in n_sets.ravel()]))
     plain = {**search.options.plain(), "tolerance": search.tolerance}
     settings = {f"identify_{k}": int(v) if isinstance(v, bool) else v for k, v in plain.items()}
     kept = {k: v for k, v in ds.attrs.items() if k != "title"}
@@ -249,13 +192,7 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
     )
 
 
-_GROWTH = {
-    "growth_rate": ("1/s", "relative growth of cells that grow, at the end of their extension"),
-    "growth_factor": ("1", "factor by which their distance from where they began grew"),
-    "growth_length": ("1", "sections over which it grew"),
-}
-
-_ID = {"units": "1", "long_name": "attractor"}
+_GROWTH = ("growth_rate", "growth_factor", "growth_length")
 
 
 def _rows(ds: xr.Dataset, found: Sequence[Found], search: Search) -> dict[str, Any]:
@@ -266,21 +203,20 @@ def _rows(ds: xr.Dataset, found: Sequence[Found], search: Search) -> dict[str, A
     angle_dim = model.angle_dim if model is not None else "angle"
     variables: dict[str, Any] = {}
     for name in _names(search.dynamics):
-        own, dtype, fill, units, text = _TABLE[name]
+        own, dtype, fill = _TABLE[name]
         values = np.full((len(features), *(sizes[d] for d in own)), fill, dtype)
         for row, x in enumerate(features):
             known = _value(x, name)
             if known is not None:
                 values[row] = known
         dims = (SET, *(angle_dim if d == "angle" else d for d in own))
-        variables[name] = (dims, values, {"units": units, "long_name": text, **_words_of(name, model)})
+        variables[name] = (dims, values, _words_of(name, model))
     variables["n_cells"][1][:] = [n for one in found for n in one.counts]
     variables["share"][1][:] = [x for one in found for x in _shares(one)]
     variables[N_POINTS][1][:] = [len(x.points) for x in features]
     variables[N_POINTS][2]["sample_dimension"] = SAMPLE
     points = np.concatenate([np.zeros((0, n_states)), *(x.points for x in features)])
-    about = {"units": _BY_STATE, "long_name": "section points"}
-    return {**variables, "attractor_points": ((SAMPLE, "state"), points, about), **_transitions(features)}
+    return {**variables, "attractor_points": ((SAMPLE, "state"), points), **_transitions(features)}
 
 
 def _value(x: Features, name: str) -> Any:
@@ -309,11 +245,7 @@ def _transitions(features: Sequence[Features]) -> dict[str, Any]:
         if n
     ]
     table = np.array(rows, np.int64).reshape(-1, 3)
-    names = {"from_set": "row of the set that was left", "to": "set of the end", "n_to": "cells that left"}
-    return {
-        name: (TRANSITION, table[:, k], {"units": "1", "long_name": text})
-        for k, (name, text) in enumerate(names.items())
-    }
+    return {name: (TRANSITION, table[:, k]) for k, name in enumerate(("from_set", "to", "n_to"))}
 
 
 def _words_of(name: str, model: Model | None) -> dict[str, Any]:
@@ -324,7 +256,8 @@ def _words_of(name: str, model: Model | None) -> dict[str, Any]:
     if name == "side" and model is not None and model.classifier is not None:
         return flags_of(model.classifier)
     if name.startswith("energy_") and model is not None:
-        return {"units": model.quantity(ENERGY).unit}
+        end = "least" if name == "energy_min" else "largest"
+        return {"units": model.quantity(ENERGY).unit, "long_name": f"{end} energy"}
     return {}
 
 
@@ -351,44 +284,42 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
     return result
 
 
-_BY_STATE = "see state_units"
-
-_TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
-    "kind": ((), "int8", 0, "1", "kind of set"),
-    "stability": ((), "int8", 0, "1", "what has been shown of the set"),
-    "evidence": ((), "int8", 0, "1", "what the stability rests on"),
-    "orbit_period": ((), "int32", 0, "1", "period in drive periods, 0 if bounded or absent"),
-    "n_cells": ((), "int64", 0, "1", "cells on the attractor"),
-    "share": ((), "float64", 0.0, "1", "share of all cells of the parameter point"),
-    N_POINTS: ((), "int32", 0, "1", "stored section points"),
-    "rotation": (("angle",), "float64", np.nan, "1", "mean rotation, turns per drive period"),
-    "side": ((), "int8", 0, "1", "what the model calls the motion"),
-    "state_min": (("state",), "float64", np.nan, _BY_STATE, "least value of the state"),
-    "state_max": (("state",), "float64", np.nan, _BY_STATE, "largest value of the state"),
-    "energy_min": ((), "float64", np.nan, "1", "least energy"),
-    "energy_max": ((), "float64", np.nan, "1", "largest energy"),
-    "mirror_partner": ((), "int32", -1, "1", "attractor that is the mirror image, -1 none"),
-    "mirror_distance": ((), "float64", np.nan, "1", "distance from the mirror image"),
-    "multiplier_real": (("multiplier",), "float64", np.nan, "1", "Floquet multipliers, real part"),
-    "multiplier_imag": (("multiplier",), "float64", np.nan, "1", "Floquet multipliers, imaginary part"),
-    "residual": ((), "float64", np.nan, "1", "scaled distance of the orbit's first point from its image"),
-    "multiplier_error": ((), "float64", np.nan, "1", "error of the largest modulus of the multipliers"),
-    "is_polished": ((), "int8", 0, "1", "whether Newton's method converged"),
-    "lyapunov_max": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent"),
-    "lyapunov_low": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent, lower end of its interval"),
-    "lyapunov_high": ((), "float64", np.nan, "1/s", "largest Lyapunov exponent, upper end of its interval"),
-    "period_s": ((), "float64", np.nan, "s", "period of a polished orbit"),
-    "eigenvalue_real": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, real part"),
-    "eigenvalue_imag": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, imaginary part"),
-    "n_sampled": ((), "int64", 0, "1", "cells of the set, and neighbours, that were extended"),
-    "n_left": ((), "int64", 0, "1", "extended cells that left the set"),
-    "n_leaving": ((), "int64", 0, "1", "extended cells that were near their end from the start"),
-    "time_at_risk": ((), "float64", np.nan, "1", "time on the set in all, drive periods"),
-    "mean_lifetime": ((), "float64", np.nan, "1", "mean lifetime in drive periods"),
-    "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
-    "lifetime_high": ((), "float64", np.nan, "1", "upper end of the interval, drive periods"),
-    "dimension": ((), "int8", 0, "1", "dimension of a torus, 0 of any other set"),
-    "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
+_TABLE: dict[str, tuple[tuple[str, ...], str, float]] = {
+    "kind": ((), "int8", 0),
+    "stability": ((), "int8", 0),
+    "evidence": ((), "int8", 0),
+    "orbit_period": ((), "int32", 0),
+    "n_cells": ((), "int64", 0),
+    "share": ((), "float64", 0.0),
+    N_POINTS: ((), "int32", 0),
+    "rotation": (("angle",), "float64", np.nan),
+    "side": ((), "int8", 0),
+    "state_min": (("state",), "float64", np.nan),
+    "state_max": (("state",), "float64", np.nan),
+    "energy_min": ((), "float64", np.nan),
+    "energy_max": ((), "float64", np.nan),
+    "mirror_partner": ((), "int32", -1),
+    "mirror_distance": ((), "float64", np.nan),
+    "multiplier_real": (("multiplier",), "float64", np.nan),
+    "multiplier_imag": (("multiplier",), "float64", np.nan),
+    "residual": ((), "float64", np.nan),
+    "multiplier_error": ((), "float64", np.nan),
+    "is_polished": ((), "int8", 0),
+    "lyapunov_max": ((), "float64", np.nan),
+    "lyapunov_low": ((), "float64", np.nan),
+    "lyapunov_high": ((), "float64", np.nan),
+    "period_s": ((), "float64", np.nan),
+    "eigenvalue_real": (("multiplier",), "float64", np.nan),
+    "eigenvalue_imag": (("multiplier",), "float64", np.nan),
+    "n_sampled": ((), "int64", 0),
+    "n_left": ((), "int64", 0),
+    "n_leaving": ((), "int64", 0),
+    "time_at_risk": ((), "float64", np.nan),
+    "mean_lifetime": ((), "float64", np.nan),
+    "lifetime_low": ((), "float64", np.nan),
+    "lifetime_high": ((), "float64", np.nan),
+    "dimension": ((), "int8", 0),
+    "closes_above": ((), "int32", 0),
 }
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 

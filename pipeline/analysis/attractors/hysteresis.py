@@ -14,7 +14,18 @@ import xarray as xr
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, unit_of, value_with_error, values, words_of
+from pipeline.analysis.tabular import (
+    Row,
+    Words,
+    aligned,
+    counted,
+    header_of,
+    plain,
+    unit_of,
+    value_with_error,
+    values,
+    words_of,
+)
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.products.attractors import HysteresisOptions
@@ -72,10 +83,7 @@ def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     )
     differs = (present[..., 0, :] != present[..., 1, :]).any(axis=-1) & present.any(axis=-1).all(axis=-1)
     result = xr.Dataset(
-        {
-            "present": ((*order, "direction", "attractor"), present, {"units": "1", "long_name": "met by a branch"}),
-            "differs": (tuple(order), differs, {"units": "1", "long_name": "up and down meet other attractors"}),
-        },
+        {"present": ((*order, "direction", "attractor"), present), "differs": (tuple(order), differs)},
         coords={
             **{d: ids[d] for d in order if d in ids.coords},
             "direction": ["up", "down"],
@@ -85,7 +93,7 @@ def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     along = ids[path].values if path in ids.coords else np.arange(ids.sizes[path])
     return (
         result.assign(_loops(present, differs, along, order, ids))
-        .assign(_jumps(values, direction, along, str(ids[path].attrs.get("units", "1")) if path in ids.coords else "1"))
+        .assign(_jumps(values, direction, along))
         .transpose(*dims, ...)
         .assign_attrs(path=path)
     )
@@ -118,29 +126,12 @@ def _loops(
     def counts(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.array([(a[i][s:e] & ~b[i][s:e]).sum(axis=0) for i, s, e in rows], np.int64).reshape(len(rows), n)
 
-    units = {"units": ids[order[-1]].attrs.get("units", "1")} if order[-1] in ids.coords else {"units": "1"}
     loops: dict[str, Any] = {
-        "loop_from": (
-            "loop",
-            np.array([along[s] for _, s, _ in rows]),
-            {**units, "long_name": "first value of the path"},
-        ),
-        "loop_to": (
-            "loop",
-            np.array([along[e - 1] for _, _, e in rows]),
-            {**units, "long_name": "last value of the path"},
-        ),
-        "loop_points": ("loop", np.array([e - s for _, s, e in rows], np.int64), {"units": "1", "long_name": "points"}),
-        "only_up": (
-            ("loop", "attractor"),
-            counts(up, down),
-            {"units": "1", "long_name": "points at which only up meets it"},
-        ),
-        "only_down": (
-            ("loop", "attractor"),
-            counts(down, up),
-            {"units": "1", "long_name": "points at which only down meets it"},
-        ),
+        "loop_from": ("loop", np.array([along[s] for _, s, _ in rows])),
+        "loop_to": ("loop", np.array([along[e - 1] for _, _, e in rows])),
+        "loop_points": ("loop", np.array([e - s for _, s, e in rows], np.int64)),
+        "only_up": (("loop", "attractor"), counts(up, down)),
+        "only_down": (("loop", "attractor"), counts(down, up)),
     }
     for k, name in enumerate(order[:-1]):
         values = [ids[name].values[i[k]] for i, _, _ in rows]
@@ -148,7 +139,7 @@ def _loops(
     return loops
 
 
-def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray, unit: str) -> dict[str, Any]:
+def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray) -> dict[str, Any]:
     found: dict[tuple[int, int, int, int, int], int] = {}
     for index in np.ndindex(*values.shape[:-2]):
         for branch, word in enumerate(direction):
@@ -163,18 +154,15 @@ def _jumps(values: np.ndarray, direction: np.ndarray, along: np.ndarray, unit: s
     kinds = sorted(found)
     rows = np.array(kinds, np.int64).reshape(-1, 5)
     counts = np.array([found[kind] for kind in kinds], np.int64)
-    texts = {
-        "jump_from": (along[rows[:, 1]], "value of the path before"),
-        "jump_to": (along[rows[:, 2]], "value of the path after"),
-        "jump_direction": ((-rows[:, 0]).astype(np.int8), "direction of the walk, 1 up, -1 down"),
-        "jump_from_id": (rows[:, 3].astype(np.int32), "attractor before"),
-        "jump_to_id": (rows[:, 4].astype(np.int32), "attractor after"),
-        "jump_count": (counts, "branches"),
+    columns = {
+        "jump_from": along[rows[:, 1]],
+        "jump_to": along[rows[:, 2]],
+        "jump_direction": (-rows[:, 0]).astype(np.int8),
+        "jump_from_id": rows[:, 3].astype(np.int32),
+        "jump_to_id": rows[:, 4].astype(np.int32),
+        "jump_count": counts,
     }
-    units = {"jump_from": unit, "jump_to": unit}
-    return {
-        name: ("jump", data, {"units": units.get(name, "1"), "long_name": text}) for name, (data, text) in texts.items()
-    }
+    return {name: ("jump", values) for name, values in columns.items()}
 
 
 def needs_directions(run: OpenRun, options: HysteresisOptions) -> None:
@@ -222,9 +210,7 @@ def with_events(ds: xr.Dataset, events: xr.Dataset) -> xr.Dataset:
         columns[name] = np.append(events[name].values, np.nan)[known]
     added: dict[str, Any] = {f"jump_{name}": ("jump", column) for name, column in columns.items()}
     found = ds.assign({"jump_event": ("jump", known), **added})
-    found["jump_what"].attrs = {"long_name": "event at which the attractor ends", **code_flags(["none", *names])}
-    for name in ("jump_value", "jump_value_error"):
-        found[name].attrs = {"units": events["value"].attrs["units"], "long_name": "parameter value of the event"}
+    found["jump_what"].attrs = code_flags(["none", *names])
     return found
 
 
@@ -233,12 +219,12 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
     loops.
     """
     names = [f"jump_{name}" for name in ("from", "to", "from_id", "to_id", "count", "what", "value", "value_error")]
-    jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
-    rows = [
-        {"direction": "up" if one["jump_direction"] > 0 else "down"}
-        | {n.removeprefix("jump_"): v for n, v in values(one, *names).items()}
-        for one in jumps
-    ]
+
+    def row_of(one: xr.Dataset) -> Row:
+        told = {name.removeprefix("jump_"): value for name, value in values(one, *names).items()}
+        return {"direction": "up" if one["jump_direction"] > 0 else "down", **told}
+
+    rows = [row_of(ds.isel(jump=i)) for i in range(ds.sizes["jump"])]
     path, n = ds.attrs["path"], ds.sizes["loop"]
     unit = f"{path}{unit_of(ds, path)}" if path in ds.coords else path
     words = [
@@ -258,7 +244,7 @@ def hysteresis_table(ds: xr.Dataset) -> Table:
         f"jumps of the branches: {sum(row['count'] for row in rows) or 'none'}",
         *aligned(words),
     ]
-    return Table(rows, lines)
+    return Table(rows, lines, header=header_of(ds, "jump", row_of))
 
 
 def _event_words(row: Row) -> str:

@@ -161,7 +161,7 @@ def match(
         "match_connect": int(connect),
     }
     flags = {"flag_values": np.arange(len(BASES), dtype=np.int8), "flag_meanings": " ".join(BASES)}
-    about = {"units": "1", "long_name": "what the id rests on", **flags}
+    about = flags
     return _renumbered(attractors.assign(match_basis=(SET, ids.basis, about)), ids.ids).assign_attrs(attrs)
 
 

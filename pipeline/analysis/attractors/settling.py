@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.ragged import dims_of
+from pipeline.analysis.ragged import SET, dims_of
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, plain, sets_of, values
+from pipeline.analysis.tabular import Row, Words, aligned, at_point, header_of, number, plain, sets_of, values
 from pipeline.layout.vocabulary import APERIODIC, model_of, periods_of
 from pipeline.products.product import Options, Table
 
@@ -57,7 +57,8 @@ def settling_table(ds: xr.Dataset) -> Table:
         for row, (where, one) in found
     ]
     if not rows:
-        return Table(rows, ["sets that do not close: none, so there is nothing to extend"])
+        header = (*dims, "attractor_id", *header_of(ds, SET, _row), "to")
+        return Table(rows, ["sets that do not close: none, so there is nothing to extend"], header=header)
     head = f"sets that do not close: {len(rows)}; lifetimes are in {periods_of(model_of(ds))}"
     return Table(rows, [head, *aligned([_words(ds, row, dims) for row in rows])])
 

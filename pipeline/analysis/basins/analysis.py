@@ -30,7 +30,7 @@ from pipeline.analysis.tabular import (
 )
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import letter, split_dims
-from pipeline.products.basins import BasinOptions
+from pipeline.products.basins import OTHERS, BasinOptions
 from pipeline.products.product import Table
 
 
@@ -86,10 +86,7 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     columns |= {name: ds[name].values for name in ("n_inferred", *FRACTION, "fraction_if_all", "high_if_all")}
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*(c.tolist() for c in columns.values()), strict=True)]
     return rows + [
-        _other_row(ds, at, where, name)
-        for at, where in points_of(ds, dims)
-        for name in _OTHERS
-        if ds[name].isel(at) > 0
+        _other_row(ds, at, where, name) for at, where in points_of(ds, dims) for name in OTHERS if ds[name].isel(at) > 0
     ]
 
 
@@ -98,7 +95,7 @@ def _other_row(ds: xr.Dataset, at: Mapping[str, int], where: Row, name: str) -> 
     count, n = int(ds[name].isel(at)), int(ds["n_cells"].isel(at))
     settings: dict[str, Any] = {"confidence": ds.attrs["basin_confidence"], "method": ds.attrs["basin_interval"]}
     low, high = (float(end) for end in binomial_interval(count, n, **settings))
-    told = {"label": NO_OUTCOME, "outcome": _OTHERS[name], "n_cells": count, "n_inferred": 0}
+    told = {"label": NO_OUTCOME, "outcome": OTHERS[name], "n_cells": count, "n_inferred": 0}
     return {
         **where,
         **told,
@@ -113,25 +110,10 @@ def _other_row(ds: xr.Dataset, at: Mapping[str, int], where: Row, name: str) -> 
 NO_OUTCOME = -1
 """Label of the rows of cells without an outcome."""
 
-_OTHERS = {
-    "n_pending": "pending",
-    "n_not_settled": "not settled",
-    "n_transient": "on a transient set",
-    "n_unstable": "on an unstable orbit or equilibrium",
-    "n_neutral": "on a neutral set",
-    "n_growing": "growing",
-    "n_step_limit": "step limit",
-    "n_step_underflow": "step underflow",
-    "n_unreached": "unreached",
-    "n_no_return": "no return",
-    "n_chatter": "chatter",
-}
-"""Variables that count the cells without an outcome, and the reasons (`pipeline.analysis.outcomes.other_cells`)."""
-
 
 def _sentence(ds: xr.Dataset) -> str:
     counts = {"diverged": int(ds["count"].values[ds["attractor"].values == DIVERGED].sum())}
-    counts |= {text: int(ds[name].sum()) for name, text in _OTHERS.items()}
+    counts |= {text: int(ds[name].sum()) for name, text in OTHERS.items()}
     return told(ds["outcome"].size, {text: n for text, n in counts.items() if n})
 
 
@@ -215,7 +197,7 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
         cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). One row (`pipeline.analysis.ragged`)
         for each outcome of cells at each parameter point, with `attractor`, the id or -2: the variables of
         `numbers.basin_rows`, in which cells without an outcome count as unfinished. On the
-        parameter dims the number of the latter by reason, such as `n_not_settled` and `n_no_return` (`_OTHERS`);
+        parameter dims the number of the latter by reason, such as `n_not_settled` and `n_no_return` (`OTHERS`);
         they add up to `n_unfinished`.
 
         If the starts are a grid, evenly spaced along every axis, on the parameter dims:
@@ -236,7 +218,7 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
     labels = outcomes(ids).transpose(*dims, *start_dims)
     result = ids[["attractor_id", "decision", "status", "ran_out"]]
     result["n_periods"] = ds["n_periods"].transpose(*dims, *start_dims).load()
-    result["outcome"] = labels.assign_attrs(units="1", long_name="attractor that the cell ends on")
+    result["outcome"] = labels
     inferred = (ids["status"] == vocabulary.INFERRED).transpose(*dims, *start_dims)
     result = result.merge(basin_rows(labels, dims, inferred, options.confidence, options.interval))
     result = result.assign(_unfinished(ids, dims))
@@ -266,12 +248,10 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
     others = other_cells(ids)
     shape = ids["attractor_id"].transpose(*dims, ...).shape
     found = {}
-    for name, reason in _OTHERS.items():
+    for name, reason in OTHERS.items():
         which = others.get(reason, np.zeros(shape, bool))
         count = which.reshape(*shape[: len(dims)], -1).sum(axis=-1, dtype=np.int64)
-        found[name] = xr.DataArray(
-            count, dims=dims, attrs={"units": "1", "long_name": f"cells without an outcome: {reason}"}
-        )
+        found[name] = xr.DataArray(count, dims=dims)
     return found
 
 
@@ -300,43 +280,35 @@ def _problems(shape: tuple[int, ...], options: BasinOptions) -> dict[str, str]:
     return found
 
 
-_LONG_NAMES = {
-    "basin_entropy": ("nat", "basin entropy"),
-    "boundary_basin_entropy": ("nat", "boundary basin entropy"),
-    "uncertainty_exponent": ("1", "uncertainty exponent"),
-    "wada_beyond": ("1", "part of all cells that is off the common boundary"),
-    "above_ln2_surely": ("1", "boundary basin entropy surely above ln 2: a fractal boundary; -1 not known"),
-    "boundary_dimension": ("1", "dimension of the basin boundary"),
-    "exponent_r_squared": ("1", "R squared of the fit of the uncertainty exponent"),
-    "wada_distance": ("cells", "largest distance between boundaries, the least radius that passes"),
-    "wada": ("1", "passes the Wada merge test; -1 fewer than three labels"),
-}
 _FLAGS = ("above_ln2_surely", "wada")
 _WITH_ERRORS = ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent", "wada_beyond")
 _ERRORS = ("stderr", "low", "high")
+_MEASURES = (
+    *(f"{name}{end}" for name in _WITH_ERRORS for end in ("", *(f"_{error}" for error in _ERRORS))),
+    "boundary_dimension",
+    "exponent_r_squared",
+    "wada_distance",
+    *_FLAGS,
+)
+"""Measures of the boundaries."""
 
 
 def _boundaries(
     labels: xr.DataArray, dims: tuple[str, ...], options: BasinOptions, missing: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Measure the basin boundaries at each parameter point; return variables as (dims, values, attributes)."""
+    """Measure the basin boundaries at each parameter point; return variables as (dims, values)."""
     shape, grid = labels.shape[: len(dims)], labels.shape[len(dims) :]
     points = [dict(_boundary(one, options, missing)) for one in labels.values.reshape(-1, *grid)]
     found: dict[str, Any] = {}
-    for name, (units, text) in _LONG_NAMES.items():
-        ends = ("", *(f"_{end}" for end in _ERRORS)) if name in _WITH_ERRORS else ("",)
-        for end in ends:
-            lacking = -1 if name in _FLAGS else np.nan
-            values = np.array([point.get(name + end, lacking) for point in points])
-            values = values.astype(np.int8 if name in _FLAGS else np.float64).reshape(shape)
-            long_name = text + end.replace("_stderr", ", standard error").replace("_", ", ")
-            found[name + end] = (dims, values, {"units": units, "long_name": long_name})
+    for name in _MEASURES:
+        is_flag = name in _FLAGS
+        values = np.array([point.get(name, -1 if is_flag else np.nan) for point in points])
+        found[name] = (dims, values.astype(np.int8 if is_flag else np.float64).reshape(shape))
     if "uncertainty exponent" not in missing:
         epsilon = epsilons_of(None, grid, options.scaling)
         values = np.array([point.get("uncertain", np.full(len(epsilon), np.nan)) for point in points])
-        attrs = {"units": "1", "long_name": "uncertain part of the region"}
-        found["uncertain"] = ((*dims, "epsilon"), values.reshape(*shape, len(epsilon)), attrs)
-        found["epsilon"] = ("epsilon", epsilon, {"units": "cells"})
+        found["uncertain"] = ((*dims, "epsilon"), values.reshape(*shape, len(epsilon)))
+        found["epsilon"] = ("epsilon", epsilon)
     return found
 
 

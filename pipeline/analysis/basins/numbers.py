@@ -78,12 +78,10 @@ def basin_rows(
         inverse, weights=inferred.values.reshape(grid.shape)[point, cell], minlength=len(rows)
     ).astype(np.int64)
     found = xr.Dataset({name: (SET, values) for name, values in fractions.items()})
-    found["fraction"].attrs = {"long_name": "basin fraction of all cells", "units": "1"}
     sizes = np.bincount(point_of_row, minlength=len(grid)).astype(np.int32)
-    found[ROW_SIZE] = (dims, sizes.reshape(shape), {"units": "1", "long_name": "number of outcomes"})
+    found[ROW_SIZE] = (dims, sizes.reshape(shape))
     found = found.assign(_of_points(dims, n_cells.reshape(shape), n_unfinished.reshape(shape), confidence))
-    about = {"units": "1", "long_name": "attractor, or -2 of cells that diverged"}
-    return found.assign_coords(attractor=(SET, outcome.astype(np.int32), about))
+    return found.assign_coords(attractor=(SET, outcome.astype(np.int32)))
 
 
 def unseen_bound(n: npt.NDArray[np.int64], confidence: float = 0.95) -> npt.NDArray[np.float64]:

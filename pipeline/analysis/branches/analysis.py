@@ -14,7 +14,6 @@ from pipeline.analysis.branches.completeness import counted_lines, searched_line
 from pipeline.analysis.branches.kinds import (
     BRANCH_POINTS,
     BRANCHING,
-    COEFFICIENTS,
     CURVE_WHY,
     FOLD,
     HOMOCLINIC,
@@ -24,10 +23,10 @@ from pipeline.analysis.branches.kinds import (
     PITCHFORK,
 )
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, value_with_error, values
+from pipeline.analysis.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values
 from pipeline.layout.own_words import RATE, axis_in_own_words, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
-from pipeline.products.branches import BranchOptions, CurveOptions
+from pipeline.products.branches import COEFFICIENTS, BranchOptions, CurveOptions
 from pipeline.products.product import Table
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.tables import FREQUENCY
@@ -199,18 +198,16 @@ def branches_table(ds: xr.Dataset) -> Table:
     head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
     head += ", mirror images counted once" if any(row.get("mirror_branch", -1) >= 0 for row in rows) else ""
     lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
-    return Table(
-        rows,
-        [
-            *lines,
-            *_unbounded(ds),
-            *_detached(ds),
-            *_no_equilibria(ds),
-            *counted_lines(ds),
-            *searched_lines(ds),
-            *listed(ds, "left_out"),
-        ],
-    )
+    lines += [*_unbounded(ds), *_detached(ds), *_no_equilibria(ds), *counted_lines(ds), *searched_lines(ds)]
+    header = (parameter_name(str(ds.attrs["parameter"])), *_COLUMNS)
+    return Table(rows, [*lines, *listed(ds, "left_out")], header=header)
+
+
+_COLUMNS = (
+    *("bracket", "label", "type", "criticality", "period", "multiplier_real", "multiplier_imag", "normal_form"),
+    *("normal_form_error", "unstable_below", "unstable_above", "period_s", "branch", "to_branch"),
+)
+"""Columns that the table of bifurcations has in any case."""
 
 
 def _no_equilibria(ds: xr.Dataset) -> list[str]:
@@ -586,7 +583,9 @@ def curves_table(ds: xr.Dataset) -> Table:
     equilibria have the coefficients of their normal forms (see `pipeline.analysis.branches.center_manifold`).
     """
     names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
-    rows = [_special(ds, names, k) for k in range(ds.sizes["special"])]
+    known = [ds[role].values[np.isfinite(ds[role].values)] for role in ("first", "second")]
+    ranges = [float(np.ptp(own)) if own.size else 0.0 for own in known]
+    rows = [_special(ds.isel(special=k), names, ranges) for k in range(ds.sizes["special"])]
     rows.sort(key=lambda row: (row["type"], row[names[0]]))
     lines = [f"{counted(ds.sizes['curve'], 'curve')} in the plane of {' and '.join(names)}"]
     lines += [_curve_line(ds.isel(curve=i), i, names) for i in range(ds.sizes["curve"])]
@@ -595,12 +594,11 @@ def curves_table(ds: xr.Dataset) -> Table:
         lines += ["", f"{counted(missed, 'sign change')} of test functions could not be located: points may be missing"]
     if rows:
         lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
-    return Table(rows, [*lines, *listed(ds, "left_out")])
+    header = header_of(ds, "special", lambda one: _special(one, names, ranges))
+    return Table(rows, [*lines, *listed(ds, "left_out")], header=header)
 
 
-def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
-    one = ds.isel(special=k)
-    ranges = [float(np.nanmax(ds[role].values) - np.nanmin(ds[role].values)) for role in ("first", "second")]
+def _special(one: xr.Dataset, names: list[str], ranges: list[float]) -> Row:
     errors = [float(one[f"special_{role}_error"]) for role in ("first", "second")]
     kind = values(one, "special_kind")["special_kind"]
     return {
@@ -611,16 +609,16 @@ def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
         "period": int(one["special_period"]),
         "error": max((e / r for e, r in zip(errors, ranges, strict=True) if r > 0.0), default=np.nan),
         "curve": int(one["special_curve"]),
-        **{name: float(one[f"special_{name}"]) for name in COEFFICIENTS if f"special_{name}" in one},
+        **{f"coefficient_{n}": float(one[f"special_{n}"]) for n in COEFFICIENTS if f"special_{n}" in one},
     }
 
 
 def _special_words(row: Row) -> Words:
-    own = {name: row[name] for name in COEFFICIENTS if name in row and row[name] == row[name]}
+    own = {name: row[key] for name in COEFFICIENTS if (key := f"coefficient_{name}") in row}
     words = {name: f"{value:.7f}" if isinstance(value, float) else str(value) for name, value in row.items()}
-    words = {name: word for name, word in words.items() if name not in COEFFICIENTS}
-    told = ", ".join(f"{name} = {value:.5g}" for name, value in own.items())
-    coefficients = {"normal form": told} if any(name in row for name in COEFFICIENTS) else {}
+    words = {name: word for name, word in words.items() if name.removeprefix("coefficient_") not in own}
+    told = ", ".join(f"{name} = {value:.5g}" for name, value in own.items() if value == value)
+    coefficients = {"normal form": told} if own else {}
     return words | {"period": str(row["period"] or "equilibrium"), "error": f"{row['error']:.1g}"} | coefficients
 
 

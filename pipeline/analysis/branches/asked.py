@@ -16,7 +16,7 @@ from magpend_core.models.text.intervals import Rates
 from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at
 from pipeline.analysis.branches.boxes import Box, enclose_equilibria, search_equilibria
-from pipeline.analysis.branches.deflation import expected_index, orbit_near
+from pipeline.analysis.branches.deflation import orbit_near
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.searching import family_at, rows_of, where_variables
@@ -201,16 +201,14 @@ def counted_variables(counted: Sequence[Counted], model: Model) -> dict[str, Any
     """Return dataset variables on the equilibria that were counted, over ``box``; none without a count."""
     if not counted:
         return {}
-    expected = expected_index(counted[0].family.system)
-    about = f"sum of the signs of det(-J); {expected} for all equilibria of a bounded flow"
     numbers = {
-        "n_equilibria": ([len(one.states) for one in counted], "equilibria in the box"),
-        "n_stable_equilibria": ([one.n_stable for one in counted], "stable equilibria in the box"),
-        "equilibria_index_sum": ([one.index_sum for one in counted], about),
+        "n_equilibria": [len(one.states) for one in counted],
+        "n_stable_equilibria": [one.n_stable for one in counted],
+        "equilibria_index_sum": [one.index_sum for one in counted],
     }
     codes = np.array([COUNTS.index(one.verdict) for one in counted], np.int8)
     return {
         **where_variables("box", counted, model),
-        **{n: ("box", np.array(v, np.int32), {"units": "1", "long_name": told}) for n, (v, told) in numbers.items()},
-        "box_verdict": ("box", codes, {"long_name": "whether the number is proved", **code_flags(COUNTS)}),
+        **{name: ("box", np.array(values, np.int32)) for name, values in numbers.items()},
+        "box_verdict": ("box", codes, code_flags(COUNTS)),
     }

@@ -361,4 +361,5 @@ def bands_table(ds: xr.Dataset) -> Table:
         }
         for row in rows
     ]
-    return Table(rows, [*lines, "", *aligned(shown, "")] if rows else lines)
+    header = ("label", "type", "period", "branch", "value", "median", "low", "high", "n_draws", "share")
+    return Table(rows, [*lines, "", *aligned(shown, "")] if rows else lines, header=header)

@@ -36,7 +36,7 @@ from pipeline.analysis.branches.codimension_two import (
     SpecialPoint,
     merged,
 )
-from pipeline.analysis.branches.dataset import column, filled
+from pipeline.analysis.branches.dataset import Columns, column, filled
 from pipeline.analysis.branches.equilibrium_curves import (
     PERSISTS,
     EquilibriumCurve,
@@ -55,27 +55,10 @@ from pipeline.analysis.branches.homoclinic_curves import (
     saddle_nodes_of,
     saddle_quantity,
 )
-from pipeline.analysis.branches.kinds import (
-    BRANCH_POINTS,
-    COEFFICIENTS,
-    CURVE_KINDS,
-    DOUBLING,
-    FOLD,
-    HOMOCLINIC,
-    HOPF,
-    KINDS,
-    TORUS,
-)
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, DOUBLING, FOLD, HOMOCLINIC, HOPF, KINDS, TORUS
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
-from pipeline.analysis.branches.problems import (
-    FREQUENCY,
-    TESTS,
-    BifurcationProblem,
-    Family,
-    parameter_units,
-    state_units,
-)
+from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
 from pipeline.analysis.tabular import plain
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import frequency_of, model_attribute, parameter_name, section_attributes
@@ -491,45 +474,32 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     names = curves[0].family.system.state_names if curves else (model.state_names if model else ())
     points = [((i, j), (c, point)) for i, c in enumerate(curves) for j, point in enumerate(c.points)]
     shape = (len(curves), max((len(c.points) for c in curves), default=0))
-    units = [parameter_units(name, model) for name in (first, second)]
-    variables = filled(
-        ("curve", "point"),
-        shape,
-        points,
-        {"state": len(names)},
-        {
-            "first": ((), units[0], first, lambda c, point: c.family.values(point.u)[0]),
-            "second": ((), units[1], second, lambda c, point: c.family.values(point.u)[1]),
-            "section": (
-                ("state",),
-                state_units(model),
-                "a section point, or the saddle",
-                lambda c, point: c.family.state(point.u),
-            ),
-            "residual": ((), "1", "largest residual, test function included", lambda _, point: point.residual),
-            "saddle_quantity": (
-                (),
-                "1/s",
-                "sum of the leading eigenvalues of the saddle of a homoclinic orbit",
-                lambda c, point: saddle_quantity(point.value.monodromy) if c.kind == HOMOCLINIC else np.nan,
-            ),
-        },
-    )
+    columns: Columns = {
+        "first": ((), lambda c, point: c.family.values(point.u)[0]),
+        "second": ((), lambda c, point: c.family.values(point.u)[1]),
+        "section": (("state",), lambda c, point: c.family.state(point.u)),
+        "residual": ((), lambda _, point: point.residual),
+        "saddle_quantity": (
+            (),
+            lambda c, point: saddle_quantity(point.value.monodromy) if c.kind == HOMOCLINIC else np.nan,
+        ),
+    }
+    variables = filled(("curve", "point"), shape, points, {"state": len(names)}, columns)
     ends = [[CURVE_ENDS.index(c.ends[i]) for c in curves] for i in (0, 1)]
     kinds = [CURVE_KINDS.index(c.kind) for c in curves]
-    columns = {
-        "kind": column(kinds, "int8", "kind of bifurcation", **code_flags(CURVE_KINDS)),
-        "orbit_period": column([c.family.period for c in curves], "int32", "period, 0 for equilibria"),
-        "start": column([c.start for c in curves], "int32", "located point"),
-        "n_missed": column([c.n_missed for c in curves], "int32", "sign changes that could not be located"),
-        "n_points": column([len(c.points) for c in curves], "int32", "points of the curve"),
-        "first_end": column(ends[0], "int8", "why it begins", **code_flags(CURVE_ENDS)),
-        "last_end": column(ends[1], "int8", "why it ends", **code_flags(CURVE_ENDS)),
+    of_curves = {
+        "kind": column(kinds, "int8", **code_flags(CURVE_KINDS)),
+        "orbit_period": column([c.family.period for c in curves], "int32"),
+        "start": column([c.start for c in curves], "int32"),
+        "n_missed": column([c.n_missed for c in curves], "int32"),
+        "n_points": column([len(c.points) for c in curves], "int32"),
+        "first_end": column(ends[0], "int8", **code_flags(CURVE_ENDS)),
+        "last_end": column(ends[1], "int8", **code_flags(CURVE_ENDS)),
     }
-    variables |= {name: ("curve", *own) for name, own in columns.items()}
+    variables |= {name: ("curve", *own) for name, own in of_curves.items()}
     told = {} if model is None else {"model": model_attribute(model), **section_attributes(model.crossing)}
     return xr.Dataset(
-        variables | _special_points(curves, (first, second), units, state_units(model), len(names)),
+        variables | _special_points(curves, len(names)),
         coords={"state": list(names)},
         attrs={"first_parameter": first, "second_parameter": second, **told},
     )
@@ -569,29 +539,21 @@ def not_followed(ds: xr.Dataset) -> list[str]:
     return lines
 
 
-def _special_points(
-    curves: Sequence[Curve], names: tuple[str, str], units: Sequence[str], states: str, n_states: int
-) -> dict[str, Any]:
+def _special_points(curves: Sequence[Curve], n_states: int) -> dict[str, Any]:
     """Return the points of codimension two on all curves as dataset variables, each point once."""
     found = merged({i: curve.special for i, curve in enumerate(curves)})
     kinds = [POINT_KINDS.index(one.kind) for one in found]
     codes = {
-        "special_kind": column(kinds, "int8", "kind of point", **code_flags(POINT_KINDS)),
-        "special_curve": column([one.curve for one in found], "int32", "curve on which it was located"),
-        "special_period": column([one.family.period for one in found], "int32", "period, 0 for equilibria"),
+        "special_kind": column(kinds, "int8", **code_flags(POINT_KINDS)),
+        "special_curve": column([one.curve for one in found], "int32"),
+        "special_period": column([one.family.period for one in found], "int32"),
     }
-    columns: dict[str, Any] = {
-        "special_section": (("state",), states, "a section point", lambda one: one.family.state(one.point.u))
-    }
-    for i, (role, name) in enumerate(zip(("first", "second"), names, strict=True)):
-        columns[f"special_{role}"] = ((), units[i], name, lambda one, i=i: one.values[i])
-        columns[f"special_{role}_error"] = ((), units[i], f"error of {name}", lambda one, i=i: one.bracket[i])
+    columns: dict[str, Any] = {"special_section": (("state",), lambda one: one.family.state(one.point.u))}
+    for i, role in enumerate(("first", "second")):
+        columns[f"special_{role}"] = ((), lambda one, i=i: one.values[i])
+        columns[f"special_{role}_error"] = ((), lambda one, i=i: one.bracket[i])
     for name in sorted({name for one in found for name in one.coefficients}):
-        about = f"normal form coefficient {name}"
-        columns[f"special_{name}"] = (
-            *((), COEFFICIENTS[name], about),
-            lambda one, name=name: one.coefficients.get(name, np.nan),
-        )
+        columns[f"special_{name}"] = ((), lambda one, name=name: one.coefficients.get(name, np.nan))
     items = [((k,), (one,)) for k, one in enumerate(found)]
     return {name: ("special", *own) for name, own in codes.items()} | filled(
         ("special",), (len(found),), items, {"state": n_states}, columns

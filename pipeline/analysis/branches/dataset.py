@@ -25,10 +25,10 @@ from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.images import images_of
 from pipeline.analysis.branches.kinds import HOPF, KINDS
 from pipeline.analysis.branches.limits import cut_ends
-from pipeline.analysis.branches.problems import FREQUENCY, parameter_units, state_units
+from pipeline.analysis.branches.problems import FREQUENCY, parameter_units
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import model_attribute, period_of, periods_of, section_attributes
+from pipeline.layout.vocabulary import model_attribute, section_attributes
 from pipeline.products.reporting import track
 
 CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
@@ -69,22 +69,20 @@ def dataset_of(
         for i, codes in enumerate(sides_of(branches, parameters)):
             side[i, : len(codes)] = codes
     events = [(i, b) for i, branch in enumerate(branches) for b in branch.bifurcations]
-    states, units = state_units(model), parameter_units(parameter, model)
     sizes = {"phase": longest, "state": len(names), "multiplier": len(names)}
-    about = {"units": "1", "long_name": "multipliers outside the unit circle, -1 beyond the branch"}
-    variables = _per_point(shape, points, sizes, units, states)
-    variables["n_unstable"] = (("branch", "point"), counts, about)
-    variables |= _per_branch(branches, events, n_angles, model) | _per_event(branches, events, sizes, units, states)
+    variables = _per_point(shape, points, sizes)
+    variables["n_unstable"] = (("branch", "point"), counts)
+    variables |= _per_branch(branches, events, n_angles, model) | _per_event(branches, events, sizes)
     variables |= _fixed(branches, parameter, parameters)
-    variables |= _limits(branches, sizes, units, states)
+    variables |= _limits(branches, sizes)
     if model is not None and model.flow.mirror is not None:
         images = images_of([(branches[i].family, b) for i, b in events], model)
-        variables["image"] = ("bifurcation", *column(images, "int32", "bifurcation that is its mirror image, -1 none"))
+        variables["image"] = ("bifurcation", *column(images, "int32"))
     if words:
         variables |= _side_variables(side, events, words)
     angle_dim = "angle" if model is None else model.angle_dim
     result = xr.Dataset(variables).rename({"angle": angle_dim} if angle_dim != "angle" else {})
-    result = result.assign_coords(state=("state", list(names), {"long_name": "component of the state"}))
+    result = result.assign_coords(state=list(names))
     if model is not None:
         result = result.assign_coords({angle_dim: list(model.angles)}).assign_attrs(
             model=model_attribute(model), **section_attributes(model.crossing)
@@ -96,8 +94,8 @@ def dataset_of(
     )
 
 
-Columns = Mapping[str, tuple[tuple[str, ...], str, str, Callable[..., Any]]]
-"""Variables by name: further dims, unit, meaning, and the function that returns the values of one item."""
+Columns = Mapping[str, tuple[tuple[str, ...], Callable[..., Any]]]
+"""Variables by name: further dims, and the function that returns the values of one item."""
 
 
 def filled(
@@ -109,56 +107,51 @@ def filled(
 ) -> dict[str, Any]:
     """Return dataset variables with the values of some items at their indices, and NaN elsewhere."""
     found = {}
-    for name, (further, unit, about, values_of) in columns.items():
+    for name, (further, values_of) in columns.items():
         values = np.full((*shape, *(sizes[dim] for dim in further)), np.nan)
         for index, item in items:
             own = np.asarray(values_of(*item))
             place: tuple[Any, ...] = (*index, *(slice(n) for n in own.shape))
             values[place] = own
-        found[name] = ((*dims, *further), values, {"units": unit, "long_name": about})
+        found[name] = ((*dims, *further), values)
     return found
 
 
-def _parts(name: str, unit: str, about: str, values_of: Callable[..., Any]) -> Columns:
+def _parts(name: str, values_of: Callable[..., Any]) -> Columns:
     """Return the columns of the real and imaginary parts of multipliers or eigenvalues."""
     return {
-        f"{name}_real": (("multiplier",), unit, f"{about}, real part", lambda *item: values_of(*item).real),
-        f"{name}_imag": (("multiplier",), unit, f"{about}, imaginary part", lambda *item: values_of(*item).imag),
+        f"{name}_real": (("multiplier",), lambda *item: values_of(*item).real),
+        f"{name}_imag": (("multiplier",), lambda *item: values_of(*item).imag),
     }
 
 
-def _per_point(
-    shape: tuple[int, ...], points: Sequence[Any], sizes: Mapping[str, int], units: str, states: str
-) -> dict[str, Any]:
+def _per_point(shape: tuple[int, ...], points: Sequence[Any], sizes: Mapping[str, int]) -> dict[str, Any]:
     """Return dataset variables for the points of all branches."""
     columns: Columns = {
-        "parameter": ((), units, "value of the parameter", lambda b, point: b.family.values(point.u)[0]),
-        "section": (("phase", "state"), states, "section points of the orbit", _orbit),
-        **_parts("multiplier", "1", "Floquet multipliers", lambda _, point: multipliers_of(point)),
-        "residual": ((), "1", "scaled distance of the point from its image", lambda _, point: point.residual),
-        "period_s": ((), "s", "period of the orbit", lambda _, point: point.value.seconds),
+        "parameter": ((), lambda b, point: b.family.values(point.u)[0]),
+        "section": (("phase", "state"), _orbit),
+        **_parts("multiplier", lambda _, point: multipliers_of(point)),
+        "residual": ((), lambda _, point: point.residual),
+        "period_s": ((), lambda _, point: point.value.seconds),
     }
     if any(point.value.is_rest for _, (_, point) in points):
-        own = _parts("eigenvalue", "1/s", "eigenvalues of an equilibrium", lambda _, point: eigenvalues_of(point))
+        own = _parts("eigenvalue", lambda _, point: eigenvalues_of(point))
         columns = {**own, **columns}
     return filled(("branch", "point"), shape, points, sizes, columns)
 
 
-def _limits(branches: Sequence[Branch], sizes: Mapping[str, int], units: str, states: str) -> dict[str, Any]:
+def _limits(branches: Sequence[Branch], sizes: Mapping[str, int]) -> dict[str, Any]:
     """Return dataset variables for the ends at which periods grow without bound; none if there is no such end."""
     found = [((i, end), (one,)) for i, b in enumerate(branches) for end, one in enumerate(b.limits) if one is not None]
-    per_root = "s, or s times the root of the parameter's unit"
-    slope = "slope of the period over -ln|p - p_h|, or over 1/sqrt|p - p_h| at a saddle node on a circle"
-    at = "equilibria where the period is infinite"
     sizes = {**sizes, "rest": max((len(one.states) for _, (one,) in found), default=0)}
     columns: Columns = {
-        "limit_value": ((), units, "parameter value where the period is infinite", lambda one: one.value),
-        "limit_error": ((), units, "error of this value", lambda one: one.error),
-        "limit_state": (("rest", "state"), states, at, lambda one: one.states),
-        **_parts("limit_eigenvalue", "1/s", f"eigenvalues of the first of the {at}", lambda one: one.eigenvalues),
-        "limit_slope": ((), per_root, f"{slope}: fitted", lambda one: one.slope),
-        "limit_slope_error": ((), per_root, "error of the fitted slope", lambda one: one.slope_error),
-        "limit_slope_expected": ((), per_root, "the same slope, from the equilibria", lambda one: one.expected),
+        "limit_value": ((), lambda one: one.value),
+        "limit_error": ((), lambda one: one.error),
+        "limit_state": (("rest", "state"), lambda one: one.states),
+        **_parts("limit_eigenvalue", lambda one: one.eigenvalues),
+        "limit_slope": ((), lambda one: one.slope),
+        "limit_slope_error": ((), lambda one: one.slope_error),
+        "limit_slope_expected": ((), lambda one: one.expected),
     }
     return filled(("branch", "end"), (len(branches), 2), found, sizes, columns) if found else {}
 
@@ -181,12 +174,9 @@ def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | 
 def _side_variables(
     side: np.ndarray, events: Sequence[tuple[int, Bifurcation]], words: Sequence[str]
 ) -> dict[str, Any]:
-    about = {"units": "1", **code_flags(words)}
+    about = code_flags(words)
     there = np.array([side[i, max(b.after, 0)] for i, b in events], np.int8)
-    return {
-        "side": (("branch", "point"), side, {**about, "long_name": "class of the whole orbit"}),
-        "bifurcation_side": ("bifurcation", there, {**about, "long_name": "class of the orbit there"}),
-    }
+    return {"side": (("branch", "point"), side, about), "bifurcation_side": ("bifurcation", there, about)}
 
 
 def _orbit(branch: Branch, point: Any) -> np.ndarray:
@@ -195,9 +185,9 @@ def _orbit(branch: Branch, point: Any) -> np.ndarray:
     return np.concatenate([branch.family.state(point.u)[None], images[: max(branch.family.period, 1) - 1]])
 
 
-def column(values: Any, dtype: str, long_name: str, **attrs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+def column(values: Any, dtype: str, **attrs: Any) -> tuple[np.ndarray, dict[str, Any]]:
     """Return values of a type with their attributes, for a variable of one dim."""
-    return np.asarray(values, dtype), {"units": "1", "long_name": long_name, **attrs}
+    return np.asarray(values, dtype), attrs
 
 
 def _per_branch(
@@ -208,20 +198,17 @@ def _per_branch(
     frequencies = [np.nan if FREQUENCY in b.family.free else b.family.frequency_hz for b in branches]
     first, last = ([ENDS.index(b.ends[i]) for b in branches] for i in (0, 1))
     columns = {
-        "orbit_period": column(periods, "int32", f"period in {periods_of(model)}, 0 for equilibria"),
-        "n_points": column([len(b.points) for b in branches], "int32", "points of the branch"),
-        "origin": column(
-            [numbers.get(id(b.origin), -1) for b in branches], "int32", "bifurcation it sprang from, -1 none"
-        ),
-        "first_end": column(first, "int8", "why it begins", **code_flags(ENDS)),
-        "last_end": column(last, "int8", "why it ends", **code_flags(ENDS)),
+        "orbit_period": column(periods, "int32"),
+        "n_points": column([len(b.points) for b in branches], "int32"),
+        "origin": column([numbers.get(id(b.origin), -1) for b in branches], "int32"),
+        "first_end": column(first, "int8", **code_flags(ENDS)),
+        "last_end": column(last, "int8", **code_flags(ENDS)),
     }
     if model is None or model.clock_hz is None:
-        about = "drive frequency, NaN if it varies"
-        columns[FREQUENCY] = column(frequencies, "float64", about, units="Hz")
+        columns[FREQUENCY] = column(frequencies, "float64")
     found: dict[str, Any] = {name: ("branch", *column) for name, column in columns.items()}
     turns = np.array([rotation_of(b) for b in branches]).reshape(len(branches), n_angles)
-    found["rotation"] = (("branch", "angle"), *column(turns, "float64", f"turns per {period_of(model)}"))
+    found["rotation"] = (("branch", "angle"), *column(turns, "float64"))
     return found
 
 
@@ -235,11 +222,7 @@ def _seconds(one: Bifurcation) -> float:
 
 
 def _per_event(
-    branches: Sequence[Branch],
-    events: Sequence[tuple[int, Bifurcation]],
-    sizes: Mapping[str, int],
-    units: str,
-    states: str,
+    branches: Sequence[Branch], events: Sequence[tuple[int, Bifurcation]], sizes: Mapping[str, int]
 ) -> dict[str, Any]:
     ones = [b for _, b in events]
     critical = np.array([b.critical_multiplier for b in ones], np.complex128)
@@ -248,37 +231,27 @@ def _per_event(
     values = [branches[i].family.values(b.point.u)[0] for i, b in events]
     children = [numbers.get(id(b.child), -1) for b in ones]
     columns = {
-        "kind": column(kinds, "int8", "kind of bifurcation", **code_flags(KINDS)),
-        "value": column(values, "float64", "parameter value of the bifurcation", units=units),
-        "bifurcation_period_s": column(
-            [_seconds(b) for b in ones], "float64", "period of the orbit, or of a Hopf point's cycles", units="s"
-        ),
-        "bracket": column([b.bracket for b in ones], "float64", "width of the bracket in the parameter", units=units),
-        "of_branch": column([i for i, _ in events], "int32", "branch on which it lies"),
-        "after": column([b.after for b in ones], "int32", "point of the branch that it comes after"),
-        "to_branch": column(children, "int32", "other branch through it, -1 none"),
-        "n_unstable_before": column(
-            [b.n_unstable_before for b in ones], "int8", "unstable multipliers before, along the branch"
-        ),
-        "n_unstable_after": column(
-            [b.n_unstable_after for b in ones], "int8", "unstable multipliers after, along the branch"
-        ),
-        "rises_before": column(
-            [b.rises_before for b in ones], "int8", "1 if the parameter rises along the branch before"
-        ),
-        "criticality": column(degrees, "int8", "criticality", **code_flags(["unknown", *CRITICALITIES[1:]])),
-        "critical_real": column(critical.real, "float64", "critical multiplier or eigenvalue [1/s], real part"),
-        "critical_imag": column(critical.imag, "float64", "critical multiplier or eigenvalue [1/s], imaginary part"),
-        "normal_form": column(
-            [b.coefficient for b in ones], "float64", "normal form coefficient; of a Hopf point in 1/s"
-        ),
-        "normal_form_error": column([b.coefficient_error for b in ones], "float64", "error of the coefficient"),
+        "kind": column(kinds, "int8", **code_flags(KINDS)),
+        "value": column(values, "float64"),
+        "bifurcation_period_s": column([_seconds(b) for b in ones], "float64"),
+        "bracket": column([b.bracket for b in ones], "float64"),
+        "of_branch": column([i for i, _ in events], "int32"),
+        "after": column([b.after for b in ones], "int32"),
+        "to_branch": column(children, "int32"),
+        "n_unstable_before": column([b.n_unstable_before for b in ones], "int8"),
+        "n_unstable_after": column([b.n_unstable_after for b in ones], "int8"),
+        "rises_before": column([b.rises_before for b in ones], "int8"),
+        "criticality": column(degrees, "int8", **code_flags(["unknown", *CRITICALITIES[1:]])),
+        "critical_real": column(critical.real, "float64"),
+        "critical_imag": column(critical.imag, "float64"),
+        "normal_form": column([b.coefficient for b in ones], "float64"),
+        "normal_form_error": column([b.coefficient_error for b in ones], "float64"),
     }
     found: dict[str, Any] = {name: ("bifurcation", *column) for name, column in columns.items()}
     items = [((k,), (branches[i], b.point)) for k, (i, b) in enumerate(events)]
     further: Columns = {
-        **_parts("bifurcation_multiplier", "1", "multipliers", lambda _, point: multipliers_of(point)),
-        "bifurcation_section": (("phase", "state"), states, "section points of the orbit there", _orbit),
+        **_parts("bifurcation_multiplier", lambda _, point: multipliers_of(point)),
+        "bifurcation_section": (("phase", "state"), _orbit),
     }
     return found | filled(("bifurcation",), (len(events),), items, sizes, further)
 

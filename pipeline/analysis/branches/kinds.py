@@ -39,12 +39,6 @@ AUTO writes HB for H and TR (torus) for NS; MatCont writes LPC for the fold of a
 transcritical point is a branch point to both.
 """
 
-COEFFICIENTS = {
-    **{"a": "1/s2", **dict.fromkeys(("b", "c", "e", "p11", "p22", "quintic"), "1/s")},
-    **dict.fromkeys(("lyapunov2", "s", "theta", "delta"), "1"),
-}
-"""Coefficients of the normal forms of equilibria at points of codimension two, with their units (`center_manifold`)."""
-
 CURVE_WHY = {
     "closed": "closed",
     "resonance": "the multipliers become real",

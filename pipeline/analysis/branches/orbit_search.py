@@ -20,19 +20,11 @@ from pipeline.analysis.branches.deflation import (
     search_orbits,
     starts_around,
 )
-from pipeline.analysis.branches.problems import state_units
 from pipeline.analysis.branches.starting_orbits import parameters_at, sections_of
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
 from pipeline.analysis.tabular import Row, Words, aligned, counted, state_columns
-from pipeline.layout.vocabulary import (
-    model_attribute,
-    model_of,
-    parameters_of,
-    periods_of,
-    section_attributes,
-    split_dims,
-)
+from pipeline.layout.vocabulary import model_attribute, model_of, parameters_of, section_attributes, split_dims
 from pipeline.products.branches import OrbitOptions
 from pipeline.products.product import Table
 from pipeline.specification.problems import SpecError
@@ -91,23 +83,22 @@ def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, poi
         multipliers[i] = one.multipliers
     sums = index_sums(found, options.max_period)
 
-    def column(values: Any, long_name: str) -> tuple[str, Any, dict[str, str]]:
-        return "orbit", np.asarray(values, np.int32), {"units": "1", "long_name": long_name}
+    def column(values: Any) -> tuple[str, Any]:
+        return "orbit", np.asarray(values, np.int32)
 
-    about = {"units": "1", "long_name": "Floquet multipliers"}
     expected = {} if model.crossing is not None else {"expected_index_sum": expected_index(system)}
     return xr.Dataset(
         {
-            "section": (("orbit", "phase", "state"), section, {"units": state_units(model)}),
-            "orbit_period": column([one.period for one in found], f"least period in {periods_of(model)}"),
-            "period_s": ("orbit", [one.seconds for one in found], {"units": "s", "long_name": "least period"}),
-            "n_unstable": column((np.abs(multipliers) > 1.0).sum(axis=1), "multipliers outside the unit circle"),
-            "n_hits": column([one.n_hits for one in found], "starts of the first round that led to it"),
-            "search_round": column([one.search_round for one in found], "round in which it was found, from 0"),
-            "index": column([one.index() for one in found], "sign of det(1 - M)"),
-            "multiplier_real": (("orbit", "multiplier"), multipliers.real, about),
-            "multiplier_imag": (("orbit", "multiplier"), multipliers.imag, about),
-            "index_sum": ("times", np.array(list(sums.values()), np.int32), {"units": "1"}),
+            "section": (("orbit", "phase", "state"), section),
+            "orbit_period": column([one.period for one in found]),
+            "period_s": ("orbit", [one.seconds for one in found]),
+            "n_unstable": column((np.abs(multipliers) > 1.0).sum(axis=1)),
+            "n_hits": column([one.n_hits for one in found]),
+            "search_round": column([one.search_round for one in found]),
+            "index": column([one.index() for one in found]),
+            "multiplier_real": (("orbit", "multiplier"), multipliers.real),
+            "multiplier_imag": (("orbit", "multiplier"), multipliers.imag),
+            "index_sum": ("times", np.array(list(sums.values()), np.int32)),
         },
         coords={"state": list(system.state_names), "times": list(sums)},
         attrs={

@@ -187,13 +187,12 @@ def searched_variables(
     counts = [[sum(one.period == p for one in place.found) for p in periods.tolist()] for place in places]
     sums = [list(index_sums(place.found, int(periods[-1])).values()) for place in places]
     codes = [[VERDICTS.index(verdict) for verdict in place.verdicts(periods)] for place in places]
-    about = f"whether the indices add up to {expected_index(places[0].system)}"
     both = ("searched", "times")
     return {
         **where_variables("searched", places, model),
-        "coverage": ("searched", [p.coverage for p in places], {"units": "1", "long_name": "share of starts"}),
-        "n_orbits": (both, np.array(counts, np.int32), {"units": "1", "long_name": "orbits of this least period"}),
-        "index_sum": (both, np.array(sums, np.int32), {"units": "1", "long_name": "sum of the fixed-point indices"}),
-        "index_verdict": (both, np.array(codes, np.int8), {"long_name": about, **code_flags(VERDICTS)}),
-        "times": ("times", periods.astype(np.int32), {"units": "1", "long_name": "period"}),
+        "coverage": ("searched", [p.coverage for p in places]),
+        "n_orbits": (both, np.array(counts, np.int32)),
+        "index_sum": (both, np.array(sums, np.int32)),
+        "index_verdict": (both, np.array(codes, np.int8), code_flags(VERDICTS)),
+        "times": ("times", periods.astype(np.int32)),
     }

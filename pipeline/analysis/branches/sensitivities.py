@@ -333,7 +333,15 @@ def sensitivities_table(ds: xr.Dataset) -> Table:
         own = [{**about, **row} for row in _rows(one)]
         rows += own
         lines += ["", _head(about, name, _unit(str(ds.attrs["parameter_units"]))), *_lines(own, str(LABELS[kind]), ds)]
-    return Table(rows, [f"{counted(ds.sizes['bifurcation'], 'bifurcation')} along {name}", *lines])
+    head = f"{counted(ds.sizes['bifurcation'], 'bifurcation')} along {name}"
+    return Table(rows, [head, *lines], header=(name, *_COLUMNS))
+
+
+_COLUMNS = (
+    *("label", "type", "period", "branch", "deviation", "parameter", "unit", "parameter_value", "derivative"),
+    *("derivative_error", "elasticity", "elasticity_error", "parameter_deviation", "status"),
+)
+"""Columns that the table has in any case, after the parameter."""
 
 
 def _rows(one: xr.Dataset) -> list[Row]:

@@ -260,7 +260,7 @@ def tongues(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     edges = curves_from(folds, base, second, bounds, longest, generations=0) if branches else []
     of_curve = [numbers[int(folds["of_branch"][curve.start])] for curve in edges]
     ds = curves_dataset(edges, first, second, base.model)
-    ds = ds.assign({k: ("curve", v, {"units": "1"}) for k, v in _parts(of_curve).items()})
+    ds = ds.assign({k: ("curve", v) for k, v in _parts(of_curve).items()})
     row = float(point[second]) if second in point.coords else float(base[second])
     return ds.assign(_variables(on_row)).assign_attrs(row=row, max_denominator=options.max_denominator)
 
@@ -346,9 +346,7 @@ def _variables(tongues: Sequence[_Tongue]) -> dict[str, Any]:
         columns[f"tongue_{name}"] = np.array([t.ends[i] for t in tongues], np.float64)
         columns[f"tongue_{name}_kind"] = np.array([t.kinds[i] for t in tongues], np.str_)
     columns["tongue_error"] = np.array([t.error for t in tongues], np.float64)
-    return {
-        name: ("tongue", values, {} if values.dtype.kind == "U" else {"units": "1"}) for name, values in columns.items()
-    }
+    return {name: ("tongue", values) for name, values in columns.items()}
 
 
 def tongues_table(ds: xr.Dataset) -> Table:

@@ -432,11 +432,12 @@ def section_dimension(
         for row in rows:
             if stays[row]:
                 curves[row] = curve(index, ids[index].ravel() == found["attractor"].values[row])
-    about = {"units": "1", "long_name": "why there is no dimension", **code_flags(REASONS)}
     reason = [
         _reason(*one) for one in zip(kind, stays, (c["correlation_dimension"].item() for c in curves), strict=True)
     ]
-    result = found.assign(_stacked(curves, nothing)).assign(reason=(SET, np.array(reason, np.int8), about))
+    result = found.assign(_stacked(curves, nothing)).assign(
+        reason=(SET, np.array(reason, np.int8), code_flags(REASONS))
+    )
     plain = {f"dimension_{k}": getattr(options, k) for k in ("theiler", "n_max", "floor")}
     return result.drop_attrs(deep=False).assign_attrs({**ds.attrs, **plain, N_IDS: found.attrs[N_IDS]})
 

@@ -91,11 +91,8 @@ def kaplan_yorke_dimension(
     if f"{name}_flag" in ds:
         unknown |= ds[f"{name}_flag"].transpose(*dims).values != LyapunovFlag.GOOD
     variables: dict[str, Any] = {}
-    for key, values, text in (
-        ("kaplan_yorke_dimension", dimension, "Kaplan-Yorke dimension of the section"),
-        ("kaplan_yorke_dimension_stderr", error, "standard error of the Kaplan-Yorke dimension"),
-    ):
-        variables[key] = (dims, np.where(unknown, np.nan, values), {"units": "1", "long_name": text})
+    for key, values in (("", dimension), ("_stderr", error)):
+        variables[f"kaplan_yorke_dimension{key}"] = (dims, np.where(unknown, np.nan, values))
     references = "Kaplan and Yorke, Lect. Notes Math. 730, 204 (1979)"
     return with_coords(ds, dims, variables).assign_attrs(zero=zero, references=references)
 
@@ -343,25 +340,21 @@ def _slope(x: Floats, y: Floats, rows: npt.NDArray[np.int64]) -> float:
 
 
 _CURVE = {
-    "correlation_dimension": ("dimension", "correlation dimension of the section"),
-    "correlation_dimension_stderr": ("stderr", "sampling error of the correlation dimension"),
-    "correlation_dimension_spread": ("spread", "slope of the lower half of the range minus the upper"),
-    "fit_low": ("fit_low", "least radius of the fit, scaled"),
-    "fit_high": ("fit_high", "largest radius of the fit, scaled"),
-    "n_points": ("n_points", "points of the set"),
-    "largest_resolved": ("largest_resolved", "largest dimension that so many points can show"),
-    "log_radius": ("log_radius", "natural logarithm of the scaled radius"),
-    "log_correlation_sum": ("log_sum", "natural logarithm of the correlation sum"),
+    "correlation_dimension": "dimension",
+    "correlation_dimension_stderr": "stderr",
+    "correlation_dimension_spread": "spread",
+    "log_correlation_sum": "log_sum",
+    **{name: name for name in ("fit_low", "fit_high", "n_points", "largest_resolved", "log_radius")},
 }
+"""Fields of a curve by the name of their variable."""
 
 
 def _curves(
     ds: xr.Dataset, dims: Sequence[object], shape: tuple[int, ...], found: dict[tuple[int, ...], _Curve]
 ) -> xr.Dataset:
     variables: dict[str, Any] = {}
-    for name, (field, text) in _CURVE.items():
+    for name, field in _CURVE.items():
         rows = np.array([getattr(found[index], field) for index in np.ndindex(*shape)])
         own = ("radius",) if rows.ndim > 1 else ()
-        about = {"units": "1", "long_name": text}
-        variables[name] = ((*dims, *own), rows.reshape((*shape, *rows.shape[1:])), about)
+        variables[name] = ((*dims, *own), rows.reshape((*shape, *rows.shape[1:])))
     return with_coords(ds, dims, variables)

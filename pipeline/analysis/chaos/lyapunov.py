@@ -146,10 +146,9 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
         motion = motion.where(~hyper, np.int8(Motion.HYPERCHAOTIC))
     motion = motion.where(known, np.int8(Motion.UNKNOWN))
     contradicts = (known & closed & (first > 0)).astype(np.int8)
-    about = {"units": "1", "long_name": "closed, and yet with a positive exponent"}
     return {
         "motion": motion.assign_attrs(motion_attrs()),
-        "contradicts": contradicts.assign_attrs(about | code_flags(["no", "yes"])),
+        "contradicts": contradicts.assign_attrs(code_flags(["no", "yes"])),
     }
 
 
@@ -174,12 +173,7 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
         exponents).
     """
     known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
-    attrs = {
-        "units": "1",
-        "long_name": "the chaos ended within the blocks",
-        "flag_values": np.arange(-1, 2, dtype=np.int8),
-        "flag_meanings": "unknown no yes",
-    }
+    attrs = {"flag_values": np.arange(-1, 2, dtype=np.int8), "flag_meanings": "unknown no yes"}
     if ds.sizes.get("block", 0) < FEWEST_BLOCKS:
         return xr.full_like(known, -1, dtype=np.int8).assign_attrs(attrs)
     first, quarter = ds["lyapunov_blocks"].isel(exponent=0, drop=True), ds.sizes["block"] // 4
@@ -208,12 +202,10 @@ def _drift(blocks: xr.DataArray) -> dict[str, xr.DataArray]:
     half = first.sizes["block"] // 2
     early, late = first.isel(block=slice(half)), first.isel(block=slice(-half, None))
     drift = late.mean("block") - early.mean("block")
-    drift = drift.assign_attrs(units="1/s", long_name="largest exponent, later minus earlier half")
     if half < 2:
         return {"drift": drift, "drift_sigma": xr.full_like(drift, np.nan)}
     error = np.sqrt((late.var("block", ddof=1) + early.var("block", ddof=1)) / half)
-    sigma = (drift / error).assign_attrs(units="1", long_name="drift in standard errors")
-    return {"drift": drift, "drift_sigma": sigma}
+    return {"drift": drift, "drift_sigma": drift / error}
 
 
 def _audit(ds: xr.Dataset) -> xr.DataArray:
@@ -222,7 +214,7 @@ def _audit(ds: xr.Dataset) -> xr.DataArray:
     total = means.sum("exponent", skipna=False) - ds["divergence"]
     if ds.sizes["exponent"] < ds.sizes["state"]:
         total = xr.full_like(total, np.nan)
-    return total.assign_attrs(units="1/s", long_name="sum of the exponents minus the divergence")
+    return total
 
 
 # ---- means over cells --------------------------------------------------------------------------

@@ -6,29 +6,7 @@ Rows of sets on the dim ``set``, as in `pipeline.analysis.attractors.attractors`
 many as there are states; ``multiplier``. Variables, beside the copies of ``kind``, ``orbit_period``,
 ``n_cells``, ``share``, ``multiplier_real``, ``multiplier_imag``, ``stability``, ``evidence``:
 
-=============================== ========== ===================================================================
-variable                        own dims   meaning
-=============================== ========== ===================================================================
-``nature``                                 codes of `Nature`
-``n_transient``                            its cells whose chaos ended while exponents were taken
-``n_drifting``                             cells not closed, with a largest exponent that drifts
-``n_contradicting``                        closed cells with a positive exponent
-``n_audit_failed``,                        cells with these flags
-``n_unresolved``, ``n_failed``
-``exponents_from``                         0 none, 1 the orbit's multipliers, 2 its cells, 3 the equilibrium's
-                                           eigenvalues
-``attractor_lyapunov``          rank       exponents [1/s]
-``attractor_lyapunov_stderr``   rank       standard errors [1/s]; of multipliers 0
-``attractor_lyapunov_between``  rank       standard deviation between cells beyond their errors [1/s]
-``attractor_kaplan_yorke``,                Kaplan-Yorke dimension of the section from these exponents, and
-``attractor_kaplan_yorke_stderr``          its standard error
-``attractor_correlation``,                 correlation dimension of the pooled sections, its sampling error,
-``attractor_correlation_stderr``,          and the slope of the lower half of its range minus the upper;
-``attractor_correlation_spread``           for bounded sets with enough points
-``median_zero_one``,                       K over its cells
-``least_zero_one``,
-``largest_zero_one``
-=============================== ========== ===================================================================
+`pipeline.products.chaos` lists the variables.
 
 A polished orbit's exponents are the logarithms of its Floquet multipliers over its period. They are complete
 and free of sampling errors, whether the cube has exponents or not. A bounded set's exponents are means over
@@ -158,7 +136,7 @@ def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Datase
     own, n_states = attractors[[ROW_SIZE, *copied]].load(), ds.sizes["state"]
     arrays = {
         name: np.full((own.sizes[SET], *((n_states,) if rank else ())), fill, dtype)
-        for name, (rank, dtype, fill, _, _) in _TABLE.items()
+        for name, (rank, dtype, fill) in _TABLE.items()
     }
     curves = _Curves(options)
     for index, rows in rows_at(own).items():
@@ -171,15 +149,11 @@ def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Datase
                 found |= curves.of(ds.isel(at), starts, here, number)
             for name in arrays.keys() & found.keys():
                 arrays[name][row] = found[name]
-    variables = {
-        name: ((SET, *(("rank",) if rank else ())), arrays[name], {"units": units, "long_name": text})
-        for name, (rank, _, _, units, text) in _TABLE.items()
-    }
+    variables = {name: ((SET, "rank")[: array.ndim], array) for name, array in arrays.items()}
     result = cells.assign(own.data_vars).assign(variables).assign_attrs({N_IDS: own.attrs[N_IDS]})
     result["nature"].attrs |= code_flags([nature.name.lower() for nature in Nature])
     result["exponents_from"].attrs |= code_flags(_FROM)
-    rank = ("rank", np.arange(1, n_states + 1), {"units": "1", "long_name": "exponents in falling order"})
-    return _with_kaplan_yorke(result.assign_coords(rank=rank))
+    return _with_kaplan_yorke(result.assign_coords(rank=np.arange(1, n_states + 1)))
 
 
 def _of_attractor(one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions) -> dict[str, Any]:
@@ -313,12 +287,10 @@ def _with_kaplan_yorke(result: xr.Dataset) -> xr.Dataset:
     # spectra without some exponents keep NaN there, and have no dimension
     flow = model_of(result).crossing is not None
     found = kaplan_yorke_dimension(spectra, name="attractor_lyapunov", dim="rank", flow=flow)
-    about = {"units": "1", "long_name": "Kaplan-Yorke dimension of the section"}
-    error = {"units": "1", "long_name": "standard error of the Kaplan-Yorke dimension"}
     dims = result["nature"].dims
     return result.assign(
-        attractor_kaplan_yorke=(dims, _values(found["kaplan_yorke_dimension"], dims), about),
-        attractor_kaplan_yorke_stderr=(dims, _values(found["kaplan_yorke_dimension_stderr"], dims), error),
+        attractor_kaplan_yorke=(dims, _values(found["kaplan_yorke_dimension"], dims)),
+        attractor_kaplan_yorke_stderr=(dims, _values(found["kaplan_yorke_dimension_stderr"], dims)),
     )
 
 
@@ -326,35 +298,14 @@ def _values(array: xr.DataArray, dims: Sequence[Any]) -> Floats:
     return np.asarray(array.transpose(*dims).values)
 
 
-_TABLE: dict[str, tuple[bool, str, float, str, str]] = {
-    "nature": (False, "int8", 0, "1", "what the attractor is"),
-    "n_transient": (False, "int64", 0, "1", "cells whose chaos ended"),
-    "n_drifting": (False, "int64", 0, "1", "cells whose largest exponent drifts"),
-    "n_contradicting": (False, "int64", 0, "1", "cells that closed, and yet have a positive exponent"),
-    "n_audit_failed": (False, "int64", 0, "1", f"cells flagged: {LyapunovFlag.AUDIT_FAILED.sentence}"),
-    "n_unresolved": (False, "int64", 0, "1", f"cells flagged: {LyapunovFlag.UNRESOLVED.sentence}"),
-    "n_failed": (False, "int64", 0, "1", f"cells flagged: {LyapunovFlag.FAILED.sentence}"),
-    "exponents_from": (False, "int8", 0, "1", "where the exponents are from"),
-    "attractor_lyapunov": (True, "float64", np.nan, "1/s", "Lyapunov exponents per unit time"),
-    "attractor_lyapunov_stderr": (True, "float64", np.nan, "1/s", "their standard errors"),
-    "attractor_lyapunov_between": (
-        True,
-        "float64",
-        np.nan,
-        "1/s",
-        "standard deviation between cells beyond their errors",
+_TABLE: dict[str, tuple[bool, str, float]] = {
+    **dict.fromkeys(("nature", "exponents_from"), (False, "int8", 0)),
+    **dict.fromkeys(
+        ("n_transient", "n_drifting", "n_contradicting", "n_audit_failed", "n_unresolved", "n_failed"),
+        (False, "int64", 0),
     ),
-    "attractor_correlation": (False, "float64", np.nan, "1", "correlation dimension of the section"),
-    "attractor_correlation_stderr": (False, "float64", np.nan, "1", "its sampling error"),
-    "attractor_correlation_spread": (
-        False,
-        "float64",
-        np.nan,
-        "1",
-        "slope of the lower half of the range minus the upper",
-    ),
-    "median_zero_one": (False, "float64", np.nan, "1", "0-1 test, median over the cells"),
-    "least_zero_one": (False, "float64", np.nan, "1", "0-1 test, least over the cells"),
-    "largest_zero_one": (False, "float64", np.nan, "1", "0-1 test, largest over the cells"),
+    **{f"attractor_lyapunov{end}": (True, "float64", np.nan) for end in ("", "_stderr", "_between")},
+    **{f"attractor_correlation{end}": (False, "float64", np.nan) for end in ("", "_stderr", "_spread")},
+    **dict.fromkeys(("median_zero_one", "least_zero_one", "largest_zero_one"), (False, "float64", np.nan)),
 }
-"""Whether on `rank`, dtype, fill, units and long name of the variables per attractor."""
+"""Whether on `rank`, dtype and fill of the variables per attractor."""

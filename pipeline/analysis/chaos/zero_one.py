@@ -103,18 +103,8 @@ def zero_one_test(
         report("0-1 test", begin, len(phi))
         rows = slice(begin, begin + step)
         measures[:, rows] = _zero_one(phi[rows], c)
-    table = {
-        "zero_one": "0-1 test, median over frequencies",
-        "zero_one_stderr": "standard error of the median from the choice of the frequencies",
-        "zero_one_low": "0-1 test, lower quartile over frequencies",
-        "zero_one_high": "0-1 test, upper quartile over frequencies",
-        "zero_one_half": "0-1 test of the later half of the sections",
-        "oversampling": "range of the observable over its mean step",
-    }
-    variables = {
-        name: (cells, values.reshape(shape), {"units": "1", "long_name": text})
-        for (name, text), values in zip(table.items(), measures, strict=True)
-    }
+    names = ("zero_one", "zero_one_stderr", "zero_one_low", "zero_one_high", "zero_one_half", "oversampling")
+    variables = {name: (cells, values.reshape(shape)) for name, values in zip(names, measures, strict=True)}
     about = {"zero_one_state": state or "first principal component", "n_frequencies": n_frequencies}
     return with_coords(ds, cells, variables).assign_attrs(
         about | {"stride": stride, "seed": seed, "n_sections": n, "references": _GOTTWALD}

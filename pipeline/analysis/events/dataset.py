@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -20,8 +20,11 @@ from pipeline.analysis.outcomes import DIVERGED
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import KINDS as SETS
 
-Columns = dict[str, tuple[Sequence[object], str, Mapping[str, object]]]
-"""Values, meaning and attributes of the columns of events, by name."""
+Columns = dict[str, Sequence[object]]
+"""Values of the columns of events, by name."""
+
+_CODES = {"set": SETS, "what": NAMES, "criticality": ["unknown", *CRITICALITIES[1:]]}
+"""Labels of the columns that hold codes."""
 
 
 def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> xr.Dataset:
@@ -37,45 +40,40 @@ def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event
         else 0
         for one in named
     ]
-    unit = {"units": str(located.attrs["parameter_units"])}
     columns: Columns = {
-        "attractor": ([one.stretch.attractor for one in named], "id of the attractor", {}),
-        "set": ([one.stretch.kind for one in named], "kind of the attractor", code_flags(SETS)),
-        "period": ([one.stretch.period for one in named], "period of the attractor, 0 none", {}),
-        "period_after": ([one.after.period if one.after else -1 for one in named], "period beyond a change", {}),
-        "rises": ([int(one.rises) for one in named], "1 if it ends as the parameter rises", {}),
-        "what": ([NAMES.index(one.what) for one in named], "name of the event", code_flags(NAMES)),
-        "criticality": (degrees, "criticality", code_flags(["unknown", *CRITICALITIES[1:]])),
-        "value": ([_value(one) for one in named], "parameter value of the event", unit),
-        "value_error": ([one.error for one in named], "error of the value", unit),
-        "seen": ([along[one.stretch.places[one.rises]] for one in named], "last value with cells", unit),
-        "beyond": (
-            [along[b] if 0 <= b < n else np.nan for b in beyond],
-            "next value of the run beyond the event",
-            unit,
-        ),
-        "bifurcation": (bifurcations.tolist(), "number of the bifurcation, -1 none", {}),
-        "branch": ([one.fate.branch for one in named], "branch of the attractor, -1 none", {}),
-        "other_branch": ([_other_branch(located, one.fate) for one in named], "other branch there, -1 none", {}),
-        "is_own": (own, "1 if the bifurcation lies on its branch, 0 if the branch springs from it", {}),
-        "n_cells": ([one.n_cells for one in named], "cells of the attractor", {}),
-        "same_as": (same_as(scene, named), "number of the event that this end belongs to", {}),
-        "evidence": ([one.fate.why for one in named], "what decided the event, or what was tried", {}),
+        "attractor": [one.stretch.attractor for one in named],
+        "set": [one.stretch.kind for one in named],
+        "period": [one.stretch.period for one in named],
+        "period_after": [one.after.period if one.after else -1 for one in named],
+        "rises": [int(one.rises) for one in named],
+        "what": [NAMES.index(one.what) for one in named],
+        "criticality": degrees,
+        "value": [_value(one) for one in named],
+        "value_error": [one.error for one in named],
+        "seen": [along[one.stretch.places[one.rises]] for one in named],
+        "beyond": [along[b] if 0 <= b < n else np.nan for b in beyond],
+        "bifurcation": bifurcations.tolist(),
+        "branch": [one.fate.branch for one in named],
+        "other_branch": [_other_branch(located, one.fate) for one in named],
+        "is_own": own,
+        "n_cells": [one.n_cells for one in named],
+        "same_as": same_as(scene, named),
+        "evidence": [one.fate.why for one in named],
     }
     variables: dict[str, object] = {
-        name: ("event", np.array(found), {"units": "1", "long_name": text, **attrs})
-        for name, (found, text, attrs) in (columns | _columns_of_sets(named)).items()
+        name: ("event", np.array(values), code_flags(_CODES[name]) if name in _CODES else {})
+        for name, values in (columns | _columns_of_sets(named)).items()
     }
     to = [list(one.to) for one in named], [list(one.to.values()) for one in named]
     doublings = [one.born.doublings if one.born else () for one in named]
-    variables["to_attractor"] = (("event", "outcome"), _padded(to[0], -1).astype(int), {"long_name": "ids beyond"})
-    variables["to_cells"] = (("event", "outcome"), _padded(to[1], 0).astype(int), {"long_name": "their cells"})
+    variables["to_attractor"] = (("event", "outcome"), _padded(to[0], -1).astype(int))
+    variables["to_cells"] = (("event", "outcome"), _padded(to[1], 0).astype(int))
     ends = [_stretches_beyond(stretches, one, b) for one, b in zip(named, beyond, strict=True)]
-    variables["to_stretch"] = (("event", "outcome"), _padded(ends, -1).astype(int), {"long_name": "their stretches"})
+    variables["to_stretch"] = (("event", "outcome"), _padded(ends, -1).astype(int))
     after = [stretches.index(one.after) if one.after else -1 for one in named]
     variables["stretch_of"] = ("event", np.array([stretches.index(one.stretch) for one in named], int))
     variables["stretch_after"] = ("event", np.array(after, int))
-    variables["doublings"] = (("event", "doubling"), _padded(doublings, np.nan), unit)
+    variables["doublings"] = (("event", "doubling"), _padded(doublings, np.nan))
     kept = {name: located.attrs[name] for name in ("parameter", "parameter_units", "model") if name in located.attrs}
     return xr.Dataset(variables | _bars(scene, stretches, named), attrs=kept)
 
@@ -91,13 +89,13 @@ def _columns_of_sets(named: Sequence[Event]) -> Columns:
     born = [one.born or Born("", "") for one in named]
     crises = [one if isinstance(one, Crisis) else Crisis("", "") for one in born]
     return {
-        "ratio": ([one.ratio for one in born], "ratio of the last two intervals", {}),
-        "exponent": ([one.exponent for one in born], "minus the power of the distance with which times grow", {}),
-        "exponent_error": ([one.exponent_error for one in born], "its error", {}),
-        "rotation": ([one.rotation for one in born], "p/q of a locked orbit", {}),
-        "met_period": ([one.period for one in crises], "period of the unstable orbit that is met, 0 none", {}),
-        "twin": ([one.twin for one in crises], "id of the set with which it merges, -1 none", {}),
-        "lives_beyond": ([int(one.lives_beyond) for one in crises], "1 if the set beyond meets the orbit", {}),
+        "ratio": [one.ratio for one in born],
+        "exponent": [one.exponent for one in born],
+        "exponent_error": [one.exponent_error for one in born],
+        "rotation": [one.rotation for one in born],
+        "met_period": [one.period for one in crises],
+        "twin": [one.twin for one in crises],
+        "lives_beyond": [int(one.lives_beyond) for one in crises],
     }
 
 
@@ -122,16 +120,16 @@ def _bars(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) ->
         found = ends[one, rises]
         return float(scene.along[one.places[rises]]) if np.isnan(found) else found
 
-    unit = {"units": str(scene.located.attrs["parameter_units"])}
-    columns: dict[str, tuple[Sequence[float], Mapping[str, object]]] = {
-        "attractor": ([one.attractor for one in stretches], {}),
-        "set": ([one.kind for one in stretches], code_flags(SETS)),
-        "period": ([one.period for one in stretches], {}),
-        "low": ([end(one, False) for one in stretches], unit),
-        "high": ([end(one, True) for one in stretches], unit),
+    columns: Columns = {
+        "attractor": [one.attractor for one in stretches],
+        "set": [one.kind for one in stretches],
+        "period": [one.period for one in stretches],
+        "low": [end(one, False) for one in stretches],
+        "high": [end(one, True) for one in stretches],
     }
     bars: dict[str, object] = {
-        f"stretch_{name}": ("stretch", np.array(found), attrs) for name, (found, attrs) in columns.items()
+        f"stretch_{name}": ("stretch", np.array(values), code_flags(SETS) if name == "set" else {})
+        for name, values in columns.items()
     }
     places = [[(place, scene.ids_of(one.attractor, place)) for place in one.places] for one in stretches]
     return bars | at_ends(scene.attractors, scene.axis, scene.order, [one.rows for one in stretches], places)

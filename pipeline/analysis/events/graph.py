@@ -59,8 +59,7 @@ def at_ends(
             count[k, end], total[k, end] = np.isin(ids[place], own).sum(), ids.shape[1]
     is_sweep = start_dims(ds) not in ([], ["branch"])
     for name, share in zip(("", "_low", "_high"), (count / total, *binomial_interval(count, total)), strict=True):
-        about = {"units": "1", "long_name": "basin fraction" + name.replace("_", ", ")}
-        found[f"stretch_fraction{name}"] = (dims, share if is_sweep else np.full(shape, np.nan), about)
+        found[f"stretch_fraction{name}"] = (dims, share if is_sweep else np.full(shape, np.nan))
     return found
 
 

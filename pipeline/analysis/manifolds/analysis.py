@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -19,11 +18,10 @@ from scipy.optimize import brentq, minimize_scalar
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import polish_orbits
 from pipeline.analysis.branches.orbit_search import needs_point, point_of
-from pipeline.analysis.branches.problems import parameter_units, state_units
 from pipeline.analysis.branches.starting_orbits import parameters_at
 from pipeline.analysis.manifolds.growing import Manifold, Resolution, Saddle, stable_manifold, unstable_manifold
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, aligned, counted
+from pipeline.analysis.tabular import Row, aligned, counted, header_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     FREQUENCY_DIM,
@@ -102,19 +100,17 @@ def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters
     for i, (*_, curve) in enumerate(curves):
         points[i, : len(curve.points)], times[i, : len(curve.points)] = curve.points, curve.time
 
-    def column(values: list[Any], dtype: str, long_name: str, **attrs: Any) -> tuple[str, Any, dict[str, Any]]:
-        return "curve", np.array(values, dtype), {"units": "1", "long_name": long_name, **attrs}
-
+    ends = np.array([ENDS.index(c.end) for *_, c in curves], np.int8)
     return xr.Dataset(
         {
-            "section": (("curve", "point", "state"), points, {"units": state_units(model)}),
-            "generation": (("curve", "point"), times, {"units": "1", "long_name": "generation and place within it"}),
-            "n_points": column([len(c.points) for *_, c in curves], "int32", "points of the curve"),
-            "stable": column([c.stable for *_, c in curves], "int8", "1 for a stable manifold"),
-            "direction": column([side for _, _, side, _ in curves], "int8", "side of the orbit, 1 or -1"),
-            "orbit": column([number for number, *_ in curves], "int32", "number of the orbit"),
-            "orbit_period": column([saddle.period for _, saddle, *_ in curves], "int32", "its period"),
-            "end": column([ENDS.index(c.end) for *_, c in curves], "int8", "why the curve ends", **code_flags(ENDS)),
+            "section": (("curve", "point", "state"), points),
+            "generation": (("curve", "point"), times),
+            "n_points": ("curve", np.array([len(c.points) for *_, c in curves], np.int32)),
+            "stable": ("curve", np.array([c.stable for *_, c in curves], np.int8)),
+            "direction": ("curve", np.array([side for _, _, side, _ in curves], np.int8)),
+            "orbit": ("curve", np.array([number for number, *_ in curves], np.int32)),
+            "orbit_period": ("curve", np.array([saddle.period for _, saddle, *_ in curves], np.int32)),
+            "end": ("curve", ends, code_flags(ENDS)),
         },
         coords={"state": list(system.state_names)},
         attrs={"model": model_attribute(model), **section_attributes(model.crossing)},
@@ -182,12 +178,8 @@ def tangency(run: OpenRun, options: TangencyOptions) -> xr.Dataset:
             rows.append((number, saddle.period, one, other, value, ""))
     names = ("orbit", "orbit_period", "unstable_side", "stable_side", "value", "why_not")
     columns = zip(*rows, strict=True) if rows else ([] for _ in names)
-    units = {"value": {"units": parameter_units(axis_name(options.parameter), base.model)}}
     return xr.Dataset(
-        {
-            name: ("tangency", np.array(list(values)), units.get(name, {"units": "1"}))
-            for name, values in zip(names, columns, strict=True)
-        },
+        {name: ("tangency", np.array(list(values))) for name, values in zip(names, columns, strict=True)},
         attrs={"parameter": axis_name(options.parameter), "model": model_attribute(base.model)},
     )
 
@@ -221,25 +213,22 @@ def _followed(saddle: Saddle, base: Parameters, parameter: str, options: Tangenc
 def tangency_table(ds: xr.Dataset) -> Table:
     """Return the table of first homoclinic tangencies, with a text line for each pair of manifolds without one."""
     name = parameter_name(str(ds.attrs["parameter"]))
-    every = [
-        {
-            "orbit": int(one["orbit"]),
-            "period": int(one["orbit_period"]),
-            "unstable_side": int(one["unstable_side"]),
-            "stable_side": int(one["stable_side"]),
-            name: float(one["value"]),
-            "why_not": str(one["why_not"].values),
-        }
-        for one in (ds.isel(tangency=i) for i in range(ds.sizes["tangency"]))
-    ]
-    rows = [{k: v for k, v in row.items() if k != "why_not"} for row in every if not row["why_not"]]
+
+    def row_of(one: xr.Dataset) -> Row:
+        sides = {side: int(one[side]) for side in ("unstable_side", "stable_side")}
+        return {"orbit": int(one["orbit"]), "period": int(one["orbit_period"]), **sides, name: float(one["value"])}
+
+    ones = [ds.isel(tangency=i) for i in range(ds.sizes["tangency"])]
+    every = [{**row_of(one), "why_not": str(one["why_not"].values)} for one in ones]
+    rows = [row_of(one) for one in ones if not str(one["why_not"].values)]
     words = [{k: f"{v:.8f}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     lines = [f"{len(rows)} first homoclinic tangencies along {name}", "", *aligned(words, "")]
     for row in every:
         if row["why_not"]:
             sides = f"sides {row['unstable_side']:+d}, {row['stable_side']:+d}"
             lines.append(f"orbit {row['orbit']}, {sides}: none, {row['why_not']}")
-    return Table(rows, lines, "" if every else "no saddle orbit with two manifolds that are curves.")
+    nothing = "" if every else "no saddle orbit with two manifolds that are curves."
+    return Table(rows, lines, nothing, header=header_of(ds, "tangency", row_of))
 
 
 def first_tangency(

@@ -15,8 +15,9 @@ from pipeline.analysis.noise.escapes import mean_and_spread
 from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, point_dims
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, points_of, values
+from pipeline.layout.columns import on_points
 from pipeline.layout.vocabulary import model_of
-from pipeline.products.noise import DensityOptions
+from pipeline.products.noise import DENSITY_COLUMNS, DensityOptions
 from pipeline.products.product import Table
 
 MOST_PEAKS = 16
@@ -98,9 +99,7 @@ def density(run: OpenRun, options: DensityOptions) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Over the parameter points: ``density`` and ``smoothed`` by ``value``; ``n_points``, ``n_effective``,
-        ``bandwidth``, ``n_peaks`` and the places ``peak``; ``mean`` and ``covariance`` of all states; ``variance``,
-        ``skewness`` and ``kurtosis`` (of the normal law 0) of the state.
+        The columns `DENSITY_COLUMNS`.
     """
     cube, model = run.cube(), model_of(run.cube())
     state = options.state or model.state_names[0]
@@ -114,16 +113,13 @@ def density(run: OpenRun, options: DensityOptions) -> xr.Dataset:
     tables = _empty(shape, options.bins, len(model.states))
     for cells in cells_at_points(cube):
         _fill(tables, tuple(cells.at[d] for d in dims), cells, options, number, edges, np.array(model.is_angle))
-    own: dict[str, tuple[str, ...]] = {"density": ("value",), "smoothed": ("value",), "peak": ("rank",)}
-    own |= {"mean": ("state",), "covariance": ("state", "other_state")}
     coords = coordinates_of(cube, dims) | {
         "value": 0.5 * (edges[1:] + edges[:-1]),
         "state": list(model.state_names),
         "other_state": list(model.state_names),
     }
-    variables = {name: ((*dims, *own.get(name, ())), table) for name, table in tables.items()}
-    ds = xr.Dataset(variables, coords=coords)
-    ds["value"].attrs = {"units": model.state(state).unit, "long_name": model.state(state).meaning}
+    ds = xr.Dataset(on_points(DENSITY_COLUMNS, tables, dims), coords=coords)
+    ds["value"].attrs["long_name"] = model.state(state).meaning
     kept = ("model", "parameters", "noise", "title", "source")
     about = {name: cube.attrs[name] for name in kept if name in cube.attrs}
     return ds.assign_attrs({**about, "density_of": state, "prominence": options.prominence})

@@ -24,8 +24,9 @@ from pipeline.analysis.noise.exits import (
 )
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, points_of, unit_of, values, words_of
+from pipeline.layout.columns import on_points
 from pipeline.layout.vocabulary import FREQUENCY_DIM
-from pipeline.products.noise import EscapeOptions
+from pipeline.products.noise import ESCAPES_COLUMNS, EscapeOptions
 from pipeline.products.product import Table
 
 _IN_AND_OUT = ("inside", "outside")
@@ -87,12 +88,8 @@ def escapes(run: OpenRun, options: EscapeOptions) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Over the parameter points, and over ``set`` (in which cells begin): ``n_cells``, ``n_left``, ``n_to`` (by
-        the set they go to), ``at_risk`` [intervals], ``rate``, ``rate_low``, ``rate_high`` and, of a box or a
-        ball, ``rate_halved`` with halved steps [1/s], ``left_share`` with its interval, ``constant_p``,
-        ``exit_mean`` and ``exit_std`` of each state; ``path_mean`` and ``path_std`` by section before leaving.
-        `finish_escapes` adds, over a strength, ``barrier`` and so on, see `rates.KramersFit`. The ``interval`` at
-        whose end exits are seen is a step for a box or a ball, and a period for a class of motion.
+        The columns `ESCAPES_COLUMNS`. `finish_escapes` adds the fit of Kramers' law over a strength, see `KramersFit`.
+        The ``interval`` at whose end exits are seen is a step for a box or a ball, and a period for a class of motion.
     """
     cube, model = run.cube(), run.model
     dims = point_dims(cube)
@@ -243,21 +240,9 @@ def _dataset(
     options: EscapeOptions,
     model: Model,
 ) -> xr.Dataset:
-    own: dict[str, tuple[str, ...]] = {
-        "n_to": ("to",),
-        "exit_mean": ("state",),
-        "exit_std": ("state",),
-        "path_n": ("lag",),
-    }
-    own |= {"path_mean": ("lag", "state"), "path_std": ("lag", "state")}
-    units = {"interval": "s", **{name: "1/s" for name in _REALS if name.startswith("rate")}}
-    variables = {
-        name: ((*dims, "set", *own.get(name, ())), value, {"units": units.get(name, "1")})
-        for name, value in tables.items()
-    }
     coords = coordinates_of(cube, dims)
     coords |= {"set": np.arange(len(words)), "lag": np.arange(-options.stretch, 1), "state": list(model.state_names)}
-    ds = xr.Dataset(variables, coords=coords)
+    ds = xr.Dataset(on_points(ESCAPES_COLUMNS, tables, dims), coords=coords)
     ds["set"].attrs = {"flag_values": list(range(len(words))), "flag_meanings": " ".join(words)}
     return ds
 

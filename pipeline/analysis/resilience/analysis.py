@@ -3,32 +3,7 @@
 The Dataset has a row for each set (`pipeline.analysis.ragged`), and the dim ``state``. Sizes are in units of the
 states' scales (coordinate ``state_scale``), jumps of states in their own units.
 
-===============================  =============================================================================
-variable                         meaning
-===============================  =============================================================================
-``basin_stability``, ``_low``,   share of the cells that end on the attractor, with its interval
-``_high``, ``n_cells``
-``weighted_stability``, ``_low``,  the same, each cell weighed by the density; ``n_effective`` independent cells of
-``_high``, ``n_effective``       equal weight would have the same error
-``arrived``, ``_low``, ``_high``  share of timed initial states that have arrived within `within` periods
-``mean_time``, ``_stderr``,      time until arrival of the timed initial states [drive periods or returns]
-``longest_time``, ``n_timed``
-``weighted_time``,               mean of these times, each weighed by the density, and share of the density of the
-``weighted_arrived``             timed initial states that has arrived within `within` periods
-``reactivity``, ...              `local.Local`: growth of small disturbances at once and later, and their decay
-``quantity``                     value of the expression `quantity`
-``shock_low``, ``shock_high``    interval of the smallest critical shock of the chosen states, at any phase
-``shock``                        its jump of each state
-``shock_phase``                  its phase: a share of the drive period, or of the period of a flow's orbit
-``shock_from``                   the state on the attractor at that phase
-``shock_to``                     id of the attractor where it leads, -1 nowhere, -2 diverges, -3 elsewhere
-``shock_safe``                   size of the largest shell of which all shocks stayed
-``shock_n_below``                smaller shocks that were tried, all of which stayed
-``shock_n_undecided``            smaller shocks whose end is not known
-``distance_...``                 the same for jumps of all states at the section
-``along_low``, ``along_high``,   the same for each state alone; ``along`` is its signed jump
-``along``, ``along_to``
-===============================  =============================================================================
+`pipeline.products.resilience` lists the variables.
 """
 
 from __future__ import annotations
@@ -102,24 +77,12 @@ _STABILITY, _WEIGHTED, _ARRIVED = (
     [f"{name}{end}" for end in ("", "_low", "_high")] for name in ("basin_stability", "weighted_stability", "arrived")
 )
 
-_NUMBERS = {
-    **dict.fromkeys(_STABILITY, ("share of the cells that end on it", "1")),
-    **dict.fromkeys(_WEIGHTED, ("share of the density that ends on it", "1")),
-    "n_effective": ("independent cells of equal weight with the same error", "1"),
-    **dict.fromkeys(_ARRIVED, ("share of initial states that have arrived in time", "1")),
-    "mean_time": ("mean time until arrival, drive periods or returns", "1"),
-    "mean_time_stderr": ("standard error of the mean time", "1"),
-    "longest_time": ("longest time until arrival, drive periods or returns", "1"),
-    "n_timed": ("timed initial states that end on it", "1"),
-    "weighted_time": ("mean time until arrival, weighed by the density", "1"),
-    "weighted_arrived": ("share of the density that has arrived in time", "1"),
-    "reactivity": ("largest growth rate of a small disturbance, at any phase", "1/{}"),
-    "amplification": ("largest factor by which a small disturbance grows", "1"),
-    "amplification_time": ("time after the disturbance at which it is largest", "{}"),
-    "return_time": ("time in which small disturbances shrink by e at last", "{}"),
-    "quantity": ("quantity of the option", "1"),
-}
-"""Numbers of an attractor: their meanings and units, {} of time."""
+_NUMBERS = (
+    *(*_STABILITY, *_WEIGHTED, "n_effective", *_ARRIVED, "mean_time", "mean_time_stderr", "longest_time", "n_timed"),
+    *("weighted_time", "weighted_arrived", "reactivity", "amplification", "amplification_time", "return_time"),
+    "quantity",
+)
+"""Numbers of an attractor."""
 
 _PLAIN = ("n_cells", *_NUMBERS)
 
@@ -214,15 +177,8 @@ def _nearest_seeds(there: Destinations, bases: Bases, states: np.ndarray, labels
     return Trials(np.concatenate(base), np.concatenate(shock)), np.concatenate(label)
 
 
-_SEARCHED: dict[str, tuple[str, float, str]] = {
-    "low": ("float64", np.nan, "no smaller shock leads away, as far as tried"),
-    "high": ("float64", np.nan, "size of the smallest shock found that leads away"),
-    "phase": ("float64", np.nan, "share of the period at which it happens"),
-    "to": ("int32", -1, "attractor where it leads: -1 none, -2 diverges, -3 none of the run's"),
-    "safe": ("float64", np.nan, "largest size of which all directions stayed"),
-    "n_below": ("int64", 0, "smaller shocks that were tried and stayed"),
-    "n_undecided": ("int64", 0, "smaller shocks whose end is not known"),
-}
+_SEARCHED = ("low", "high", "phase", "to", "safe", "n_below", "n_undecided")
+"""Results of a search that are kept."""
 
 
 class _Result:
@@ -235,25 +191,22 @@ class _Result:
         self._attracts = attractors["stability"].values == ATTRACTS
         self._units = np.asarray(run.model.units)
         self._values: dict[str, np.ndarray] = {}
-        self._attrs: dict[str, dict[str, str]] = {}
-        vector = ("float64", np.nan, ("state",), "see state_units")
-        for what, text in (("shock", "smallest critical shock"), ("distance", "shortest way out of the basin")):
-            for name, (dtype, fill, meaning) in _SEARCHED.items():
-                self._new(f"{what}_{name}", f"{text}: {meaning}", dtype, fill)
-            self._new(what, f"{text}: jump of each state", *vector)
-            self._new(f"{what}_from", f"{text}: state before it", *vector)
-        for name in ("low", "high", "to", "n_undecided"):
-            dtype, fill, meaning = _SEARCHED[name]
-            self._new(f"along_{name}", f"boundary along a state: {meaning}", dtype, fill, ("state",))
-        self._new("along", "boundary along a state: jump", *vector)
-        for name, (text, units) in _NUMBERS.items():
-            dtype, fill = ("int64", 0) if name == "n_timed" else ("float64", np.nan)
-            self._new(name, text, dtype, fill, (), units)
+        for what in ("shock", "distance"):
+            for name in ("", "_from"):
+                self._new(f"{what}{name}", by_state=True)
+            for name in _SEARCHED:
+                self._new(f"{what}_{name}")
+        for name in ("along", "along_low", "along_high", "along_to", "along_n_undecided"):
+            self._new(name, by_state=True)
+        for name in _NUMBERS:
+            self._new(name)
 
-    def _new(self, name: str, text: str, dtype: str, fill: float, own: tuple[str, ...] = (), units: str = "1") -> None:
-        shape = (self._attractors.sizes[SET], *(len(self._units) for _ in own))
+    def _new(self, name: str, by_state: bool = False) -> None:
+        """Make an array of a variable: of counts if its name has ``n_``, of ids if it ends in ``_to``."""
+        shape = (self._attractors.sizes[SET], *([len(self._units)] if by_state else []))
+        is_count = name.startswith("n_timed") or "_n_" in name
+        fill, dtype = (0, "int64") if is_count else (-1, "int32") if name.endswith("_to") else (np.nan, "float64")
         self._values[name] = np.full(shape, fill, dtype)
-        self._attrs[name] = {"units": units.format(time_unit(self._run.model)), "long_name": text}
 
     def _attracting(self, index: tuple[int, ...]) -> list[tuple[int, int]]:
         """Return the ids and rows of the sets of a parameter point that attract."""
@@ -356,13 +309,13 @@ class _Result:
         """Return all arrays, with the attractors' features."""
         kept = [name for name in ("kind", "stability", "orbit_period", "n_cells", "side") if name in self._attractors]
         found, plain = self._attractors[[ROW_SIZE, *kept]], self._options.plain()
-        own = {n: ((SET, "state")[: v.ndim], v, self._attrs[n]) for n, v in self._values.items()}
+        own = {n: ((SET, "state")[: v.ndim], v) for n, v in self._values.items()}
         attrs = {**told_by(found.attrs), **section_attributes(self._run.model.crossing), "title": "resilience"}
         options = ("phases", "largest", "norm", "within", "near", "timed", "density", "quantity")
         attrs |= {f"resilience_{name}": value for name, value in plain.items() if name in options}
         attrs |= {"resilience_states": ", ".join(_chosen(self._run, self._options)), N_IDS: found.attrs[N_IDS]}
         states = {k: v.variable for k, v in self._attractors.coords.items() if k in ("state", "state_units")}
-        states["state_scale"] = xr.Variable("state", self._units, {"long_name": "size that counts as 1"})
+        states["state_scale"] = xr.Variable("state", self._units, {"units": "see state_units"})
         return found.assign(own).assign_coords(states).drop_attrs(deep=False).assign_attrs(attrs)
 
 

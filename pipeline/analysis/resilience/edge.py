@@ -3,21 +3,7 @@
 The Dataset has the dims ``edge`` (different edge states), ``point``, ``state``, ``multiplier``, ``pair`` (tracked
 pairs) and ``step`` (sections of their paths).
 
-===============================  =============================================================================
-variable                         meaning
-===============================  =============================================================================
-``kind``                         of the edge state: ``vocabulary.KINDS``; a bounded set where it is no orbit
-                                 and no equilibrium
-``section``, ``n_points``        its section points, in the order of time
-``orbit_period``, ``period_s``   period of an orbit
-``multiplier_real``, ``_imag``   Floquet multipliers of an orbit, by falling modulus
-``eigenvalue_real``, ``_imag``   eigenvalues of an equilibrium [1/s], by falling real part
-``residual``                     scaled residual of Newton's method; NaN of a bounded set
-``n_pairs``                      pairs that lead to it; 0 of an orbit on a path that does not settle
-``pair_edge``, ``pair_reason``   edge state of each pair, -1 none, and why it has none
-``pair_start``                   the two initial states of each pair
-``path``, ``n_steps``            middle of the pair at successive sections
-===============================  =============================================================================
+`pipeline.products.resilience` lists the variables.
 
 The attribute ``between`` has the ids of the two attractors, and ``between_letters`` their letters.
 """
@@ -167,18 +153,16 @@ def _dataset(there: Destinations, pairs: list[Pair], on_paths: list[Orbit], here
     points = [_points_of(one) for one in found]
     paths = [np.array(pair.path).reshape(-1, n) for pair in pairs]
     initial = np.array([pair.start for pair in pairs]).reshape(len(pairs), 2, -1)
-    units = {"units": "see state_units"}
-    reasons = {"long_name": "why none", **code_flags(REASONS)}
     variables = {
-        "section": (("edge", "point", "state"), padded(points, n), {**units, "long_name": "section points"}),
-        "n_points": ("edge", np.array([len(p) for p in points], np.int32), {"long_name": "section points"}),
+        "section": (("edge", "point", "state"), padded(points, n)),
+        "n_points": ("edge", np.array([len(p) for p in points], np.int32)),
         **_about(found, n),
-        "n_pairs": ("edge", np.bincount([k for k in edge_of if k >= 0], minlength=len(found)), {"units": "1"}),
-        "pair_edge": ("pair", np.array(edge_of, np.int32), {"long_name": "edge state, -1 none"}),
-        "pair_reason": ("pair", np.array([p.reason for p in pairs], np.int8), reasons),
-        "pair_start": (("pair", "side", "state"), initial, {**units, "long_name": "initial states"}),
-        "path": (("pair", "step", "state"), padded(paths, n), {**units, "long_name": "path along the boundary"}),
-        "n_steps": ("pair", np.array([len(p) for p in paths], np.int32), {"long_name": "sections of the path"}),
+        "n_pairs": ("edge", np.bincount([k for k in edge_of if k >= 0], minlength=len(found))),
+        "pair_edge": ("pair", np.array(edge_of, np.int32)),
+        "pair_reason": ("pair", np.array([p.reason for p in pairs], np.int8), code_flags(REASONS)),
+        "pair_start": (("pair", "side", "state"), initial),
+        "path": (("pair", "step", "state"), padded(paths, n)),
+        "n_steps": ("pair", np.array([len(p) for p in paths], np.int32)),
     }
     scalars = {str(k): v.variable for k, v in here.coords.items() if not v.ndim}
     states = {name: here[name].variable for name in ("state", "state_units") if name in here.coords}
@@ -203,21 +187,16 @@ def _about(found: list[Any], n_states: int) -> dict[str, Any]:
         else:
             rows.append((BOUNDED_SET, 0, np.nan, np.nan, none, none))
     kinds, periods, seconds, residuals, multipliers, eigenvalues = zip(*rows, strict=True) if rows else ((),) * 6
-    columns = {
-        "kind": (kinds, "int8", "1", "kind of set"),
-        "orbit_period": (periods, "int32", "1", "period in drive periods or returns"),
-        "period_s": (seconds, "float64", "s", "period"),
-        "residual": (residuals, "float64", "1", "scaled residual of Newton's method"),
-    }
     variables: dict[str, Any] = {
-        name: ("edge", np.array(values, dtype), {"units": units, "long_name": text})
-        for name, (values, dtype, units, text) in columns.items()
+        "kind": ("edge", np.array(kinds, np.int8), code_flags(KINDS)),
+        "orbit_period": ("edge", np.array(periods, np.int32)),
+        "period_s": ("edge", np.array(seconds, float)),
+        "residual": ("edge", np.array(residuals, float)),
     }
-    variables["kind"][2].update(code_flags(KINDS))
-    for name, values, units in (("multiplier", multipliers, "1"), ("eigenvalue", eigenvalues, "1/s")):
+    for name, values in (("multiplier", multipliers), ("eigenvalue", eigenvalues)):
         both = np.array(values, complex).reshape(len(found), n_states)
         for part, numbers in (("real", both.real), ("imag", both.imag)):
-            variables[f"{name}_{part}"] = (("edge", "multiplier"), numbers, {"units": units})
+            variables[f"{name}_{part}"] = (("edge", "multiplier"), numbers)
     return variables
 
 

@@ -53,7 +53,7 @@ MEASURES = ("amplitude", "mean", "rms", "error", "dominant_order", "harmonic_amp
 
 _LEFT_OUT = ("section", "multiplier", "eigenvalue", "residual", "bifurcation_section", "bifurcation_multiplier")
 
-Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
+Variable = tuple[Any, ...]
 
 
 def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
@@ -93,8 +93,8 @@ def channel_coordinates(model: Model, n_harmonics: int) -> dict[str, Any]:
     """Return the coordinates of measures: a model's states and quantities with their units, and the harmonics."""
     both: list[State | Quantity] = [*model.states, *model.quantities]
     return {
-        "channel": ("channel", [v.name for v in both], {"long_name": "state or quantity"}),
-        "unit": ("channel", [v.unit for v in both], {"long_name": "unit of the channel"}),
+        "channel": ("channel", [v.name for v in both]),
+        "unit": ("channel", [v.unit for v in both]),
         "harmonic": np.arange(1, n_harmonics + 1),
     }
 
@@ -104,20 +104,18 @@ def measured(orbits: Sequence[Orbit], model: Model, n_harmonics: int) -> dict[st
     found = measures_of(orbits, n_harmonics)
     n = len(model.states) + len(model.quantities)  # also if there is no orbit
     columns = {
-        "amplitude": (found.amplitude, "half of peak to peak"),
-        "mean": (found.mean, "mean over the period"),
-        "rms": (found.rms, "root of the mean square over the period"),
-        "error": (found.error, "largest error of the amplitudes"),
-        "dominant_order": (found.dominant, "order of the largest component, in units of the drive's frequency"),
-    }
-    variables: dict[str, Variable] = {
-        name: (("channel",), v.reshape(-1, n), {"long_name": text}) for name, (v, text) in columns.items()
+        "amplitude": found.amplitude,
+        "mean": found.mean,
+        "rms": found.rms,
+        "error": found.error,
+        "dominant_order": found.dominant,
     }
     both, harmonics = ("channel", "harmonic"), found.harmonics.reshape(-1, n, n_harmonics)
-    variables["harmonic_amplitude"] = (both, np.abs(harmonics), {"long_name": "amplitude of the harmonic"})
-    about = {"units": "rad", "long_name": "lag of the harmonic behind that of the drive"}
-    variables["phase"] = (both, lags_of(orbits, harmonics), about)
-    return variables
+    return {
+        **{name: (("channel",), values.reshape(-1, n)) for name, values in columns.items()},
+        "harmonic_amplitude": (both, np.abs(harmonics)),
+        "phase": (both, lags_of(orbits, harmonics)),
+    }
 
 
 def measured_along(
@@ -126,10 +124,10 @@ def measured_along(
     """Return the measures of orbits at places along two dims as variables; NaN where there is no orbit."""
     rows = tuple(np.array([*orbits], int).reshape(-1, 2).T)
     variables: dict[str, Variable] = {}
-    for name, (dims, found, about) in measured([*orbits.values()], model, n_harmonics).items():
+    for name, (dims, found) in measured([*orbits.values()], model, n_harmonics).items():
         whole = np.full((*sizes.values(), *found.shape[1:]), np.nan)
         whole[rows] = found
-        variables[name] = ((*sizes, *dims), whole, about)
+        variables[name] = ((*sizes, *dims), whole)
     return variables
 
 
@@ -186,22 +184,14 @@ def _jumps(
         words = ["at_rest" if a.max() < CLOSURE else word for a, word in zip(amplitude, words, strict=True)]
     codes = np.array([[*LANDINGS].index(word) for word in words], np.int8)
     periods = [0 if orbit is None else orbit.period for _, orbit in landed]
-    columns = {
-        "jump_bifurcation": ([k for k, _ in ends], "int32", "bifurcation at which a stable orbit ends"),
-        "jump_rises": ([way > 0 for _, way in ends], "int8", "1 if the parameter rises"),
-        "jump_beyond": (beyond, "float64", "value of the parameter beyond it"),
-        "jump_period": (periods, "int32", "period of the orbit on which a trajectory lands"),
+    return {
+        "jump_bifurcation": ("jump", np.array([k for k, _ in ends], np.int32)),
+        "jump_rises": ("jump", np.array([way > 0 for _, way in ends], np.int8)),
+        "jump_beyond": ("jump", np.array(beyond, float)),
+        "jump_period": ("jump", np.array(periods, np.int32)),
+        "jump_landing": ("jump", codes, code_flags([*LANDINGS])),
+        "jump_amplitude": (("jump", "channel"), amplitude.reshape(-1, len(nothing))),
     }
-    found: dict[str, Variable] = {
-        name: (("jump",), np.array(values, dtype), {"long_name": text})
-        for name, (values, dtype, text) in columns.items()
-    }
-    about = {"long_name": "where a trajectory lands", **code_flags([*LANDINGS])}
-    found["jump_beyond"][2]["units"] = str(located.attrs["parameter_units"])
-    found["jump_landing"] = (("jump",), codes, about)
-    text = {"long_name": "half of peak to peak of the orbit on which a trajectory lands"}
-    found["jump_amplitude"] = (("jump", "channel"), amplitude.reshape(-1, len(nothing)), text)
-    return found
 
 
 def _ways(located: xr.Dataset, k: int) -> list[int]:

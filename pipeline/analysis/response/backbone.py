@@ -17,7 +17,7 @@ from magpend_core.pointwise import rates
 from pipeline.analysis.branches.analysis import fixed_of, interval_of, swept_axis
 from pipeline.analysis.branches.curves import lies_on
 from pipeline.analysis.branches.lockstep import run_alone, run_together
-from pipeline.analysis.branches.problems import FREQUENCY, Family, parameter_units
+from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.response.analysis import channel_coordinates, channel_rows, measured_along
 from pipeline.analysis.response.resonance import (
     ENDS,
@@ -280,25 +280,22 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         multiplier[i, j, : len(own)] = own
     orbits = {(i, j): curves[i].problem.orbit(curves[i].points[j].u) for i, j in places}
     variables: dict[str, Any] = measured_along(orbits, {"curve": len(curves), "point": n}, model, HARMONICS)
-    over, unit = ("curve", "point"), {"units": "1"}
-    force_units = parameter_units(options.drive, model) if options.drive else "1"
+    over = ("curve", "point")
     linear = [c.problem.linear_hz if isinstance(c.problem, ModeProblem) else np.nan for c in curves]
     first, last = ([ENDS.index(c.ends[k]) for c in curves] for k in (0, 1))
-    about = "multipliers that decide the stability"
-    linear_about = {"units": "Hz", "long_name": "frequency of the linear mode"}
     variables |= {
-        "parameter": (over, frequency, {"units": "Hz", "long_name": "frequency"}),
-        "force": (over, force, {"units": force_units, "long_name": options.drive or "force"}),
-        "section": ((*over, "state"), section, {"long_name": "point of the orbit"}),
-        "residual": (over, residual, {**unit, "long_name": "scaled gap between the ends of the orbit"}),
-        "n_unstable": (over, unstable, {**unit, "long_name": "multipliers outside the unit circle, -1 beyond"}),
-        "multiplier_real": ((*over, "multiplier"), multiplier.real, {**unit, "long_name": f"{about}, real part"}),
-        "multiplier_imag": ((*over, "multiplier"), multiplier.imag, {**unit, "long_name": f"{about}, imaginary part"}),
+        "parameter": (over, frequency),
+        "force": (over, force),
+        "section": ((*over, "state"), section),
+        "residual": (over, residual),
+        "n_unstable": (over, unstable),
+        "multiplier_real": ((*over, "multiplier"), multiplier.real),
+        "multiplier_imag": ((*over, "multiplier"), multiplier.imag),
         "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), code_flags(KINDS)),
-        "n_points": ("curve", np.array([len(c.points) for c in curves], np.int32), unit),
+        "n_points": ("curve", np.array([len(c.points) for c in curves], np.int32)),
         "first_end": ("curve", np.array(first, np.int8), code_flags(ENDS)),
         "last_end": ("curve", np.array(last, np.int8), code_flags(ENDS)),
-        "linear_frequency": ("curve", np.array(linear, float), linear_about),
+        "linear_frequency": ("curve", np.array(linear, float)),
     }
     left_out = [*left_out, *(f"curve {i}: {why}" for i, curve in enumerate(curves) for why in _cut_off(curve))]
     coords = {**channel_coordinates(model, HARMONICS), "state": list(model.state_names)}

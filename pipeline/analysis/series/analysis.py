@@ -37,10 +37,11 @@ from pipeline.analysis.sets import Geometry
 from pipeline.analysis.spectrum.estimate import pieces_of, spectrum_of
 from pipeline.analysis.spectrum.motions import channels_of, clock_of, motions_of, sampled
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain
+from pipeline.layout.columns import described
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import model_of, told_by
 from pipeline.products.product import Table
-from pipeline.products.spectrum import SeriesOptions
+from pipeline.products.spectrum import SERIES_COLUMNS, SeriesOptions
 
 MOST_VECTORS = 4000
 """Most delay vectors that are kept for the figure."""
@@ -115,7 +116,8 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
         raise ValueError(f"channel {channel!r} is constant.")
     about = {"title": "series", "channel": channel, "unit": shown_unit(ds[channel].attrs, "1"), "seed": seed}
     power = spectrum_of(ds, channel).isel(spectrum=0).reset_coords()[["power", "frequency_hz"]]
-    return xr.merge([_measured(series, seed), power]).assign_attrs({**told_by(ds.attrs), **about})
+    found = xr.merge([_measured(series, seed), power]).assign_attrs({**told_by(ds.attrs), **about})
+    return described(found, SERIES_COLUMNS)
 
 
 def refuse_map(model: Model, channel: str) -> None:
@@ -159,9 +161,9 @@ def _measured(series: Series, seed: int) -> xr.Dataset:
     ]
     motion, reason = _motion(returns, {r.name: r for r in results}, parted, drift)
     variables: dict[str, Any] = {name: ("quantity", [getattr(r, name) for r in results]) for name in Result._fields[1:]}
-    lags = ("lag", np.arange(len(information)) * series.step, {"units": "s"})
-    variables["mutual_information"] = ("lag", information, {"units": "1"})
-    variables["false_neighbours"] = ("dimension", false, {"units": "1"})
+    lags = ("lag", np.arange(len(information)) * series.step)
+    variables["mutual_information"] = ("lag", information)
+    variables["false_neighbours"] = ("dimension", false)
     coords = {"quantity": [r.name for r in results], "lag": lags, "dimension": np.arange(1, len(false) + 1)}
     curves = _curves(embedding, returns, parted, sums, own)
     return xr.merge([xr.Dataset(variables, coords), curves]).assign_attrs(motion=motion, motion_reason=reason)
@@ -171,30 +173,28 @@ def _curves(
     embedding: Embedding, returns: Returns, parted: Divergence, sums: Sums, own: Recurrence | None
 ) -> xr.Dataset:
     """Return the curves of a series' figure."""
-    pure, seconds = {"units": "1"}, {"units": "s"}
     inside = (parted.time >= parted.fit[0]) & (parted.time <= parted.fit[1])
     line = np.where(inside, parted.offset + parted.value * parted.time, np.nan)
     firsts, series = returns.pairs(), embedding.series
     starts = series.starts(embedding.delay)[:MOST_VECTORS]
-    about = {**pure, "long_name": "mean log distance of neighbours, of random pairs 0"}
     curves = {
-        "divergence": ("elapsed", parted.curve, about),
-        "fit_line": ("elapsed", line, pure),
+        "divergence": ("elapsed", parted.curve),
+        "fit_line": ("elapsed", line),
         "maximum": ("return", returns.height[firsts]),
         "next_maximum": ("return", returns.height[firsts + 1]),
         "vector": (("delayed", "coordinate"), series.values[starts[:, None] + [0, embedding.delay]]),
-        "correlation_sum": (("embedding", "radius"), sums.share, pure),
+        "correlation_sum": (("embedding", "radius"), sums.share),
         "fit_low": ((), sums.fit[0]),
         "fit_high": ((), sums.fit[1]),
     }
     coords: dict[str, Any] = {
-        "elapsed": ("elapsed", parted.time, seconds),
+        "elapsed": ("elapsed", parted.time),
         "embedding": list(sums.dimensions),
-        "radius": ("radius", sums.radius, pure),
+        "radius": ("radius", sums.radius),
     }
     if own is not None:
         curves["recurrent"] = (("row", "column"), own.matrix)
-        coords |= {name: (name, own.time, seconds) for name in ("row", "column")}
+        coords |= {name: (name, own.time) for name in ("row", "column")}
     return xr.Dataset(curves, coords)
 
 
@@ -352,7 +352,8 @@ def series(run: OpenRun, options: SeriesOptions) -> xr.Dataset:
     time = np.arange(len(values)) / (rate * options.samples)
     told = told_by(run.cube().attrs)
     ds = xr.Dataset({channel.name: ("time", values, {"units": channel.unit})}, {"time": time}, told)
-    return series_of(ds, seed=options.seed).assign_coords({**motion.where, "attractor": motion.attractor})
+    where = {name: ((), value, run.cube()[name].attrs) for name, value in motion.where.items()}
+    return series_of(ds, seed=options.seed).assign_coords({**where, "attractor": motion.attractor})
 
 
 def series_table(ds: xr.Dataset) -> Table:

@@ -163,16 +163,7 @@ def _row(
     return row
 
 
-_NUMBERS = {
-    "n_averages": ("", "number of averaged segments"),
-    "resolution_hz": ("Hz", "distance of two bins"),
-    "bandwidth_hz": ("Hz", "equivalent noise bandwidth of the window"),
-    "kept": ("1", "share of the variance in the bins"),
-    "rate_hz": ("Hz", "frequency of the drive, or mean rate of returns"),
-    "first_hz": ("Hz", "first frequency of a torus: the drive's, or that of its strongest line"),
-    "second_hz": ("Hz", "second frequency of a torus, up to its sign and multiples of the first"),
-    "explained": ("1", "share of a torus' power at combinations of its two frequencies"),
-}
+_NUMBERS = ("n_averages", "resolution_hz", "bandwidth_hz", "kept", "rate_hz", "first_hz", "second_hz", "explained")
 
 
 def _dataset(
@@ -188,27 +179,24 @@ def _dataset(
                 values[i, : len(row[name])] = row[name]
     over, both = ("spectrum",), ("spectrum", "bin")
     rate = np.array([row.get("rate_hz", np.nan) for row in rows])
-    power = {"units": power_unit(unit, options.scaling), "long_name": f"{options.scaling} of {options.channel}"}
     variables: dict[str, Any] = {
-        "amplitude": (both, table["amplitude"], {"units": unit, "long_name": f"amplitude of {options.channel}"}),
-        "power": (both, table["power"], power),
+        "amplitude": (both, table["amplitude"]),
+        "power": (both, table["power"], {"units": power_unit(unit, options.scaling)}),
         "estimate": (over, np.array([row["estimate"] for row in rows], np.int8), code_flags(ESTIMATES)),
         "kind": (over, np.array([m.kind for m in motions], np.int8), code_flags(KINDS)),
         "stability": (over, np.array([m.stability for m in motions], np.int8), code_flags(STABILITIES)),
-        "orbit_period": (over, np.array([m.period for m in motions], np.int32), {"long_name": "period"}),
-        "share": (over, np.array([m.share for m in motions]), {"long_name": "share of the initial conditions"}),
-        "variance": (over, _column(rows, "variance"), {"units": power_unit(unit, "spectrum"), "long_name": "variance"}),
-        "error": (over, _column(rows, "error"), {"units": unit, "long_name": "largest error of the amplitudes"}),
+        "orbit_period": (over, np.array([m.period for m in motions], np.int32)),
+        "share": (over, np.array([m.share for m in motions])),
+        "variance": (over, _column(rows, "variance"), {"units": power_unit(unit, "spectrum")}),
+        "error": (over, _column(rows, "error")),
+        **{name: (over, _column(rows, name)) for name in _NUMBERS},
     }
-    for name, (units, text) in _NUMBERS.items():
-        variables[name] = (over, _column(rows, name), {"units": units, "long_name": text})
     coords: dict[str, Any] = {
-        "frequency_hz": (both, table["frequency_hz"], {"units": "Hz", "long_name": "frequency"}),
-        "attractor": (over, np.array([m.attractor for m in motions], np.int32), {"long_name": "attractor id"}),
+        "frequency_hz": (both, table["frequency_hz"]),
+        "attractor": (over, np.array([m.attractor for m in motions], np.int32)),
     }
     if not model.autonomous:
-        about = {"units": "1", "long_name": "multiple of the drive frequency"}
-        coords["order"] = (both, table["frequency_hz"] / rate[:, None], about)
+        coords["order"] = (both, table["frequency_hz"] / rate[:, None])
     coords |= {str(k): v for k, v in cube.coords.items() if not v.ndim and v.dtype.kind == "f"}
     for name in motions[0].where:
         coords[row_axis(name)] = (over, np.array([m.where[name] for m in motions]), dict(cube[name].attrs))

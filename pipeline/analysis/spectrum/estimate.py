@@ -12,8 +12,10 @@ import xarray as xr
 from scipy import optimize, signal
 
 from pipeline.analysis.spectrum.gaps import Filled, filled
+from pipeline.layout.columns import described
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
+from pipeline.products.spectrum import SPECTRUM_COLUMNS
 
 UNEVEN = 0.01
 """Largest deviation of a sampling interval from their median, as a share of it, at which a series counts as even."""
@@ -195,19 +197,18 @@ def spectrum_of(
     drive_hz = drive_hz or ds.attrs.get("frequency_hz")
     unit = shown_unit(ds[channel].attrs, "1")
     both, frequency = ("spectrum", "bin"), found.frequency_hz[None]
-    about = {"units": power_unit(unit, scaling), "long_name": f"{scaling} of {channel}"}
-    variables: dict[str, Any] = {"power": (both, found.power[None], about)}
+    variables: dict[str, Any] = {"power": (both, found.power[None], {"units": power_unit(unit, scaling)})}
     for name in ("n_averages", "resolution_hz", "bandwidth_hz"):
         variables[name] = ("spectrum", [getattr(found, name)])
     variables["variance"] = ("spectrum", [found.variance], {"units": power_unit(unit, "spectrum")})
     variables["kept"] = ("spectrum", [found.kept(scaling)])
     variables["n_interpolated"] = ("spectrum", [whole.n_samples])
-    coords: dict[str, Any] = {"frequency_hz": (both, frequency, {"units": "Hz", "long_name": "frequency"})}
+    coords: dict[str, Any] = {"frequency_hz": (both, frequency)}
     if drive_hz:
-        coords["order"] = (both, frequency / float(drive_hz), {"units": "1", "long_name": "order"})
+        coords["order"] = (both, frequency / float(drive_hz))
     attrs = {"title": "spectrum", "channel": channel, "unit": unit, "scaling": scaling, "window": window}
     attrs["notes"] = "\n".join(_notes(whole, found, scaling, rate))
-    return xr.Dataset(variables, coords, {**told_by(ds.attrs), **attrs})
+    return described(xr.Dataset(variables, coords, {**told_by(ds.attrs), **attrs}), SPECTRUM_COLUMNS)
 
 
 def _averaged(pieces: Sequence[Array], rate_hz: float, nperseg: int, **settings: str) -> Averaged:

@@ -10,9 +10,11 @@ import numpy as np
 import xarray as xr
 
 from magpend_core import Status
+from magpend_core.models.model import Model
+from pipeline.analysis.branches.problems import parameter_units
 from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, aligned, counted, plain, unit_of, words_of
+from pipeline.analysis.tabular import Row, aligned, counted, header_of, plain, unit_of, words_of
 from pipeline.analysis.tipping.endings import NONE, Final, Group, endings, ends_s, finals_of
 from pipeline.layout.cells import CellMap, initial_states
 from pipeline.layout.vocabulary import axis_name, drift_attributes, letter, model_attribute, parameter_name, split_dims
@@ -67,8 +69,7 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     for group, own in zip(groups, ids, strict=True):
         outcome[group.cells] = [own.get(int(o), int(o)) for o in group.outcome]
     outcome = outcome.reshape(shape)
-    about = {"units": "1", "long_name": "attractor reached, -2 diverged, -1 none"}
-    result = xr.Dataset({**table, "outcome": (order, outcome.astype(np.int32), about)})
+    result = xr.Dataset({**table, "outcome": (order, outcome.astype(np.int32))})
     result = result.assign_coords({k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)})
     axis = parameter_name(options.parameter)
     others = tuple(name for name in run.spec.axes if name != axis)
@@ -77,9 +78,8 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     if axis in run.spec.axes and len(run.spec.axes[axis].array()) > 1:
         whole = _brackets(run, axis, others, outcome, dims)
         brackets = Bisection(run, axis, others, groups, ids, options).run_all(whole[: options.brackets])
-    unit = "Hz" if axis == FREQUENCY else model.parameter(axis).unit
     attrs = {"model": model_attribute(model), **drift_attributes(model), "parameter": axis, "n_brackets": len(whole)}
-    return result.assign(_of_brackets(brackets, axis, others, unit)).assign_attrs(attrs)
+    return result.assign(_of_brackets(brackets, others, model)).assign_attrs(attrs)
 
 
 def _cells(run: OpenRun) -> tuple[np.ndarray, np.ndarray]:
@@ -102,12 +102,11 @@ def _numbered(groups: list[Group]) -> tuple[list[dict[int, int]], dict[str, Any]
     kinds = [words_of(one["kind"])[int(one["kind"])] for *_, one in rows]
     points = [one["attractor_points"].values[0] for *_, one in rows]
     n_states = len(groups[0].final.parameters.model.state_names)
-    pure = {"units": "1"}
     return ids, {
         "attractor_kind": ("attractor", np.array(kinds, dtype="U32")),
-        "attractor_period": ("attractor", np.array([int(one["orbit_period"]) for *_, one in rows], np.int32), pure),
-        "attractor_group": ("attractor", np.array([number for number, *_ in rows], np.int32), pure),
-        "attractor_n_cells": ("attractor", np.array([n for _, n, _ in rows], np.int64), pure),
+        "attractor_period": ("attractor", np.array([int(one["orbit_period"]) for *_, one in rows], np.int32)),
+        "attractor_group": ("attractor", np.array([number for number, *_ in rows], np.int32)),
+        "attractor_n_cells": ("attractor", np.array([n for _, n, _ in rows], np.int64)),
         "attractor_point": (("attractor", "state"), np.reshape(points, (len(rows), n_states))),
         "final_parameters": ("group", np.array(_sentences(groups), dtype=str)),
     }
@@ -136,24 +135,22 @@ def _brackets(
     return found
 
 
-def _of_brackets(brackets: list[Bracket], axis: str, others: tuple[str, ...], unit: str) -> dict[str, Any]:
+def _of_brackets(brackets: list[Bracket], others: tuple[str, ...], model: Model) -> dict[str, Any]:
     """Return the variables of the critical values, over the dim ``critical``."""
-
-    def column(values: list[Any], dtype: str, long_name: str, units: str = "1") -> Any:
-        return xr.Variable("critical", np.array(values, dtype), {"units": units, "long_name": long_name})
-
-    found = {
-        "critical_value": column([b.middle for b in brackets], "float64", f"critical {axis}", unit),
-        "critical_low": column([b.low for b in brackets], "float64", "last value with the first attractor", unit),
-        "critical_high": column([b.high for b in brackets], "float64", "first value with the second one", unit),
-        "critical_from": column([b.outcome_low for b in brackets], "int32", "attractor below, -2 diverged"),
-        "critical_to": column([b.outcome_high for b in brackets], "int32", "attractor above, -2 diverged"),
-        "critical_start": column([b.start for b in brackets], "int64", "initial condition"),
-        "critical_n_evaluated": column([b.n_evaluated for b in brackets], "int32", "trajectories of the bisection"),
-        "critical_decided": column([b.is_decided for b in brackets], "int8", "1 if every one reached an attractor"),
+    columns: dict[str, tuple[list[Any], str]] = {
+        "critical_value": ([b.middle for b in brackets], "float64"),
+        "critical_low": ([b.low for b in brackets], "float64"),
+        "critical_high": ([b.high for b in brackets], "float64"),
+        "critical_from": ([b.outcome_low for b in brackets], "int32"),
+        "critical_to": ([b.outcome_high for b in brackets], "int32"),
+        "critical_start": ([b.start for b in brackets], "int64"),
+        "critical_n_evaluated": ([b.n_evaluated for b in brackets], "int32"),
+        "critical_decided": ([b.is_decided for b in brackets], "int8"),
     }
+    found: dict[str, Any] = {name: ("critical", np.array(values, dtype)) for name, (values, dtype) in columns.items()}
     for i, name in enumerate(others):
-        found[f"critical_at_{axis_name(name)}"] = column([b.point[i] for b in brackets], "float64", name)
+        about = {"units": parameter_units(axis_name(name), model), "long_name": f"value of {name}"}
+        found[f"critical_at_{axis_name(name)}"] = ("critical", np.array([b.point[i] for b in brackets], float), about)
     return found
 
 
@@ -173,7 +170,8 @@ def tipping_table(ds: xr.Dataset) -> Table:
     lines.append(f"{counted(n, 'critical value')} of {axis}" if n else "no cell changes its attractor along the sweep")
     if shown < n:
         lines[-1] += f"; the first {shown} are bisected (--brackets)"
-    return Table(rows, [*lines, *aligned([_words(row, unit) for row in rows])])
+    lines += aligned([_words(row, unit) for row in rows])
+    return Table(rows, lines, header=header_of(ds, "critical", _row))
 
 
 def _row(one: xr.Dataset) -> Row:

@@ -76,16 +76,12 @@ def delay(run: OpenRun, options: DelayOptions) -> xr.Dataset:
     values = cube[at_section(name)].broadcast_like(cube["section"].isel(state=0)).transpose(*order, "period_index")
     left = np.take_along_axis(values.values, np.maximum(at, 0)[..., None], axis=-1)[..., 0]
     left = np.where(at >= 0, left, np.nan)
-    unit = model.parameter(name).unit
-    variables: dict[str, Any] = {
-        "left": (order, left, {"units": unit, "long_name": f"{name} where it leaves"}),
-        "left_index": (order, at.astype(np.int32), {"units": "1", "long_name": "section at which it leaves, or -1"}),
-    }
+    variables: dict[str, Any] = {"left": (order, left), "left_index": (order, at.astype(np.int32))}
     attrs: dict[str, Any] = {"model": model_attribute(model), **drift_attributes(model)}
     attrs |= {"moving": name, "period": options.period, "distance": options.distance}
     if options.static is not None:
         attrs["static"] = options.static
-        variables["delay"] = (order, left - options.static, {"units": unit, "long_name": "left - static"})
+        variables["delay"] = (order, left - options.static)
     return xr.Dataset(variables, {k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)}, attrs)
 
 

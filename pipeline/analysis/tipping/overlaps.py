@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 
@@ -15,10 +13,11 @@ from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import choose, place, start_dims
 from pipeline.analysis.tabular import Row, aligned, with_interval
 from pipeline.analysis.tipping.analysis import outcome_word
+from pipeline.layout.columns import on_points
 from pipeline.layout.own_words import rate_of
 from pipeline.layout.vocabulary import axis_name
 from pipeline.products.product import Table
-from pipeline.products.tipping import OverlapOptions
+from pipeline.products.tipping import OVERLAPS_COLUMNS, OverlapOptions
 
 UNKNOWN = -1
 
@@ -64,21 +63,11 @@ def overlaps(run: OpenRun, options: OverlapOptions) -> xr.Dataset:
     first, last, counts = overlap_counts(before, after)
     total = counts.sum(axis=1, keepdims=True)
     low, high = binomial_interval(counts, np.broadcast_to(total, counts.shape), confidence=options.confidence)
-    columns = {
-        "count": (counts, "starts in both basins"),
-        "probability": (counts / np.maximum(total, 1), "tipping probability"),
-        "low": (low, "lower end of the interval"),
-        "high": (high, "upper end of the interval"),
-    }
-    one = {"units": "1"}
-    variables: dict[str, Any] = {n: (("before", "after"), v, {**one, "long_name": t}) for n, (v, t) in columns.items()}
-    variables["n_unknown"] = ((), int(((before == UNKNOWN) | (after == UNKNOWN)).sum()), one)
-    coords = {
-        "before": ("before", first, {**one, "long_name": "attractor before, -2 diverges"}),
-        "after": ("after", last, {**one, "long_name": "attractor after, -2 diverges"}),
-    }
+    values = {"count": counts, "probability": counts / np.maximum(total, 1), "low": low, "high": high}
+    values["n_unknown"] = np.array(((before == UNKNOWN) | (after == UNKNOWN)).sum())
     attrs = {"parameter": axis, "value_before": options.before, "value_after": options.after}
-    return xr.Dataset(variables, coords, {**attrs, "confidence": options.confidence})
+    coords = {"before": first, "after": last}
+    return xr.Dataset(on_points(OVERLAPS_COLUMNS, values, ()), coords, {**attrs, "confidence": options.confidence})
 
 
 def overlaps_table(ds: xr.Dataset) -> Table:

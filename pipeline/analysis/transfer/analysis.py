@@ -1,33 +1,7 @@
 """Analyse the transfer operator of a run's section map: slow sets, committors, passage times and rates of escape.
 
-Schema
-------
 Rows are sets (dim ``set``, see `pipeline.analysis.ragged`); the boxes of a set are its samples (dim ``sample``). Steps
-are drive periods or returns.
-
-============================== ================= ==========================================================
-variable                       dims              meaning
-============================== ================= ==========================================================
-``n_pairs``, ``n_boxes``       parameters        pairs of sections, and boxes in which a pair begins
-``outside``, ``unknown``       parameters        shares of pairs that end outside the grid, or in a box in
-                                                 which no pair begins
-``n_closed``                   parameters        closed sets, which no path leaves
-``eigenvalue``                 parameters, mode  real and imaginary part of the slow eigenvalues, on the one
-``eigenvalue_imaginary``                         closed set; NaN where several sets are closed
-``width``                      parameters, axis  width of the boxes along each state
-``is_closed``, ``measure``     set               1 if no path leaves it; share of the stationary measure
-                                                 (NaN: each closed set has its own)
-``share``                      set               mean committor over all boxes: of a closed set, its share of
-                                                 the sampled states
-``kept``, ``escape_rate``      set               share of its measure that stays in a step; rate of escape per
-                                                 step, with ``_low``, ``_high`` and ``_coarse``
-``passage``                    set, target       mean steps from its core to the core of another set of the
-                                                 same parameter point, with ``_low``, ``_high``, ``_coarse``
-``place``                      sample, axis      centre of a box
-``density``                    sample            stationary measure of a box, within its set
-``committor``, ``is_core``     sample            probability to reach the core of its set before the others, with
-                                                 ``_low``, ``_high`` and ``_coarse``
-============================== ================= ==========================================================
+are drive periods or returns. `pipeline.products.transfer.COLUMNS` lists the variables.
 
 Intervals are percentiles of resamples: of whole cells if there are enough, else of stretches of cells. Sets and cores
 stay those of all cells. ``_coarse`` is the number on boxes of twice the width: its distance from the number itself
@@ -46,15 +20,17 @@ from scipy.sparse import csr_array
 
 from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, inputs_at, point_dims
-from pipeline.analysis.ragged import N_POINTS, ROW_SIZE, SAMPLE, SET, rows_at
+from pipeline.analysis.ragged import N_POINTS, ROW_SIZE, rows_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import listed
 from pipeline.analysis.tabular import Row, Words, aligned, number, points_of, with_interval
 from pipeline.analysis.transfer import ulam
 from pipeline.analysis.transfer.ulam import Chain, Grid
+from pipeline.layout.columns import on_points
 from pipeline.layout.vocabulary import letter, model_of
+from pipeline.products.column import POINTS
 from pipeline.products.product import Table
-from pipeline.products.transfer import TransferOptions
+from pipeline.products.transfer import COLUMNS, TransferOptions
 from pipeline.specification.problems import unknown_name
 
 MOST_SETS = 16
@@ -292,9 +268,6 @@ _WITH_ENDS = ("escape_rate", "passage", "committor")
 
 _RATES, _PASSAGES, _COMMITTORS = ([f"{name}{end}" for end in ("", "_low", "_high", "_coarse")] for name in _WITH_ENDS)
 _REALS = (*_RATES, "kept")
-_ON_SETS: dict[str, tuple[str, ...]] = dict.fromkeys(("is_closed", "measure", "share", *_REALS, N_POINTS), (SET,))
-_ON_SETS |= dict.fromkeys(_PASSAGES, (SET, "target"))
-_ON_BOXES = dict.fromkeys(("density", *_COMMITTORS, "is_core"), (SAMPLE,)) | {"place": (SAMPLE, "axis")}
 
 
 def _variables(
@@ -333,30 +306,21 @@ def _variables(
     }
 
 
-_UNITS = {"escape_rate": "1/step", "passage": "steps"}
-
-
 def _dataset(
     cube: xr.Dataset, names: Sequence[str], parts: Sequence[dict[str, Any]], options: TransferOptions
 ) -> xr.Dataset:
     model, dims = model_of(cube), point_dims(cube)
     shape = tuple(cube.sizes[d] for d in dims)
-    own_dims = {"eigenvalue": ("mode",), "eigenvalue_imaginary": ("mode",), "width": ("axis",)}
-    on_rows = _ON_SETS | _ON_BOXES
-    variables: dict[str, Any] = {}
+    of_points = {column.name for column in COLUMNS if column.dims.startswith(POINTS)}
+    values: dict[str, np.ndarray] = {}
     for name in parts[0]:
         rows = [np.asarray(part[name]) for part in parts]
-        units = {"units": next((u for key, u in _UNITS.items() if name.startswith(key)), "1")}
-        if name in on_rows:
-            variables[name] = (on_rows[name], np.concatenate(rows), {} if name == "place" else units)
-        else:
-            table = np.stack(rows).reshape((*shape, *rows[0].shape))
-            variables[name] = ((*dims, *own_dims.get(name, ())), table, units)
-    own = {"axis": list(names), "axis_units": ("axis", [model.state(name).unit for name in names])}
+        values[name] = np.stack(rows).reshape((*shape, *rows[0].shape)) if name in of_points else np.concatenate(rows)
+    axis = {"axis": list(names), "unit": ("axis", [model.state(name).unit for name in names])}
     kept = ("model", "parameters", "noise", "title", "source")
     about = {name: cube.attrs[name] for name in kept if name in cube.attrs}
     about |= {"confidence": options.confidence, "core": options.core}
-    return xr.Dataset(variables, {**coordinates_of(cube, dims), **own}, about)
+    return xr.Dataset(on_points(COLUMNS, values, dims), {**coordinates_of(cube, dims), **axis}, about)
 
 
 def transfer_table(ds: xr.Dataset) -> Table:

@@ -134,7 +134,7 @@ def test_bogdanov_takens():
     assert q.max() < 1e-8
     assert "bogdanov_takens" in next(c for c in curves if c.kind == "hopf").ends
     row = only_at_origin(curves, "bogdanov_takens")
-    np.testing.assert_allclose([row["a"], row["b"]], [1.4, -0.7], atol=1e-9)
+    np.testing.assert_allclose([row["coefficient_a"], row["coefficient_b"]], [1.4, -0.7], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_generalised_hopf():
     curves = curves_of(model, "hopf", bent([0, 0, 0]), [0.0, -0.5], generations=0)
     np.testing.assert_allclose(on(curves, "hopf")[:, 0], 0.0, atol=1e-10)
     row = only_at_origin(curves, "generalised_hopf")
-    assert row["lyapunov2"] == pytest.approx(12.0 / 1.7, abs=1e-8)
+    assert row["coefficient_lyapunov2"] == pytest.approx(12.0 / 1.7, abs=1e-8)
 
 
 @pytest.mark.slow
@@ -165,7 +165,9 @@ def test_zero_hopf(kind):
     assert sorted(c.kind for c in curves if not c.family.period) == ["fold", "hopf"]
     np.testing.assert_allclose(on(curves, "fold")[:, 0], 0.0, atol=1e-9)
     row = only_at_origin(curves, "zero_hopf")
-    np.testing.assert_allclose([row["s"], row["theta"], row["e"]], [-1.0, -0.75, 0.9], atol=1e-8)
+    np.testing.assert_allclose(
+        [row[f"coefficient_{name}"] for name in ("s", "theta", "e")], [-1.0, -0.75, 0.9], atol=1e-8
+    )
 
 
 @pytest.mark.slow
@@ -179,7 +181,7 @@ def test_double_hopf():
     for values in hopf:
         np.testing.assert_allclose(np.abs(values).min(axis=1), 0.0, atol=1e-10)
     row = only_at_origin(curves, "double_hopf")
-    found = [row[name] for name in ("p11", "p22", "theta", "delta")]
+    found = [row[f"coefficient_{name}"] for name in ("p11", "p22", "theta", "delta")]
     np.testing.assert_allclose(found, [1.4, -1.0, -0.4 / -0.5, 0.3 / 0.7], atol=1e-8)
 
 
@@ -232,7 +234,7 @@ def test_branch_points__zero_hopf():
     rates = {"x": "p*x - x^3 + x*(y^2 + z^2)", "y": "(q + x^2)*y - 13*z/10", "z": "(q + x^2)*z + 13*y/10"}
     model = disguised(rates, {"p": 0.0, "q": 0.0})
     row = only_at_origin(curves_of(model, "pitchfork", bent([0, 0, 0]), [0.0, -0.5], generations=0), "zero_hopf")
-    assert not {"s", "theta", "e"} & row.keys()
+    assert not {f"coefficient_{name}" for name in ("s", "theta", "e")} & row.keys()
 
 
 def test_branch_points__unfolded_by_the_second_parameter():
