@@ -82,7 +82,7 @@ def shown(ds: xr.Dataset, table: Callable[[xr.Dataset], Table]) -> Table:
     return Table(
         [{own.get(key, key): value for key, value in row.items()} for row in found.rows],
         [_replaced(line, plain_names) for line in found.lines],
-        found.nothing,
+        _replaced(found.nothing, plain_names),
         _replaced(found.graph, plain_names),
         [own.get(key, key) for key in found.header],
     )

@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.vocabulary import FREQUENCY, parameter_name, period_of, periods_of, time_unit
+from pipeline.layout.vocabulary import parameter_name, period_of, periods_of, time_unit
 from pipeline.products.column import OWN, POINTS, STATES, Column, over
+from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr

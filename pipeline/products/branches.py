@@ -137,7 +137,9 @@ BRANCH_COLUMNS: Columns = (
         limit_error="error of this value",
     ),
     *over("branch end rest state", STATES, limit_state="equilibria where the period is infinite"),
-    *in_parts(over("branch end multiplier", "1/s", limit_eigenvalue="eigenvalues of the first of them"), "real", "imag"),
+    *in_parts(
+        over("branch end multiplier", "1/s", limit_eigenvalue="eigenvalues of the first of them"), "real", "imag"
+    ),
     *over(
         "branch end",
         "s, or s times the root of the parameter's unit",

@@ -196,8 +196,10 @@ class CutProblem:
         m, n, scales = len(nodes), self.system.n_states, np.asarray(self.system.scales)
         if not (np.isfinite(u).all() and 0.0 < seconds.min() <= seconds.max() <= 1.0 / self.family.frequency_hz):
             nothing = np.full((self.size - 1, self.size), np.nan)
-            segments = {"nodes": nodes, "tangents": nothing[:n, :n], "slopes": nodes, "speeds": nodes}
-            return CutValue(nothing[:, 0], nothing, nodes[:1] * scales, nothing[:n, :n], **segments)
+            derivative, image = nothing[:n, :n], nodes[:1] * scales
+            return CutValue(
+                nothing[:, 0], nothing, image, derivative, nodes=nodes, tangents=derivative, slopes=nodes, speeds=nodes
+            )
         own = np.column_stack([nodes, np.full(m, at)])
         rows = self.family.rows(np.concatenate([own, own + ONE_SIDED_STEP * np.eye(n + 1)[-1]]))
         durations = np.tile(self.shares * seconds[self.returns], 2)
@@ -258,7 +260,7 @@ class CutProblem:
             product = one @ product
         crossed = crossed_state(self.system)
         assert crossed is not None
-        return on_section_derivative((product * scales[:, None] / scales)[None], rates[None], crossed)[0]
+        return np.asarray(on_section_derivative((product * scales[:, None] / scales)[None], rates[None], crossed)[0])
 
     def _wrapped(self, difference: np.ndarray) -> np.ndarray:
         scales = np.asarray(self.system.scales)

@@ -104,7 +104,7 @@ def test_cusp():
     assert len(p) > 20
     np.testing.assert_allclose(27.0 * 1.3 * p**2, 4.0 * q**3, atol=1e-9)
     row = only_at_origin(curves, "cusp")
-    assert row["c"] == pytest.approx(-1.3, abs=1e-9)
+    assert row["coefficient_c"] == pytest.approx(-1.3, abs=1e-9)
 
 
 def bent(states):
@@ -219,11 +219,11 @@ def test_branch_points__without_a_quadratic_or_cubic_term():
     model = disguised({"x": "p*x + q*x^2 - 13*x^3/10", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
     curves = curves_of(model, "transcritical", bent([0, 0]), [0.0, -0.5], generations=0)
     row = only_at_origin(curves, "cusp")
-    assert row["c"] == pytest.approx(-1.3, abs=1e-8)
+    assert row["coefficient_c"] == pytest.approx(-1.3, abs=1e-8)
     model = disguised({"x": "p*x + q*x^3 - 3*x^5/5", "y": "-y + x^2"}, {"p": 0.0, "q": 0.0})
     curves = curves_of(model, "pitchfork", bent([0, 0]), [0.0, -0.5], generations=1)
     row = only_at_origin(curves, "degenerate_pitchfork")
-    assert row["quintic"] == pytest.approx(-0.6, abs=1e-7)
+    assert row["coefficient_quintic"] == pytest.approx(-0.6, abs=1e-7)
     p, q = on(curves, "fold").T
     np.testing.assert_allclose(q**2, -2.4 * p, atol=1e-8)
     assert q.max() > 0.9

@@ -10,8 +10,9 @@ import xarray as xr
 
 from magpend_core.models.drift.ramps import LINEAR, Ramp
 from pipeline.analysis.tipping.delay import delay, delay_table, lags, left_at, moving_parameter, needs_sections
+from pipeline.layout.columns import described
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.products.tipping import DelayOptions
+from pipeline.products.tipping import DELAY_COLUMNS, DelayOptions
 from tests.core.flows import model_of
 
 MODEL = model_of({"x": "mu*x"}, {"mu": {"value": 0.0, "unit": "1/s"}})
@@ -54,7 +55,7 @@ def test_delay__is_the_way_before_the_bifurcation() -> None:
     # steps of 1e-3 (exp(SLOW mu .../SLOW) - 1) pass 5e-4 where x is about its start again: two sections more or less
     np.testing.assert_allclose(ds["left"].values[:, 0], -np.array(begins), atol=3.0 * SLOW + 0.02)
     np.testing.assert_allclose(ds["delay"], ds["left"])
-    assert ds["left"].attrs["units"] == "1/s"
+    assert described(ds, DELAY_COLUMNS, MODEL)["left"].attrs["units"] == "1/s"
     index = ds["left_index"].values[:, 0]
     for begin, i in zip(begins, index, strict=True):
         mu, x = passing(begin)
