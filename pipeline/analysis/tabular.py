@@ -80,7 +80,7 @@ def shown(ds: xr.Dataset, table: Callable[[xr.Dataset], Table]) -> Table:
     own = {marked[name]: f"parameter_{name}" if name in columns else name for name in names}
     plain_names = {mark: name for name, mark in marked.items()}
     return Table(
-        [{own.get(key, key): value for key, value in row.items()} for row in found.rows],
+        [{own.get(key, key): _replaced(value, plain_names) for key, value in row.items()} for row in found.rows],
         [_replaced(line, plain_names) for line in found.lines],
         _replaced(found.nothing, plain_names),
         _replaced(found.graph, plain_names),

@@ -19,7 +19,8 @@ NAMES = ("delta", "rate", "label", "period", "plain")
 def table(ds: xr.Dataset) -> Table:
     """A row for each point, with a column ``period`` and a line that names the parameter of the result."""
     rows: list[Row] = [
-        {**where, "period": 3, "label": "x"} for _, where in points_of(ds, [str(d) for d in ds["n"].dims])
+        {**where, "period": 3, "label": f"at {ds.attrs['parameter']}"}
+        for _, where in points_of(ds, [str(d) for d in ds["n"].dims])
     ]
     lines = [f"along {ds.attrs['parameter']}", *(f"{name} = {value}" for row in rows for name, value in row.items())]
     return Table(rows, lines, graph={"nodes": [{"sentence": lines[0]}]})
@@ -34,8 +35,9 @@ def test_shown__a_parameter_with_the_name_of_a_column_has_its_own(name) -> None:
     column = f"parameter_{name}" if name in ("label", "period") else name
     found = shown(result(name), table)
     assert [row[column] for row in found.rows] == [0.5, 1.5]
-    assert [row["period"] for row in found.rows] == ([3, 3] if name != column or name != "period" else [0.5, 1.5])
+    assert [row["period"] for row in found.rows] == [3, 3]
     assert found.lines[:2] == [f"along {name}", f"{name} = 0.5"]
+    assert found.rows[0]["label"] == f"at {name}"
     assert found.graph == {"nodes": [{"sentence": f"along {name}"}]}
     assert list(found.rows[0]) == [column, "period", "label"]
 
