@@ -110,7 +110,7 @@ IDENTIFIED = Analysis(
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
     columns=IDENTIFIED_COLUMNS,
-    version=6,
+    version=7,
     by_point=True,
 )
 
