@@ -197,7 +197,8 @@ def branches_table(ds: xr.Dataset) -> Table:
         return Table(rows, [*lines, *listed(ds, "left_out")], _why_none(ds))
     head = f"{len(rows)} bifurcations on {ds.sizes['branch']} branches"
     head += ", mirror images counted once" if any(row.get("mirror_branch", -1) >= 0 for row in rows) else ""
-    lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
+    located = ["", *aligned([_words(ds, row) for row in rows], "")] if rows else []
+    lines = [head, *located, "", *_windows(ds)]
     lines += [*_unbounded(ds), *_detached(ds), *_no_equilibria(ds), *counted_lines(ds), *searched_lines(ds)]
     header = (parameter_name(str(ds.attrs["parameter"])), *_COLUMNS)
     return Table(rows, [*lines, *listed(ds, "left_out")], header=header)
