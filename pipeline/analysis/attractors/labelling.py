@@ -43,6 +43,7 @@ from pipeline.layout.vocabulary import (
     EXTENDED,
     GROWS,
     NEUTRAL,
+    NOT_SETTLED,
     PERIODIC_ORBIT,
     SAME_SET,
     UNDECIDED,
@@ -503,6 +504,8 @@ def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
             f"an orbit with a multiplier of modulus {modulus:g} is said to attract: a fault of magpend."
         )
     found.evidence = stability.BY_APPROACH if orbit.approached_within else stability.BY_MULTIPLIERS
+    if found.stability == NEUTRAL and orbit.multiplier_error > stability.TELLING:
+        found.stability, found.evidence = NOT_SETTLED, stability.BY_NOTHING
     exponents = orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)
     found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])
     found.period_s = orbit.seconds

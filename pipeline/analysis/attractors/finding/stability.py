@@ -39,6 +39,10 @@ TIMES_LONGEST = 10.0
 ABOVE = 0.01
 """Largest excess of a multiplier over 1 that rounding errors leave to an orbit which trajectories approach."""
 
+TELLING = 0.1
+"""Largest error of a multiplier with which one on the unit circle says that an orbit is neutral; beyond it nothing is
+known."""
+
 _TRIALS = 8
 
 

@@ -12,7 +12,7 @@ from pipeline.analysis.attractors.finding.stability import by_margin, largest_er
 from pipeline.analysis.attractors.labelling import _fill_orbit
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
 from pipeline.analysis.ragged import dense, isel
-from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, PERIODIC_ORBIT, UNSTABLE
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, PERIODIC_ORBIT, UNSTABLE
 from pipeline.runs.derive import derive, stale
 from tests.core.flows import table
 from tests.pipeline.analysis.cubes import line, sweep
@@ -39,6 +39,14 @@ def test_stability__by_the_error_of_a_multiplier():
     assert saddle.is_stable
     with pytest.raises(AssertionError, match="a multiplier of modulus 382 is said to attract"):
         _fill_orbit(Features(saddle.points, PERIODIC_ORBIT, 1, np.zeros(0), 0, np.zeros(1), np.zeros(1)), saddle, False)
+
+
+@pytest.mark.parametrize(("residual", "known"), [(1e-8, NEUTRAL), (1e-4, NOT_SETTLED)])
+def test_fill_orbit__a_multiplier_whose_error_covers_everything_decides_nothing(residual, known):
+    one = orbit(0.999, residual)
+    found = Features(one.points, PERIODIC_ORBIT, 1, np.zeros(0), 0, np.zeros(1), np.zeros(1), stability=one.stability)
+    _fill_orbit(found, one, False)
+    assert (one.stability, found.stability) == (NEUTRAL, known)
 
 
 # a pitchfork at r = 0, beside a damped state that the drive moves; from starts on a symmetric grid
