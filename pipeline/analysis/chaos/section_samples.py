@@ -11,7 +11,9 @@ import xarray as xr
 
 from magpend_core.status import Status
 from pipeline.analysis.sets import Geometry
+from pipeline.layout.columns import described
 from pipeline.layout.vocabulary import model_of
+from pipeline.products.chaos import CHAOS_COLUMNS, DIMENSION_COLUMNS
 
 Floats = npt.NDArray[np.float64]
 
@@ -52,4 +54,5 @@ def at_least(name: str, value: int, least: int) -> int:
 def with_coords(ds: xr.Dataset, dims: Sequence[object], variables: Mapping[str, Any]) -> xr.Dataset:
     """Build a dataset from variables on the given dims, with the coordinates that another dataset has on these dims."""
     coords = {name: c for name, c in ds.coords.items() if set(c.dims) <= set(dims)}
-    return xr.Dataset(variables, coords=coords)
+    # of a cube in memory, too, without the door of stored results
+    return described(xr.Dataset(variables, coords=coords), (*CHAOS_COLUMNS, *DIMENSION_COLUMNS))

@@ -48,6 +48,7 @@ def test_zero_one_test__logistic_windows_and_chaos():
     # periods 2, 4, 8, the window of period 3; then chaos, the last with exponents .35 to ln 2
     regular, chaotic = [3.2, 3.5, 3.55, 3.83], [3.7, 3.8, 3.9, 3.97, 4.0]
     found = zero_one_test(cube(logistic(regular + chaotic, 1000)), geometry=LINE)
+    assert all({"long_name", "units"} <= v.attrs.keys() for v in found.data_vars.values())
     k = found["zero_one"].values
     assert abs(k[: len(regular)]).max() < 0.05
     assert k[len(regular) :].min() > 0.98
