@@ -11,6 +11,8 @@ from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
+from pipeline.layout.columns import described
+from pipeline.products.branches import CURVE_COLUMNS
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +77,7 @@ def test_curves_from__folds_meet_in_a_cusp():
     curves = curves_from(ds, parameters, "amplitude", bounds, 1)
     assert len(curves) == 1
     told = curves_dataset(curves, "frequency", "amplitude", DUFFING)
-    assert told["second"].attrs["units"] == "m/s2"
+    assert described(told, CURVE_COLUMNS, DUFFING)["second"].attrs["units"] == "m/s2"
     least = float(told["second"].min())
     # to first order in what is small
     expected = np.sqrt(32.0 * parameters["damping"] ** 3 / (9.0 * np.sqrt(3.0) * parameters["cubic"]))
