@@ -209,7 +209,9 @@ def test_analyse(runs, name):
 def test_result__each_variable_is_declared_and_says_what_it_is_and_in_which_unit(runs, day, name):
     runs("analyse", name, *ANALYSES[name].split())
     run = magpend.Run.open(day / ANALYSES[name].split()[0])
-    for ds in stored_each(run, name):
+    results = list(stored_each(run, name))
+    assert results
+    for ds in results:
         assert not list(complaints(ds, name, run.cube()))
 
 

@@ -107,7 +107,7 @@ def _replaced(value: Any, names: Mapping[str, str]) -> Any:
 
 
 def header_of(ds: xr.Dataset, dim: str, row: Callable[[xr.Dataset], Row]) -> tuple[str, ...]:
-    """Return the names of a table's columns from the function that makes its rows, for a result that may have none.
+    """Return the names of a table's columns, also for a result without rows: those of a row of zeros.
 
     Parameters
     ----------

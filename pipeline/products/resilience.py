@@ -59,7 +59,7 @@ class EdgeOptions(Options):
 
 
 def _shock_columns(name: str, dims: str, text: str, of: str) -> Columns:
-    """Return the columns of a search for the smallest shock, of those of its results that are kept."""
+    """Return the columns of a search for the smallest shock: those of its results that are named."""
     meanings = {
         "low": "no smaller shock leads away, as far as tried",
         "high": "size of the smallest shock found that leads away",

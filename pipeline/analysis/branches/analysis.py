@@ -206,7 +206,7 @@ def branches_table(ds: xr.Dataset) -> Table:
 
 _COLUMNS = (
     *("bracket", "label", "type", "criticality", "period", "multiplier_real", "multiplier_imag", "normal_form"),
-    *("normal_form_error", "unstable_below", "unstable_above", "period_s", "branch", "to_branch"),
+    *("normal_form_error", "unstable_below", "unstable_above", "branch", "to_branch"),
 )
 """Columns that the table of bifurcations has in any case."""
 
