@@ -48,7 +48,7 @@ def rows_of(run: magpend.Run, options: dict[str, Any]) -> pd.DataFrame:
     rows = run.table("events", **options)
     sides = run.table("attractors").groupby("attractor_id")["side"].agg(lambda own: ", ".join(sorted(set(own))))
     rows = rows[~rows["what"].isin(["range_end", "lives_on"])].assign(side=rows["attractor"].map(sides))
-    middle = rows["value"].fillna(0.5 * (rows["seen"] + rows["beyond"]))
+    middle = rows["frequency_hz"].fillna(0.5 * (rows["seen"] + rows["beyond"]))
     return rows.iloc[middle.argsort(kind="stable")]
 
 
@@ -130,7 +130,7 @@ def _parts(row: Row) -> tuple[str, str, str]:
         what, _, cells = what.partition("; of its cells ")
     what = re.sub(r" \(branch \d+\)", "", what.replace("meets the unstable", "meets an unstable"))
     cells = cells.replace("go on ", "").replace("reach no attractor", "to none")
-    value = f"{row['value']:.7f}" if row["value_error"] <= SMALL else value
+    value = f"{row['frequency_hz']:.7f}" if row["frequency_hz_error"] <= SMALL else value
     return value, re.sub(r" of branch \d+", "", what), cells
 
 

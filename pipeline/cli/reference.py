@@ -380,7 +380,7 @@ def results() -> str:
     parts = []
     for name in COMMANDS:
         rows = [
-            (f"`{c.name}`", ", ".join(dims.get(d, f"`{d}`") for d in c.dims.split()), c.unit, c.text)
+            (f"`{c.own or c.name}`", ", ".join(dims.get(d, f"`{d}`") for d in c.dims.split()), c.unit, c.text)
             for c in ANALYSES[name].columns
         ]
         parts.append(f"## {name}\n\n{table(('variable', 'dims', 'unit', 'meaning'), rows)}")

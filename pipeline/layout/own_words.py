@@ -1,10 +1,15 @@
-"""Show datasets in the word by which a specification gives the drive's rate: as omega, or as period."""
+"""Show datasets in the words of their specification: the drive's rate as omega or period, parameters by their names.
+
+Analyses read and write plain names, which are those of `pipeline.products.column`: ``parameter`` is the value of the
+swept parameter. Results have own names, such as ``F``, when they are stored and when users get them.
+"""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -13,8 +18,14 @@ from magpend_core.models.model import Model
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of
 from pipeline.specification.tables import FREQUENCY, RATES, Rate, word_named
 
+if TYPE_CHECKING:
+    from pipeline.products.column import Column
+
 RATE = "drive_rate"
 """Attribute with the word, if it is not ``frequency_hz``."""
+
+OWN_NAMES = "own_names"
+"""Attribute with the plain name of each variable that has an own name; empty for a rate beside the frequency."""
 
 _FLIPPED = ("jump_rises", "rises_before", "rises_after", "rises")
 """Variables that tell whether the frequency rises: the period falls."""
@@ -84,11 +95,11 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     the frequency in the texts of ``evidence`` and ``left_out``. The dim and the coordinate ``frequency`` are named like
     the word, and so are attributes whose value is this name. Others are returned unchanged.
     """
+    ds = with_plain_names(ds)
     word = str(ds.attrs.get(RATE, FREQUENCY))
     if word == FREQUENCY:
         return ds
-    rate = RATES[word]
-    unit = "1" if all(state.unit == "1" for state in model_of(ds).states) else rate.unit
+    rate, unit = RATES[word], _unit_of_rate(ds)
     found = {}
     for name, variable in ds.variables.items():
         if variable.attrs.get("units") == "Hz" and not str(name).endswith("_hz"):
@@ -174,7 +185,7 @@ def arguments_in_own_words(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a figure with datasets, arrays over their cells and ``at`` in the word of the first."""
     first = next((value for value in given.values() if isinstance(value, xr.Dataset)), None)
     if first is None or RATE not in first.attrs:
-        return {}
+        return {name: with_plain_names(value) for name, value in given.items() if isinstance(value, xr.Dataset)}
     rate, found = RATES[str(first.attrs[RATE])], dict[str, Any]()
     for name, value in given.items():
         if isinstance(value, xr.Dataset):
@@ -184,6 +195,65 @@ def arguments_in_own_words(given: Mapping[str, Any]) -> dict[str, Any]:
         elif name == "at" and value and FREQUENCY_DIM in value:
             own = float(_rounded(rate.given(value[FREQUENCY_DIM])))
             found[name] = {key: at for key, at in value.items() if key != FREQUENCY_DIM} | {rate.column: own}
+    return found
+
+
+def _unit_of_rate(ds: xr.Dataset) -> str:
+    return "1" if all(state.unit == "1" for state in model_of(ds).states) else RATES[str(ds.attrs[RATE])].unit
+
+
+def with_own_names(ds: xr.Dataset, columns: Iterable[Column] = ()) -> xr.Dataset:
+    """Return a result with its swept parameters as coordinates under the names that the specification gives them.
+
+    Parameters
+    ----------
+    ds
+        Result of an analysis with plain names, or a cube.
+    columns
+        The columns of the analysis.
+
+    Returns
+    -------
+    Dataset
+        Beside coordinates of the drive's frequency there are those in the word of the specification, such as ``omega``.
+        A parameter that has the name of another variable has the name ``parameter_NAME``.
+    """
+    columns = tuple(columns)
+    # frequency is a column of branches along other parameters alone
+    taken = {*(c.name for c in columns if c.name != FREQUENCY_DIM), *map(str, ds.dims), *map(str, ds.variables)}
+    names, of = {}, {FREQUENCY_DIM: FREQUENCY_DIM}
+    for column in columns:
+        parameter = str(ds.attrs[column.unit.strip("{}")]) if column.own and column.name in ds.variables else ""
+        if parameter:
+            own = names[column.name] = _free(column.own.replace(column.unit, parameter), taken)
+            of[own] = parameter
+    found = ds.rename(names).set_coords([*names.values(), *{FREQUENCY_DIM} & set(ds.variables)])
+    plain = {own: name for name, own in names.items()}
+    word = str(ds.attrs.get(RATE, FREQUENCY))
+    if word != FREQUENCY:
+        for name in [name for name, parameter in of.items() if parameter == FREQUENCY_DIM and name in found.coords]:
+            rate, hertz = RATES[word], found[name]
+            own = _free(name.removesuffix(FREQUENCY_DIM) + rate.column, taken)
+            about = rate.meaning if name == FREQUENCY_DIM else hertz.attrs["long_name"]
+            attrs = {"units": _unit_of_rate(ds), "long_name": about}
+            found = found.assign_coords({own: (hertz.dims, _rounded(rate.given(hertz.values)), attrs)})
+            plain[own] = ""
+    return found.assign_attrs({OWN_NAMES: json.dumps(plain)}) if plain else found
+
+
+def _free(name: str, taken: Iterable[str]) -> str:
+    return f"parameter_{name}" if name in taken else name
+
+
+def with_plain_names(ds: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with the names that analyses use, from one that `with_own_names` has returned."""
+    if OWN_NAMES not in ds.attrs:
+        return ds
+    names = {own: plain for own, plain in json.loads(ds.attrs[OWN_NAMES]).items() if own in ds.variables}
+    found = ds.drop_vars([own for own, plain in names.items() if not plain])
+    named = {own: plain for own, plain in names.items() if plain}
+    found = found.reset_coords(list(named)).rename(named)
+    found.attrs = {key: value for key, value in ds.attrs.items() if key != OWN_NAMES}
     return found
 
 

@@ -15,6 +15,7 @@ from scipy.signal import find_peaks
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.spectrum.analysis import AVERAGE, FOLDED, LINES, NONE, axes_of
 from pipeline.analysis.spectrum.estimate import Settings, power_unit
+from pipeline.analysis.spectrum.motions import swept_by
 from pipeline.layout.vocabulary import ATTRACTS, KINDS, STABILITIES, TORUS, letter
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
@@ -114,7 +115,7 @@ def _end(one: xr.Dataset, column: str) -> float:
 
 def _fixed(data: xr.Dataset) -> str:
     """Return a caption with the parameter values that all rows share."""
-    rows = {name.removeprefix("at_"): data[name] for name in axes_of(data)}
+    rows = {swept_by(name): data[name] for name in axes_of(data)}
     own = {name: ((), float(v[0]), v.attrs) for name, v in rows.items() if (v == v[0]).all()}
     plain = data.drop_vars([n for n, v in data.coords.items() if v.dims])
     return labels.caption(plain.assign_coords(own), with_start=False)
@@ -277,7 +278,7 @@ def plot_waterfall(
     ramp = colormaps[rcParams["image.cmap"]].reversed()  # faint values are light, as the paper beside them
     ax.pcolormesh(style.edges(x), style.edges(y), shown, norm=norm, cmap=ramp, rasterized=True, gid="waterfall")
     style.limits(ax, frame, None, (0.0, float(y.max())))
-    coordinate = ds[along].rename(along.removeprefix("at_"))
+    coordinate = ds[along].rename(swept_by(along))
     style.label_axes(ax, labels.parameter_label(coordinate), _label(ds, column))
     unit = power_unit(measure.unit, "density") if is_density else measure.unit
     text = f"{'density' if is_density else 'amplitude'} of {measure.symbol}"

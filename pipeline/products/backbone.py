@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.products.column import STATES, Columns, in_parts, over
+from pipeline.products.column import STATES, Columns, in_parts, over, swept
 from pipeline.products.product import Analysis, Options, option
 from pipeline.products.response import CHANNEL_COLUMNS, measured
 
@@ -36,8 +36,8 @@ COLUMNS: Columns = (
         "curve", kind="kind of curve", n_points="points of the curve", first_end="why it begins", last_end="why it ends"
     ),
     *over("curve", "Hz", linear_frequency="frequency of the linear mode"),
-    *over("curve point", "Hz", parameter="frequency"),
-    *over("curve point", "{force}", force="value of the parameter that scales the drive"),
+    *swept("parameter", "curve point", "frequency"),
+    *swept("force", "curve point", "value of the parameter that scales the drive", "{force}"),
     *over("curve point", n_unstable="multipliers outside the unit circle, -1 beyond the curve"),
     *over("curve point", residual="scaled gap between the ends of the orbit"),
     *over("curve point state", STATES, section="point of the orbit"),

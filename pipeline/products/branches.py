@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.products.column import STATES, UNITS, Column, Columns, in_parts, only, over, with_parts
+from pipeline.products.column import STATES, UNITS, Column, Columns, in_parts, only, over, swept, with_parts
 from pipeline.products.product import Analysis, Options, option
 
 _ROOM = "pipeline.analysis.branches.analysis"
@@ -123,7 +123,7 @@ BRANCH_COLUMNS: Columns = (
     *over("branch", "Hz", frequency="drive frequency, NaN if it varies"),
     *over("branch angle", rotation="turns per {period}"),
     *over("angle", angle="angle"),
-    *over("branch point", "{parameter}", parameter="value of the parameter"),
+    *swept("parameter", "branch point", "value of the parameter"),
     *over("branch point", n_unstable="multipliers outside the unit circle, -1 beyond the branch"),
     *over("branch point", residual="scaled distance of the point from its image", side="class of the whole orbit"),
     *over("branch point", "s", period_s="period of the orbit"),
@@ -163,7 +163,7 @@ BRANCH_COLUMNS: Columns = (
         normal_form_error="error of the coefficient",
     ),
     *in_parts(over("bifurcation", critical="critical multiplier, or eigenvalue in 1/s"), "real", "imag"),
-    *over("bifurcation", "{parameter}", value="parameter value of the bifurcation"),
+    *swept("value", "bifurcation", "parameter value of the bifurcation", "bifurcation_{parameter}"),
     *over("bifurcation", "{parameter}", bracket="width of the bracket in the parameter"),
     *over("bifurcation", "s", bifurcation_period_s="period of the orbit, or of a Hopf point's cycles"),
     *over("bifurcation phase state", STATES, bifurcation_section="section points of the orbit there"),
@@ -220,8 +220,8 @@ CURVE_COLUMNS: Columns = (
         first_end="why it begins",
         last_end="why it ends",
     ),
-    *over("curve point", "{first_parameter}", first="value of the first parameter"),
-    *over("curve point", "{second_parameter}", second="value of the second parameter"),
+    *swept("first", "curve point", "value of the first parameter", "{first_parameter}"),
+    *swept("second", "curve point", "value of the second parameter", "{second_parameter}"),
     *over("curve point state", STATES, section="a section point, or the saddle"),
     *over("curve point", residual="largest residual, test function included"),
     *over("curve point", "1/s", saddle_quantity="sum of the leading eigenvalues of the saddle of a homoclinic orbit"),
@@ -231,8 +231,10 @@ CURVE_COLUMNS: Columns = (
         special_curve="curve on which it was located",
         special_period="period in {periods}, 0 for equilibria",
     ),
-    *with_parts(over("special", "{first_parameter}", special_first="value of the first parameter"), "error"),
-    *with_parts(over("special", "{second_parameter}", special_second="value of the second parameter"), "error"),
+    *swept("special_first", "special", "value of the first parameter", "special_{first_parameter}"),
+    *over("special", "{first_parameter}", special_first_error="error of this value"),
+    *swept("special_second", "special", "value of the second parameter", "special_{second_parameter}"),
+    *over("special", "{second_parameter}", special_second_error="error of this value"),
     *over("special state", STATES, special_section="a section point"),
     *(Column(f"special_{n}", "special", f"normal form coefficient {n}", unit) for n, unit in COEFFICIENTS.items()),
 )

@@ -39,12 +39,21 @@ class Column:
     unit : str
         Unit of its numbers; ``{parameter}`` stands for the unit of the parameter that the attribute ``parameter`` of
         the result names.
+    own : str
+        For values of a swept parameter: their name in results of users, such as ``bifurcation_{parameter}``, with the
+        name of the attribute that names the parameter.
     """
 
     name: str
     dims: str
     text: str
     unit: str = "1"
+    own: str = ""
+
+
+def swept(name: str, dims: str, text: str, own: str = "{parameter}") -> Columns:
+    """Return a column with values of a swept parameter, and the name that it has in results of users."""
+    return (Column(name, dims, text, own[own.index("{") :], own),)
 
 
 Columns = tuple[Column, ...]

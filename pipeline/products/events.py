@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.products.branches import BranchOptions
-from pipeline.products.column import Columns, over, with_parts
+from pipeline.products.column import Columns, over, swept, with_parts
 from pipeline.products.product import Analysis, option
 
 _ROOM = "pipeline.analysis.events.analysis"
@@ -53,10 +53,10 @@ COLUMNS: Columns = (
         stretch_of="stretch that ends",
         stretch_after="stretch beyond a change, -1 none",
     ),
+    *swept("value", "event", "parameter value of the event"),
     *over(
         "event",
         "{parameter}",
-        value="parameter value of the event",
         value_error="error of the value",
         seen="last value with cells",
         beyond="next value of the run beyond the event",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.products.branches import OrbitOptions
-from pipeline.products.column import STATES, Columns, over
+from pipeline.products.column import STATES, Columns, over, swept
 from pipeline.products.product import Analysis, option
 
 _ROOM = "pipeline.analysis.manifolds.analysis"
@@ -69,7 +69,7 @@ TANGENCY_COLUMNS: Columns = (
         unstable_side="side of the unstable manifold, 1 or -1",
         why_not="why there is no value",
     ),
-    *over("tangency", "{parameter}", value="value of the parameter at the tangency"),
+    *swept("value", "tangency", "value of the parameter at the tangency"),
 )
 
 TANGENCY = Analysis(

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.precision import Precision
 from pipeline.layout.columns import described
 from pipeline.layout.conventions import conventional
-from pipeline.layout.own_words import in_own_words, rate_attribute
+from pipeline.layout.own_words import in_own_words, rate_attribute, with_own_names, with_plain_names
 from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.product import Analysis, Options, Table, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
@@ -88,8 +88,8 @@ class AnalysedRun(RunDirectory):
         return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)}, echo=echo or _silent, **places)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of an analysis of this run, computed now or read if it is stored."""
-        return derive(self, name, options)
+        """Return the result of an analysis of this run with plain names, computed now or read if it is stored."""
+        return with_plain_names(derive(self, name, options))
 
     def with_values(self, values: Sequence[float]) -> AnalysedRun:
         """Return the run beside this one that has further values of the swept parameter, see `extend.refine`; its
@@ -183,7 +183,8 @@ def derive(
     with bar_in_notebook():
         computed = _compute(run, analysis, wanted, can_keep=not why)
         others = {k: value for k, value in computed.attrs.items() if k not in key}
-        result = _kept(run, place, computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told}))
+        complete = computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told})
+        result = _kept(run, place, with_own_names(complete, analysis.columns))
     if is_chosen:
         _keep(run, wanted)
     return result

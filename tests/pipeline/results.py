@@ -6,14 +6,17 @@ from collections.abc import Iterator
 
 import xarray as xr
 
+from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import is_start_dim
 from pipeline.products.column import POINTS, STARTS, Column
 from pipeline.products.registry import ANALYSES
 
 
 def complaints(ds: xr.Dataset, name: str, cube: xr.Dataset) -> Iterator[str]:
-    """Yield what is missing in the result of an analysis: a declaration, its dims, a meaning, a unit."""
+    """Yield what is missing in the result of an analysis: a declaration, its dims, a meaning, a unit, an own name."""
     columns = {column.name: column for column in ANALYSES[name].columns}
+    yield from (f"{c.name}: has no own name" for c in columns.values() if c.own and c.name in ds.data_vars)
+    ds = with_plain_names(ds)
     for key, variable in ds.variables.items():
         column, attrs = columns.get(str(key)), variable.attrs
         if column is None:

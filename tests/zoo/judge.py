@@ -148,7 +148,8 @@ def _odd_number(known: Known, row: Row) -> str:
     s, m = known.seconds, known.multiplier
     if s and not _near(row.get("period_s"), s, known.seconds_error or 1e-5 * s):
         return f"known {s:.6g} s"
-    if is_orbit and m is not None and not _near(row.get("multiplier_modulus"), m, 2e-5 + 1e-3 * m):
+    told = np.nan_to_num(row.get("multiplier_error", 0.0))
+    if is_orbit and m is not None and not _near(row.get("multiplier_modulus"), m, 2e-5 + 1e-3 * m + told):
         return f"known multiplier {m:.6g}"
     if is_rest and known.eigenvalue is not None:
         said = (row.get("eigenvalue_real"), row.get("eigenvalue_imag"))

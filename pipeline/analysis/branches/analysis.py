@@ -362,7 +362,7 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
     # a dataset in the word of the specification has the drive's rate under this word
     words = dict.fromkeys([FREQUENCY_DIM, *dims_in_own_words([FREQUENCY_DIM], str(ds.attrs.get(RATE, FREQUENCY)))])
     found = {word: ds[word] for word in words if word != parameter and word in ds}
-    for variable in ds.data_vars.values():
+    for variable in ds.coords.values():
         told = str(variable.attrs.get("long_name", ""))
         if variable.dims == ("branch",) and told.startswith("value of "):
             found[told.removeprefix("value of ")] = variable

@@ -246,7 +246,8 @@ def moving_of(drawn: xr.Dataset, parameter: str) -> list[str]:
 
 
 def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along:
-    varying = [str(n) for n in located.data_vars if located[n].attrs.get("long_name", "") == f"value of {n}"]
+    told = [str(v.attrs.get("long_name", "")) for v in located.coords.values() if v.dims == ("branch",)]
+    varying = [text.removeprefix("value of ") for text in told if text.startswith("value of ")]
     frequency = np.nan if base.model.clock_hz is None else base.model.clock_hz
     if base.model.clock_hz is None and axis_name(options.parameter) != FREQUENCY and FREQUENCY in located:
         rates = np.unique(located[FREQUENCY].values)

@@ -29,6 +29,7 @@ from pipeline.analysis.branches.problems import FREQUENCY, parameter_units
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import model_attribute, section_attributes
+from pipeline.products.branches import BRANCH_COLUMNS
 from pipeline.products.reporting import track
 
 CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
@@ -73,7 +74,6 @@ def dataset_of(
     variables = _per_point(shape, points, sizes)
     variables["n_unstable"] = (("branch", "point"), counts)
     variables |= _per_branch(branches, events, n_angles, model) | _per_event(branches, events, sizes)
-    variables |= _fixed(branches, parameter, parameters)
     variables |= _limits(branches, sizes)
     if model is not None and model.flow.mirror is not None:
         images = images_of([(branches[i].family, b) for i, b in events], model)
@@ -82,7 +82,7 @@ def dataset_of(
         variables |= _side_variables(side, events, words)
     angle_dim = "angle" if model is None else model.angle_dim
     result = xr.Dataset(variables).rename({"angle": angle_dim} if angle_dim != "angle" else {})
-    result = result.assign_coords(state=list(names))
+    result = result.assign_coords(state=list(names), **_fixed(branches, parameter, parameters))
     if model is not None:
         result = result.assign_coords({angle_dim: list(model.angles)}).assign_attrs(
             model=model_attribute(model), **section_attributes(model.crossing)
@@ -157,7 +157,7 @@ def _limits(branches: Sequence[Branch], sizes: Mapping[str, int]) -> dict[str, A
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:
-    """Return dataset variables for the fixed parameters whose values differ between the branches and the run."""
+    """Return coordinates with the fixed parameters whose values differ between the branches and the run."""
     if parameters is None or not branches:
         return {}
     values = np.array([b.family.parameters for b in branches])
@@ -165,8 +165,9 @@ def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | 
     chosen = [i for i, n in enumerate(parameters.names) if n != parameter and own[i]]
     names = [parameters.names[i] for i in chosen]
     units = [parameter_units(n, parameters.model) for n in names]
+    taken = {*(one.name for one in BRANCH_COLUMNS), *" ".join(one.dims for one in BRANCH_COLUMNS).split()}
     return {
-        n: ("branch", values[:, i], {"units": u, "long_name": f"value of {n}"})
+        f"parameter_{n}" if n in taken else n: ("branch", values[:, i], {"units": u, "long_name": f"value of {n}"})
         for n, i, u in zip(names, chosen, units, strict=True)
     }
 
@@ -204,7 +205,7 @@ def _per_branch(
         "first_end": column(first, "int8", **code_flags(ENDS)),
         "last_end": column(last, "int8", **code_flags(ENDS)),
     }
-    if model is None or model.clock_hz is None:
+    if (model is None or model.clock_hz is None) and not np.isnan(frequencies).all():
         columns[FREQUENCY] = column(frequencies, "float64")
     found: dict[str, Any] = {name: ("branch", *column) for name, column in columns.items()}
     turns = np.array([rotation_of(b) for b in branches]).reshape(len(branches), n_angles)

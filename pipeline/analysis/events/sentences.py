@@ -53,9 +53,9 @@ def events_table(ds: xr.Dataset) -> Table:
     """Return the table of events: a row for each, with its sentence and evidence.
 
     ``event`` is the number of its end that leads, see ``same_as`` in the schema; the sentence names the others.
-    ``value`` and ``value_error`` have the unit of the swept parameter; ``seen`` and ``beyond`` are the values of the
-    run between which cells leave the attractor, ``to_attractor`` is the id on which most of them go on. In JSON the
-    table is a graph, see `pipeline.analysis.events.graph`.
+    ``NAME`` and ``NAME_error`` are the value of the swept parameter and its error; ``seen`` and ``beyond`` are the
+    values of the run between which cells leave the attractor, ``to_attractor`` is the id on which most of them go on.
+    In JSON the table is a graph, see `pipeline.analysis.events.graph`.
     """
     ends = [_row(ds, k) for k in range(ds.sizes["event"])]
     rows = [_with_others(ds, row, ends) for k, row in enumerate(ends) if row["event"] == k]
@@ -78,6 +78,9 @@ def events_table(ds: xr.Dataset) -> Table:
     length = max(node["high"] for node in nodes) - min(node["low"] for node in nodes) if nodes else 1.0
     digits = int(9 - np.floor(np.log10(length or 1.0)))
     lines += aligned([_node_words(node, str(ds.attrs["parameter_units"]), digits) for node in nodes[:MOST_ROWS]])
+    name = parameter_name(str(ds.attrs["parameter"]))
+    named = {"value": name, "value_error": f"{name}_error"}
+    rows = [{named.get(key, key): value for key, value in row.items()} for row in rows]
     return Table(rows, lines, "" if rows else "no cell ends on an attractor", graph)
 
 

@@ -27,6 +27,7 @@ from pipeline.analysis.spectrum.motions import (
     needs_motion,
     row_axis,
     sampled,
+    swept_by,
 )
 from pipeline.analysis.tabular import Row, Words, aligned, number, plain, words_of
 from pipeline.layout.conventions import code_flags
@@ -85,7 +86,7 @@ def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
     Dataset
         Over ``spectrum`` (rows) and ``bin``: ``amplitude`` of each line of a closed orbit, in the channel's unit;
         ``power`` of other motions, in unit^2/Hz or unit^2; both have the coordinates ``frequency_hz`` and, with a
-        drive, ``order``. Rows have the swept parameters (``frequency``, others as ``at_NAME``), ``attractor``,
+        drive, ``order``. Rows have the swept parameters (``frequency``, and others under their names), ``attractor``,
         ``kind``, ``stability``, ``orbit_period``, ``share`` and ``estimate``, a code of `ESTIMATES`. Evidence:
         ``n_averages``, ``resolution_hz``, ``bandwidth_hz``; ``variance``, and ``kept``, its share in the bins; of lines
         ``error``; of a torus ``first_hz``, ``second_hz`` (NaN if undecided) and ``explained``, the share of its power
@@ -221,7 +222,7 @@ _EVIDENCE_OF_TORI = ("first_hz", "second_hz", "explained")
 def spectrum_table(ds: xr.Dataset) -> Table:
     """Return the table of spectra, of a run or from `magpend.spectrum_of`.
 
-    Rows are bins: swept parameters (``at_NAME``, and the drive's rate), ``attractor_id``, ``kind``, ``stability``,
+    Rows are bins: swept parameters, ``attractor_id``, ``kind``, ``stability``,
     ``estimate``, ``frequency_hz``, ``order`` (with a drive), ``amplitude``, ``power``, and the evidence of the whole
     spectrum. The text has a line for each spectrum.
     """
@@ -256,7 +257,7 @@ def _words(one: xr.Dataset, head: Row) -> Words:
         return number(float(one[name]), form) if name in one else None
 
     return {
-        **{key.removeprefix("at_"): f"{value:.6g}" for key, value in head.items() if isinstance(value, float)},
+        **{swept_by(key): f"{value:.6g}" for key, value in head.items() if isinstance(value, float)},
         "id": (str(head["attractor_id"]) if head["attractor_id"] >= 0 else "-") if "attractor_id" in head else None,
         **{key: plain(str(head[key])) for key in ("kind", "stability", "estimate") if key in head},
         "largest": largest or "-",

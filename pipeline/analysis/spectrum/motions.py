@@ -18,16 +18,8 @@ from pipeline.analysis.flown import flown
 from pipeline.analysis.ragged import dims_of, places_of_rows, points_of_rows
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.selection import select_points
-from pipeline.layout.vocabulary import (
-    BOUNDED_SET,
-    FREQUENCY_DIM,
-    NOT_SETTLED,
-    frequency_of,
-    letter,
-    parameters_of,
-    split_dims,
-)
-from pipeline.products.spectrum import CellOptions, MotionOptions
+from pipeline.layout.vocabulary import BOUNDED_SET, NOT_SETTLED, frequency_of, letter, parameters_of, split_dims
+from pipeline.products.spectrum import SPECTRUM_COLUMNS, CellOptions, MotionOptions
 from pipeline.specification.problems import unknown_name
 
 Chosen = TypeVar("Chosen", bound=MotionOptions)
@@ -128,8 +120,17 @@ def _parameters(found: xr.Dataset, where: Mapping[str, float]) -> tuple[Paramete
 
 
 def row_axis(name: str) -> str:
-    """Return the name of the coordinate with a swept parameter along the rows, which is none of a variable's."""
-    return name if name == FREQUENCY_DIM else f"at_{name}"
+    """Return the name of the coordinate with a swept parameter along the rows."""
+    return f"parameter_{name}" if name in _COLUMNS else name
+
+
+def swept_by(axis: str) -> str:
+    """Return the swept parameter whose values a coordinate along the rows has."""
+    name = axis.removeprefix("parameter_")
+    return name if name in _COLUMNS else axis
+
+
+_COLUMNS = {column.name for column in SPECTRUM_COLUMNS}
 
 
 def clock_of(motion: Motion) -> float:

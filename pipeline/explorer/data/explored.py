@@ -11,9 +11,10 @@ import numpy as np
 
 from pipeline.explorer import RequestError
 from pipeline.layout.cells import CellMap, parameter_axes
+from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
 from pipeline.motion.steady import Inputs
-from pipeline.runs.derive import stored, stored_each
+from pipeline.runs.derive import stored_each
 from pipeline.specification.problems import unknown_name
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in
@@ -75,11 +76,12 @@ class ExploredRun(RunDirectory):
 
     def kept(self, name: str) -> xr.Dataset | None:
         """Return the stored result of an analysis; None if it has not been computed."""
-        return self.remembered(f"derived {name}", lambda: stored(self, name))
+        found = self.kept_each(name)
+        return found[0] if found else None
 
     def kept_each(self, name: str) -> list[xr.Dataset]:
         """Return all stored results of an analysis, such as one for each pair of attractors; see `stored_each`."""
-        return self.remembered(f"each {name}", lambda: list(stored_each(self, name)))
+        return self.remembered(f"each {name}", lambda: [with_plain_names(ds) for ds in stored_each(self, name)])
 
     def bifurcation_curves(self) -> xr.Dataset | None:
         """Return the stored bifurcation curves of this run, or of the run named for them; None if there are none."""

@@ -31,7 +31,6 @@ from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES, axis_name
 from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
 from pipeline.plots.palette import MOTION_COLOURS as MOTION_COLOURS
-from pipeline.runs.derive import stored
 from pipeline.specification.tables import FREQUENCY
 from pipeline.store.run import RunDirectory
 
@@ -297,7 +296,7 @@ class LiveRun:
         """Attractors that an analysis of the run has stored; None if there are none."""
         with self._lock:
             if self._attractors is None:
-                self._attractors = stored(self.run, "attractors")
+                self._attractors = self.run.kept("attractors")
             return self._attractors
 
     def catalog(self, place: Place) -> Catalog:

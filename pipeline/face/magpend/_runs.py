@@ -122,8 +122,9 @@ class Run(RunDirectory):
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Open the run's result cube as an xarray dataset; see `magpend.open_run`."""
         import magpend._accessor  # noqa: F401 -- registers ds.magpend
+        from pipeline.layout.own_words import with_own_names
 
-        ds = super().cube(chunks, check=check)
+        ds = with_own_names(super().cube(chunks, check=check))
         ds.encoding["source"] = self.name
         return ds
 

@@ -14,6 +14,7 @@ from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.view import describe_view
+from pipeline.layout.own_words import with_plain_names
 from pipeline.runs.derive import derive
 from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.small_runs import CURVES
@@ -23,7 +24,7 @@ from tests.pipeline.explorer.small_runs import CURVES
 def test_line__its_own_curves(bent):
     """Of the run that was followed: its curves, and no map."""
     line, _ = bent
-    found, curves = parameter_plane(RunDirectory.open(line)), derive(line, "curves", CURVES)
+    found, curves = parameter_plane(RunDirectory.open(line)), with_plain_names(derive(line, "curves", CURVES))
     assert [axis["name"] for axis in found["axes"]] == ["frequency", "amplitude"]
     assert found["map"] is None
     assert len(found["curves"]) == curves.sizes["curve"] >= 1
@@ -63,7 +64,7 @@ def test_no_curves(bent):
 def test_curve_orbit__by_another_integrator(bent):
     """The orbit closes at the values of its point, with a multiplier 1 on a fold."""
     line, _ = bent
-    curves = derive(line, "curves", CURVES)
+    curves = with_plain_names(derive(line, "curves", CURVES))
     i = int(np.flatnonzero(curves["kind"].values == 0)[0])
     point = int(curves["n_points"][i]) // 4  # not where the curve begins, at the run's own values
     arrays, attrs = unpack_arrays(curve_orbit(RunDirectory.open(line), i, point))

@@ -135,9 +135,9 @@ def test_left_out__has_the_word_of_the_specification(runs):
 def test_options__take_values_in_the_word_that_they_name(runs):
     part = runs["frequency_hz"].branches(parameter="omega", low=1.3, high=1.5, max_period=1)
     assert (part.attrs["parameter"], len(part["value"])) == ("frequency", 1)
-    np.testing.assert_allclose(part["parameter"].max(), 1.5 / (2 * pi), rtol=1e-12)
+    np.testing.assert_allclose(part["frequency"].max(), 1.5 / (2 * pi), rtol=1e-12)
     own = runs["period"].branches(low=2 * pi / 1.5, high=2 * pi / 1.3, max_period=1)  # of the only axis, so in its word
-    np.testing.assert_allclose(own["value"], part["value"], rtol=1e-7)
+    np.testing.assert_allclose(own["bifurcation_frequency"], part["bifurcation_frequency"], rtol=1e-7)
     cell = runs["frequency_hz"].cube().magpend.sel_cell(omega=1.3)
     np.testing.assert_allclose(float(cell.frequency), 1.3 / (2 * pi), rtol=1e-15)
 

@@ -175,12 +175,12 @@ def test_branches__all_equilibria_of_a_hoop(hoop):
     assert len(top) == 1
     n = int(ds["n_points"][top[0]])
     assert (ds["n_unstable"].values[top[0], :n] == 1).all()
-    np.testing.assert_allclose(ds["parameter"].values[top[0], [0, n - 1]], [0.5, 2.0])
+    np.testing.assert_allclose(ds["w"].values[top[0], [0, n - 1]], [0.5, 2.0])
     tilted = ds["section"].sel(state="th", phase=0).values
     arms = [i for i in range(len(tilted)) if 0.5 < np.nanmax(np.abs(tilted[i])) < 3.0]
     assert arms
     for i in arms:
-        w = ds["parameter"].values[i]
+        w = ds["w"].values[i]
         good = np.isfinite(w) & (np.abs(tilted[i]) > 1e-3)
         np.testing.assert_allclose(np.cos(tilted[i][good]), 1.0 / w[good] ** 2, atol=1e-8)
 

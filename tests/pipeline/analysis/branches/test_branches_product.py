@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.analysis import attractors_table
-from pipeline.analysis.branches.analysis import branches_table, curves_table
+from pipeline.analysis.branches.analysis import branches_table
 from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
 from pipeline.analysis.ragged import dense
@@ -13,7 +13,7 @@ from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
 from pipeline.products.branches import BranchOptions
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
-from pipeline.runs.derive import AnalysedRun, derive, prepared
+from pipeline.runs.derive import AnalysedRun, derive, prepared, shown_table
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import sweep
 from tests.pipeline.analysis.dense_sets import rows_of
@@ -74,7 +74,7 @@ def test_branches__all_periods_or_a_line(directory):
 def test_branches__none_to_begin_with(directory, main, tmp_path):
     ds = derive(directory, "branches", {"parameter": "amplitude", "low": 0.4, "high": 0.6})
     assert ds.sizes["branch"] == 0
-    lines = branches_table(ds).lines
+    lines = shown_table("branches", ds).lines
     assert lines[0].startswith("no branch")
     assert any("outside of amplitude = 0.4 to 0.6" in line for line in lines)
     # With the reason, and without a file
@@ -127,10 +127,10 @@ def test_curves__in_the_plane_of_amplitude_and_damping(directory):
     assert ds.sizes["curve"] == 2
     assert set(ds["kind"].values) == {KINDS.index("period_doubling")}
     assert set(ds["orbit_period"].values) == {1}
-    highest = np.nanmax(ds["second"].values, axis=1)
+    highest = np.nanmax(ds["damping"].values, axis=1)
     assert highest[0] == pytest.approx(highest[1], rel=0.05)
-    assert sum("period_doubling, period 1" in line for line in curves_table(ds).lines) == 2
-    assert ds["second"].attrs["units"] == "1/s"
+    assert sum("period_doubling, period 1" in line for line in shown_table("curves", ds).lines) == 2
+    assert ds["damping"].attrs["units"] == "1/s"
     with pytest.raises(SpecError, match="did you mean damping"):
         derive(directory, "curves", {**plane, "second": "dampin"})
     with pytest.raises(SpecError, match="own parameter"):

@@ -15,6 +15,7 @@ from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.kinds import KINDS, PITCHFORK
 from pipeline.analysis.branches.searching import VERDICTS, places_of
 from pipeline.analysis.response.analysis import response_table
+from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import parameters_of
 from tests.pipeline.analysis.cubes import swept
 from tests.pipeline.analysis.response.test_response import cycles_run
@@ -45,7 +46,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(run):
-    return run.branches(**SEARCHED)
+    return with_plain_names(run.branches(**SEARCHED))
 
 
 class Balance:
@@ -143,7 +144,7 @@ def test_isola__ends_at_folds_of_harmonic_balance(found):
 @pytest.mark.slow
 def test_cut_isola__is_detached_within_the_interval(run, found):
     """Up to 0.15 Hz the isola leaves the interval twice; the main curve passes from bound to bound."""
-    part = run.branches(high=0.15, isolas=4, generations=0)
+    part = with_plain_names(run.branches(high=0.15, isolas=4, generations=0))
     assert isolas_of(part) == []
     (cut,) = cut_of(part)
     line = part["parameter"].values[cut, : int(part["n_points"][cut])]
@@ -159,8 +160,8 @@ def test_fold_curve__holds_the_isola_from_its_birth_on(run):
     plane = {"second": "A", "second_low": 0.55, "second_high": 0.8}
     curves = run.curves(**plane, **SEARCHED)
     balance = Balance(np.arange(8))
-    nearest = min(range(curves.sizes["curve"]), key=lambda i: float(np.nanmin(curves["first"][i])))
-    f, force = (curves[name].values[nearest] for name in ("first", "second"))
+    nearest = min(range(curves.sizes["curve"]), key=lambda i: float(np.nanmin(curves["frequency"][i])))
+    f, force = (curves[name].values[nearest] for name in ("frequency", "A"))
     birth = int(np.nanargmin(force))
     assert 0 < birth < int(curves["n_points"][nearest]) - 1
     at = OMEGA * float(f[birth])

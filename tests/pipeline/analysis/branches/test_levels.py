@@ -14,14 +14,14 @@ def branches():
     """Four branches at two levels of F: the last springs from the third bifurcation, at the higher level."""
     return xr.Dataset(
         {
-            "F": ("branch", [1.0, 3.0, 1.0, 3.0], {"long_name": "value of F"}),
             "origin": ("branch", [-1, -1, -1, 2]),
             "of_branch": ("bifurcation", [0, 1, 1, 3]),
             "to_branch": ("bifurcation", [-1, -1, 3, 1]),
             "value": ("bifurcation", [0.5, 0.6, 0.7, 0.8]),
             "jump_bifurcation": ("jump", [0, 1, 3]),
         },
-        attrs={"parameter": "omega"},
+        {"F": ("branch", [1.0, 3.0, 1.0, 3.0], {"long_name": "value of F"})},
+        {"parameter": "omega"},
     )
 
 

@@ -65,7 +65,7 @@ def located(run, low, high, parameter, **options):
     """Return the located bifurcations as rows: parameter value, type, period and critical multiplier."""
     ds = derive(run, "branches", {"parameter": parameter, "low": low, "high": high, **options})
     rows = zip(
-        ds["value"].values,
+        ds[f"bifurcation_{parameter}"].values,
         [str(kind) for kind in np.array(ds["kind"].attrs["flag_meanings"].split())[ds["kind"].values]],
         ds["orbit_period"].values[ds["of_branch"].values],
         ds["critical_real"].values + 1j * ds["critical_imag"].values,

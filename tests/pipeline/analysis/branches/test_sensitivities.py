@@ -11,7 +11,7 @@ from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.sensitivities import STATUSES, sensitivities_of, sensitivities_table
-from pipeline.layout.own_words import in_own_words
+from pipeline.layout.own_words import in_own_words, with_plain_names
 from pipeline.layout.vocabulary import parameters_of
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
@@ -121,7 +121,7 @@ def hardening(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folds(hardening):
-    return hardening.sensitivities(deviation={"damping": 0.01, "linear": 0.02})
+    return with_plain_names(hardening.sensitivities(deviation={"damping": 0.01, "linear": 0.02}))
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_folds_of_orbits(hardening, folds):
     base, steps = 0.1, np.array([-2.0, -1.0, 1.0, 2.0]) * 1e-3
     branches = hardening.branches()
     orbit = branches["section"].values[0, 0, 0]
-    at = float(branches["parameter"].values[0, 0])
+    at = float(branches["frequency"].values[0, 0])
     own = parameters_of(hardening.cube())
     places = []
     for step in steps:
@@ -166,6 +166,7 @@ def test_doubling_with_the_drive(tmp_path):
     given = {"preset": "twin-well", "omega": 1.2, "overrides": {"damping": 0.3}}
     run = swept("duffing", tmp_path / "run", [(1.2, 0.0)], (300, 8), parameters=given, amplitude=[0.25, 0.275])
     found = run.sensitivities(low=0.24, high=0.29, max_period=2, deviation={"frequency_hz": 1e-3})
+    found = with_plain_names(found)
     by = {str(n): found["elasticity"].sel(parameter=n).values for n in found["parameter"].values}
     assert "period_doubling" in [found["kind"].attrs["flag_meanings"].split()[k] for k in found["kind"].values]
     np.testing.assert_allclose(by["cubic"], -0.5, rtol=1e-7)

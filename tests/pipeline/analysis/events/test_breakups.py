@@ -36,8 +36,8 @@ def test_events__break_up_at_a_border_collision(tmp_path):
     table = sweep(BORDER, tmp_path, starts, mu=[-0.05, 0.08]).table("events")
     rows = table[table["what"] != "range_end"]
     assert set(rows["what"]) == {"torus_breakup"}
-    assert (rows["value"].abs() <= rows["value_error"]).all()
-    assert (rows["value_error"] < 1e-4).all()
+    assert (rows["mu"].abs() <= rows["mu_error"]).all()
+    assert (rows["mu_error"] < 1e-4).all()
     assert len(rows) == 1  # the end of the torus and the beginning of chaos are one event
 
 

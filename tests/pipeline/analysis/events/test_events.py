@@ -22,6 +22,7 @@ from pipeline.analysis.events.one_event import on_circle, same_as, with_images
 from pipeline.analysis.events.scene import Event, Stretch
 from pipeline.analysis.ragged import ROW_SIZE
 from pipeline.analysis.sets import Geometry
+from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.specification.problems import SpecError
 
@@ -188,7 +189,8 @@ def told(table):
     ways = np.where(rows["rises"] == 1, "rises", "falls")
     letters = [chr(ord("A") + i) for i in rows["attractor"]]
     columns = (letters, rows["period"], ways, rows["what"], rows["criticality"])
-    return list(zip(*columns, strict=True)), rows["value"].to_numpy(), rows["value_error"].to_numpy()
+    (error, _) = [column for column in rows if column.endswith("_error")]
+    return list(zip(*columns, strict=True)), rows[error.removesuffix("_error")].to_numpy(), rows[error].to_numpy()
 
 
 @pytest.mark.slow
@@ -403,7 +405,7 @@ def test_events__cascade_of_the_logistic_map(tmp_path):
     assert not (table["what"] == "not_decided").any()
     assert [one[:3] for one in events] == [("A", p, "rises") for p in (1, 2, 4, 8, 16)] + [("B", 0, "falls")]
     # the same cascade says nothing of a set that is seen beyond the merging of its bands, as crises may lie between
-    located = run.branches()
+    located = with_plain_names(run.branches())
     first = int(np.flatnonzero(np.abs(located["value"] - 3.0) < 1e-6)[0])
     points = located["bifurcation_section"].values[first, :1]
     born = cascade_of(located, Fate(3.0, 0, 0, first), (3.5, 3.8), points, Geometry((False,), (1.0,)))
@@ -415,6 +417,7 @@ def test_events__cascade_of_the_logistic_map(tmp_path):
 def test_crossing_at__needs_both_branches(tmp_path):
     """A pitchfork that is said to be transcritical, or whose other branch is unknown, is a branch point."""
     located = sweep(CUBIC, tmp_path, BOX, LONG, mu=[0.81, 1.21]).branches()
+    located = with_plain_names(located)
     lines = lines_of(located, {"mu": 1.0}, Geometry((False,), (1.0,)))
     ((k,),) = np.nonzero(located["kind"].values == KINDS.index("pitchfork"))
     assert crossing_at(located, lines, int(k)) == "pitchfork"

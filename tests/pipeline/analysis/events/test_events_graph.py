@@ -71,24 +71,24 @@ def test_graph__edges_are_the_rows_of_the_table(cubic, tmp_path):
         assert {edge["sentence"] for edge in edges} == ({row["sentence"]} if row["what"] != "range_end" else set())
         if not edges:
             continue
-        assert np.ptp([edge["value"] for edge in edges]) <= 2.0 * row["value_error"]
+        assert np.ptp([edge["value"] for edge in edges]) <= 2.0 * row["mu_error"]
         edges = [edge for edge in edges if edge["attractor"] == row["attractor"]]
         assert sum(edge["cells"] for edge in edges) == row["n_cells"]
         source = nodes[edges[0]["source"]]
         assert (source["attractor"], source["period"]) == (row["attractor"], row["period"])
         end = "high" if row["rises"] else "low"
         assert source[f"{end}_event"] == row["what"]
-        assert source[end] == row["value"]
+        assert source[end] == row["mu"]
         if row["period_after"] >= 0:
             after = nodes[edges[0]["target"]]
             assert (after["attractor"], after["period"]) == (row["attractor"], row["period_after"])
-            assert after["low"] == row["value"]
+            assert after["low"] == row["mu"]
     name = {node["id"]: node["name"] for node in graph["nodes"]}
     ends = [(name[e["source"]], name[e["target"]], e["label"]) for e in graph["edges"]]
     assert set(ends) >= {("A", "B", "BP"), ("A", "C", "BP"), ("B", "A", "BP"), ("B", "B", "PD"), ("C", "C", "PD")}
     # the pitchfork is one event of three attractors, and the doublings of both arms are another one
-    told = table[table["what"].isin(["pitchfork", "period_doubling"]) & (table["value"] > 0.0)]
-    assert told["value"].tolist() == pytest.approx([1.0, 2.0], abs=1e-6)
+    told = table[table["what"].isin(["pitchfork", "period_doubling"]) & (table["mu"] > 0.0)]
+    assert told["mu"].tolist() == pytest.approx([1.0, 2.0], abs=1e-6)
     assert [len({e["source"] for e in graph["edges"] if e["event"] == k}) for k in told["event"]] == [3, 2]
 
 
@@ -132,7 +132,7 @@ def assert_crisis(run, found):
     (k,) = [k for k in ends if found["seen"][k] <= 4.0]
     seen, beyond = float(found["seen"][k]), float(found["beyond"][k])
     error = float(found["value_error"][k])
-    assert beyond - seen <= WIDTH * (1.0 + 1e-9) or abs(found["value"][k] - 4.0) <= error <= WIDTH
+    assert beyond - seen <= WIDTH * (1.0 + 1e-9) or abs(found["r"][k] - 4.0) <= error <= WIDTH
     assert found["to_attractor"].values[k, 0] == -2
     beside = magpend.Run.open(f"{run.name}-refined")
     values = beside.cube()["r"].values
@@ -150,7 +150,7 @@ def test_events__of_orbits_alone(tmp_path):
         patch.setattr(analysis, "_aperiodic", None)
         patch.setattr(analysis.Crises, "split", None)
         table = magpend.run(spec, tmp_path / "run", workers=0).table("events", orbits=True)
-    (doubling,) = table[table["what"] == "period_doubling"]["value"][:1]
+    (doubling,) = table[table["what"] == "period_doubling"]["r"][:1]
     assert abs(doubling - 3.0) < 1e-8
     assert table[(table["set"] == "chaotic_set") & (table["what"] != "range_end")]["what"].tolist() == ["not_decided"]
 

@@ -45,7 +45,9 @@ def sweep(model, folder, starts, integration=None, n=8, **axes):
 def of(table, what):
     """Values, errors, exponents and rotations of the events of one name."""
     rows = table[table["what"] == what]
-    return [tuple(row) for row in rows[["value", "value_error", "exponent", "exponent_error", "rotation"]].to_numpy()]
+    (error, _) = [column for column in rows if column.endswith("_error")]
+    columns = [error.removesuffix("_error"), error, "exponent", "exponent_error", "rotation"]
+    return [tuple(row) for row in rows[columns].to_numpy()]
 
 
 NORMAL = {
@@ -90,7 +92,7 @@ def test_events__tongue_of_stuart_landau(tmp_path):
     assert [x[0] for x in edges] == pytest.approx([1.0 - d, 1.0 + d], abs=1e-9)
     assert [x[4] for x in edges] == ["0/1", "0/1"]
     # and the orbit ends at both edges in the same folds
-    assert sorted(table[table["what"] == "fold"]["value"]) == pytest.approx([1.0 - d, 1.0 + d], abs=1e-9)
+    assert sorted(table[table["what"] == "fold"]["w"]) == pytest.approx([1.0 - d, 1.0 + d], abs=1e-9)
     assert not (table["what"] == "not_decided").any()
 
 

@@ -70,7 +70,7 @@ def balanced(force, omega, c, n=9):
 @pytest.mark.slow
 def test_phase_resonance__agrees_with_harmonic_balance(duffing):
     one = curve(duffing, 0)
-    forces = one["force"].values
+    forces = one["parameter_amplitude"].values
     np.testing.assert_allclose(np.cos(one["phase"].sel(channel="x", harmonic=1)), 0.0, atol=1e-9)
     assert forces[0] == pytest.approx(0.003, abs=1e-4)
     assert duffing.attrs["force"] == "amplitude"
@@ -78,12 +78,12 @@ def test_phase_resonance__agrees_with_harmonic_balance(duffing):
     for j in range(0, len(forces), 10):
         at = one.isel(point=j)
         amplitudes = at["harmonic_amplitude"].sel(channel="x").values
-        omega, c = balanced(forces[j], OMEGA * float(at["parameter"]), -amplitudes[0])
-        assert OMEGA * float(at["parameter"]) == pytest.approx(omega, rel=1e-8)
+        omega, c = balanced(forces[j], OMEGA * float(at["frequency"]), -amplitudes[0])
+        assert OMEGA * float(at["frequency"]) == pytest.approx(omega, rel=1e-8)
         np.testing.assert_allclose(amplitudes[::2], np.abs(c[:3]), rtol=1e-8, atol=1e-10)
     # the determinant is that of the damping: exp(-0.1 T)
     mu = (one["multiplier_real"] + 1j * one["multiplier_imag"]).values
-    np.testing.assert_allclose(np.prod(mu, axis=1), np.exp(-0.1 / one["parameter"].values), rtol=1e-8)
+    np.testing.assert_allclose(np.prod(mu, axis=1), np.exp(-0.1 / one["frequency"].values), rtol=1e-8)
 
 
 @pytest.mark.slow
@@ -103,10 +103,10 @@ def test_phase_resonance__of_two_linear_masses_is_exact(tmp_path):
         ds = run.backbone(channel=("x1", "x2")[c], drive_low=0.05)
         exact = [brentq(lambda w, c=c: response(w)[c].real, *ends, xtol=1e-14) for ends in brackets]
         assert ds.sizes["curve"] == len(exact)
-        np.testing.assert_allclose(OMEGA * ds["parameter"].min("point"), exact, rtol=1e-8)
-        np.testing.assert_allclose(OMEGA * ds["parameter"].max("point"), exact, rtol=1e-8)
+        np.testing.assert_allclose(OMEGA * ds["frequency"].min("point"), exact, rtol=1e-8)
+        np.testing.assert_allclose(OMEGA * ds["frequency"].max("point"), exact, rtol=1e-8)
         gain = [abs(response(w)[c]) for w in exact]
-        own = ds["amplitude"].sel(channel=("x1", "x2")[c]) / ds["force"]
+        own = ds["amplitude"].sel(channel=("x1", "x2")[c]) / ds["F"]
         np.testing.assert_allclose(own.isel(point=-1 - (int(ds["n_points"].max()) - ds["n_points"])), gain, rtol=1e-8)
 
 
@@ -116,9 +116,9 @@ def test_normal_mode__of_duffing_is_exact(duffing):
     one = curve(duffing, 1)
     x = 0.5 * one["section"].sel(state="x").values ** 2
     exact = np.pi * np.sqrt(1.0 + x) / (2.0 * ellipk(x / (2.0 * (1.0 + x))))
-    np.testing.assert_allclose(OMEGA * one["parameter"], exact, rtol=1e-9)
+    np.testing.assert_allclose(OMEGA * one["frequency"], exact, rtol=1e-9)
     np.testing.assert_allclose(one["amplitude"].sel(channel="x"), one["section"].sel(state="x"), rtol=1e-9)
-    assert float(one["parameter"][-1]) == pytest.approx(2.0 / OMEGA, abs=1e-5)  # ends at the run's bound
+    assert float(one["frequency"][-1]) == pytest.approx(2.0 / OMEGA, abs=1e-5)  # ends at the run's bound
     assert (one["n_unstable"] == 0).all()
 
 
@@ -151,8 +151,8 @@ def test_normal_modes__of_two_masses_agree_with_shooting(masses):
                 # from rest, both masses rest again after half a period
                 return swing(np.array([x1, free[0], 0.0, 0.0]), 0.5 * free[1])[0][2:]
 
-            found, seconds = fsolve(residual, [x2 * (1 + 1e-4), 1.0001 / float(at["parameter"])], xtol=1e-12)
-            assert float(at["parameter"]) == pytest.approx(1.0 / seconds, rel=1e-8)
+            found, seconds = fsolve(residual, [x2 * (1 + 1e-4), 1.0001 / float(at["frequency"])], xtol=1e-12)
+            assert float(at["frequency"]) == pytest.approx(1.0 / seconds, rel=1e-8)
             energy = x1**2 + found**2 - x1 * found + x1**4 / 8
             assert float(at["mean"].sel(channel="energy")) == pytest.approx(energy, rel=1e-8)
             mu = np.linalg.eigvals(swing(np.array([x1, found, 0.0, 0.0]), seconds)[1])
@@ -162,7 +162,7 @@ def test_normal_modes__of_two_masses_agree_with_shooting(masses):
             np.testing.assert_allclose(np.sort(np.abs(own)), np.sort(np.abs(mu)), rtol=1e-5)
     # beyond an energy the mode in phase is unstable; its frequency stays below sqrt(2), that of the first mass held
     assert set(curve(ds, 0)["n_unstable"].values.tolist()) == {0, 1}
-    assert OMEGA * float(curve(ds, 0)["parameter"].max()) < np.sqrt(2.0)
+    assert OMEGA * float(curve(ds, 0)["frequency"].max()) < np.sqrt(2.0)
 
 
 @pytest.mark.slow
@@ -175,9 +175,9 @@ def test_normal_mode__of_a_pendulum_softens_towards_its_upper_rest(tmp_path):
     ds = run.backbone(undamped={"c": 0.0}, low=0.06)
     (one,) = (curve(ds, i) for i in range(ds.sizes["curve"]))
     amplitude = one["section"].sel(state="th").values
-    np.testing.assert_allclose(OMEGA * one["parameter"], np.pi / (2 * ellipk(np.sin(amplitude / 2) ** 2)), rtol=1e-9)
+    np.testing.assert_allclose(OMEGA * one["frequency"], np.pi / (2 * ellipk(np.sin(amplitude / 2) ** 2)), rtol=1e-9)
     assert amplitude[-1] > 3.0
-    assert float(one["parameter"][-1]) == pytest.approx(0.06, abs=1e-5)
+    assert float(one["frequency"][-1]) == pytest.approx(0.06, abs=1e-5)
     # with damping there is none, and the table says why
     assert "grows or decays at the rate -0.05 1/s; see --undamped" in backbone_table(run.backbone()).nothing
     assert run.plot.backbone(undamped={"c": 0.0}, low=0.06).get_xlabel() == "frequency [Hz]"
@@ -198,7 +198,7 @@ def test_figure__shows_both_curves_over_the_response(hardening, duffing):
     ax = hardening.plot.backbone(undamped={"damping": 0.0, "amplitude": 0.0})
     lines = [line.get_xydata() for line in ax.get_lines() if line.get_linestyle() == "-"]
     for i in range(2):
-        own = np.column_stack([curve(duffing, i)["parameter"], curve(duffing, i)["amplitude"].sel(channel="x")])
+        own = np.column_stack([curve(duffing, i)["frequency"], curve(duffing, i)["amplitude"].sel(channel="x")])
         assert any(len(line) == len(own) and (line == own).all() for line in lines)
     texts = {text.get_text() for text in ax.figure.legends[0].get_texts()}
     assert {"phase resonance", "normal mode", "response, amplitude = 0.1"} <= texts, texts

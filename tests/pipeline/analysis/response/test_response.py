@@ -70,7 +70,7 @@ def balanced(force, omega, guess, n=9):
 def test_duffing__agrees_with_harmonic_balance(response):
     for i, j in points_of(response):
         one = response.isel(branch=i, point=j).sel(channel="x")
-        omega = OMEGA * float(one["parameter"])
+        omega = OMEGA * float(one["frequency"])
         first = float(one["harmonic_amplitude"][0]) * np.exp(-1j * float(one["phase"][0]))
         c = balanced(float(response["F"][i]), omega, [first])
         np.testing.assert_allclose(one["harmonic_amplitude"][::2], np.abs(c[:3]), rtol=1e-6, atol=1e-10)
@@ -101,7 +101,7 @@ def test_duffing__has_the_folds_and_the_landings_of_an_independent_integration(r
             ).y[0]
             assert float(response["jump_amplitude"][k, 0]) == pytest.approx(np.ptp(period) / 2.0, rel=1e-4)
         rises = bool(response["jump_rises"][k])
-        assert (float(response["jump_beyond"][k]) > float(response["value"][event])) == rises
+        assert (float(response["jump_beyond"][k]) > float(response["bifurcation_frequency"][event])) == rises
         down = float(response["jump_amplitude"][k, 0]) < float(response["bifurcation_amplitude"][event, 0])
         assert down == rises  # a hardening spring falls off as the frequency rises
     lines = "\n".join(response_table(response).lines)
@@ -125,11 +125,11 @@ def test_duffing__has_a_response_without_a_bifurcation_to_a_force_called_amplitu
 def test_quantities__are_measured_like_states(response):
     i, j = points_of(response)[2]
     one = response.isel(branch=i, point=j)
-    c = balanced(float(response["F"][i]), OMEGA * float(one["parameter"]), [
+    c = balanced(float(response["F"][i]), OMEGA * float(one["frequency"]), [
         float(one["harmonic_amplitude"][0, 0]) * np.exp(-1j * float(one["phase"][0, 0]))
     ])  # fmt: skip
     t, orders = np.linspace(0.0, OMEGA, 20_000, endpoint=False), np.arange(1, 18, 2)
-    waves, omega = np.exp(1j * np.outer(t, orders)), OMEGA * float(one["parameter"])
+    waves, omega = np.exp(1j * np.outer(t, orders)), OMEGA * float(one["frequency"])
     x, v = (waves @ c).real, (waves @ (1j * orders * omega * c)).real
     energy = v**2 / 2 + x**2 / 2 + x**4 / 4
     own = one.sel(channel="energy")
@@ -235,12 +235,12 @@ def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
     cycle = ds["orbit_period"].values.tolist().index(1)
     one = ds.isel(branch=cycle, point=slice(0, int(ds["n_points"][cycle])))
     stable = one["n_unstable"].values == 0
-    mu = one["parameter"].values[stable]
+    mu = one["mu"].values[stable]
     exact = np.sqrt((1.0 + np.sqrt(1.0 + 4.0 * mu)) / 2.0)
     np.testing.assert_allclose(one["amplitude"].values[stable, 0], exact, rtol=1e-7, atol=0.0)
     np.testing.assert_allclose(one["harmonic_amplitude"].values[stable, 0, 0], exact, rtol=1e-7, atol=0.0)
     (jump,) = range(ds.sizes["jump"])
-    assert float(ds["value"][ds["jump_bifurcation"][jump]]) == pytest.approx(-0.25, abs=1e-7)
+    assert float(ds["bifurcation_mu"][ds["jump_bifurcation"][jump]]) == pytest.approx(-0.25, abs=1e-7)
     assert not ds["jump_rises"][jump]
     # beyond, trajectories spiral to rest
     assert (ds["jump_amplitude"][jump] < 1e-6).all()

@@ -13,7 +13,7 @@ from magpend_core.models import load_model
 from pipeline.analysis.spectrum.analysis import axes_of, needs_axis, needs_channel, spectrum_table
 from pipeline.analysis.spectrum.estimate import ALL, LOBE, _near, _peak, averaged, frequencies_of, pieces_of, power_unit
 from pipeline.analysis.spectrum.gaps import Settings, _fit, _weights, filled
-from pipeline.analysis.spectrum.motions import _of_cell, clock_of, needs_motion, row_axis, settle_motion
+from pipeline.analysis.spectrum.motions import _of_cell, clock_of, needs_motion, row_axis, settle_motion, swept_by
 from pipeline.layout.vocabulary import BOUNDED_SET
 from pipeline.products.figures import SpectrumFigureOptions, WaterfallOptions
 from pipeline.products.spectrum import SpectrumOptions
@@ -201,7 +201,8 @@ def test_of_cell__goes_on_from_its_last_section() -> None:
 
 
 def test_row_axis__names_no_variable() -> None:
-    assert (row_axis("frequency"), row_axis("share")) == ("frequency", "at_share")
+    assert [row_axis(name) for name in ("frequency", "F", "share")] == ["frequency", "F", "parameter_share"]
+    assert [swept_by(name) for name in ("F", "parameter_share", "parameter_F")] == ["F", "share", "parameter_F"]
 
 
 def test_spectrum_table__rows_are_bins_and_the_text_names_the_largest_lines() -> None:

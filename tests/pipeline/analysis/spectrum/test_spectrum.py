@@ -183,7 +183,7 @@ def test_spectrum__lines_of_orbits_are_those_of_scipy(duffing):
     lines = [i for i in range(found.sizes["spectrum"]) if int(found["estimate"][i]) == LINES]
     assert set(periods[lines]) == {1, 2}
     for i in lines:
-        force, p = float(found["at_F"][i]), int(periods[i])
+        force, p = float(found["F"][i]), int(periods[i])
 
         def rates(t, y, force=force):
             return [y[1], -0.3 * y[1] + y[0] - y[0] ** 3 + force * np.cos(1.2 * t)]
@@ -230,7 +230,7 @@ def test_spectrum__of_a_cell_is_that_of_its_attractor(duffing):
     number = int(np.ravel_multi_index((3, 1), ids.shape))
     found = duffing.spectrum(cell=number)
     assert found["attractor"].values.tolist() == [int(ids[3, 1])]
-    assert float(found["at_F"][0]) == 0.65
+    assert float(found["F"][0]) == 0.65
     same = duffing.spectrum(at={"F": 0.65}, attractor=str(int(ids[3, 1])))
     xr.testing.assert_equal(found.drop_attrs(), same.drop_attrs())
 
