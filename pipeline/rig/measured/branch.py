@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from pydantic import Field
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
 from pipeline.analysis.branches.problems import parameter_units
+from pipeline.analysis.points import OWN, PointFile
 from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import spelling_of
@@ -143,7 +142,7 @@ def read_branch(path: str | Path, model: Model | None = None, state: str = "") -
     """Read a measured branch from a CSV table of orbits, or from a TOML specification of recorded orbits,
     ``[measured.branch]``.
 
-    The first column of a CSV file is the parameter of `model`, of the drive's rate in any of its words. Others are
+    The first column of a CSV file is the parameter of `model`, in any spelling (`pipeline.analysis.points`). Others are
     ``amplitude``, ``amplitude_sd``, ``mean``, ``frequency`` (with ``_sd``), ``stable`` (yes, no, unknown) and ``name``.
     The tables that ``magpend measured branch --csv`` writes can be read as well. `state` is by default the model's
     first. Return over the dim ``orbit`` the parameter's ``value``, ``amplitude``, ``mean`` and ``frequency`` with the
@@ -175,7 +174,8 @@ def _from_recordings(path: Path) -> xr.Dataset:
         raise SpecError(f"{path}: measured.branch.model: missing; name the model whose orbits were measured.")
     model = add_model(reference, path.parent, problems)
     if model is not None:
-        problems += _name_problems(model, spec.parameter, spec.state)
+        axis, convert = spelling_of(spec.parameter, model)
+        problems += _name_problems(model, axis, spec.state, spec.parameter)
     problems += [
         f"measured.branch.orbits: {one.name!r} has no file." for one in spec.orbits if not (one.file or spec.file)
     ]
@@ -183,11 +183,9 @@ def _from_recordings(path: Path) -> xr.Dataset:
         raise SpecError([f"{path}: {p}" for p in problems])
     rows, cycles = [], []
     for one in spec.orbits:
-        rows.append({"name": one.name, "value": one.value, "stable": one.stable})
+        rows.append({"name": one.name, "value": convert(one.value), "stable": one.stable})
         cycles.append(_recorded(path, spec, reference, one))
-    return _dataset(
-        model, spec.parameter, spec.state, rows, [_columns_of(c) for c in cycles], [c.harmonics for c in cycles]
-    )
+    return _dataset(model, axis, spec.state, rows, [_columns_of(c) for c in cycles], [c.harmonics for c in cycles])
 
 
 def _recorded(path: Path, spec: MeasuredBranch, reference: Any, one: RecordedOrbit) -> Cycles:
@@ -216,66 +214,60 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
             f"{path}: a table of orbits names no model; name it with --model, or give the run that it is compared "
             "with: --over RUN."
         )
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            header, *lines = list(csv.reader(file)) or [[]]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SpecError(f"{path}: cannot be read as a CSV table ({error}).") from None
-    lines = [line for line in lines if any(field.strip() for field in line)]
-    if len(header) > 1 and header[0].strip() == "name":
-        # as magpend writes it: the name, then the parameter
-        header, *lines = ([*line[1:2], *line[:1], *line[2:]] for line in (header, *lines))
-    if not header or not lines:
-        raise SpecError(f"{path}: has no rows; give a header and a row for each orbit.")
-    # by position, since the parameter may have the name of another column
-    parameter, *others = (name.strip() for name in header)
+    file = PointFile.read(path)
+    # by position, since the parameter may have the name of another column; magpend writes the name before it
+    first = 1 if file.header[0] == "name" and len(file.header) > 1 else 0
+    parameter = file.header[first]
+    others = {name: file.place(name, {name}, first + 1) for name in _KNOWN[1:]}
+    others["name"] = 0 if first else file.place("name", {"name"}, 1)
+    own = parameter.removeprefix(OWN)
+    axis, convert = spelling_of(own if own in _KNOWN else parameter, model)
     chosen = state or model.section_states[0]
-    problems = _name_problems(model, parameter, chosen)
-    problems += [
-        f"column {name!r}: {near_names(name, _KNOWN, 'columns')}" for name in others if name not in _KNOWN and name
-    ]
-    if "amplitude" not in others:
-        problems.append("column 'amplitude': missing; give half of the peak-to-peak value of each orbit.")
-    rows, columns = [], []
-    for i, (first, *rest) in enumerate(lines, 2):
-        line = dict(zip(others, rest, strict=False))
-        found = {name: _number(line.get(name), f"row {i}, {name}", problems) for name in _NUMBERS}
-        found |= {name: _number(line.get(name), f"row {i}, {name}", problems) for name in ("n_cycles", *_HARMONICS)}
-        word = (line.get("stable") or line.get("stability") or "unknown").strip().lower()
+    file.problems.extend(_name_problems(model, axis, chosen, parameter))
+    file.problems.extend(
+        f"column {name!r}: {near_names(name, _KNOWN, 'columns')}"
+        for name in file.header[first + 1 :]
+        if name not in _KNOWN and name
+    )
+    if others["amplitude"] < 0:
+        file.problems.append("column 'amplitude': missing; give half of the peak-to-peak value of each orbit.")
+    own_values = file.numbers(first, convert, needed=True)
+    found = {
+        name: file.numbers(others[name], needed=name == "amplitude") for name in (*_NUMBERS, "n_cycles", *_HARMONICS)
+    }
+    rows = _words_of_rows(file, others, own_values)
+    file.refuse()
+    columns = [{name: float(found[name][i]) for name in _NUMBERS} for i in range(len(rows))]
+    for one, n_cycles in zip(columns, np.nan_to_num(found["n_cycles"]), strict=True):
+        one["n_cycles"] = int(n_cycles)
+    harmonics = None
+    if any(others[name] >= 0 for name in _HARMONICS):
+        harmonics = list(np.transpose([found[name] for name in _HARMONICS]))
+    return _dataset(model, axis, chosen, rows, columns, harmonics)
+
+
+def _words_of_rows(file: PointFile, places: Mapping[str, int], own: np.ndarray) -> list[dict[str, Any]]:
+    """Return the name, the parameter's value and the stability of each row, and note problems of the stability."""
+    rows = []
+    for i, (line, row) in enumerate(zip(file.lines, file.rows, strict=True), 1):
+        name, *words = (row[places[k]] if places[k] >= 0 else "" for k in ("name", "stable", "stability"))
+        word = (words[0] or words[1] or "unknown").lower()
         if word not in _YES:
-            problems.append(f"row {i}, stable = {word!r}: must be yes, no or unknown.")
-        value = _number(first, f"row {i}, {parameter}", problems)
-        if not math.isfinite(value):
-            problems.append(f"row {i}, {parameter}: missing; each orbit needs the parameter's value.")
-        if not math.isfinite(found["amplitude"]):
-            problems.append(f"row {i}, amplitude: missing; each orbit needs one.")
-        rows.append({"name": line.get("name") or f"orbit {i - 1}", "value": value, "stable": word})
-        columns.append(found | {"n_cycles": int(np.nan_to_num(found["n_cycles"]))})
-    if problems:
-        raise SpecError([f"{path}: {p}" for p in problems])
-    harmonics = [np.array([c[name] for name in _HARMONICS]) for c in columns] if set(_HARMONICS) & set(others) else None
-    return _dataset(model, parameter, chosen, rows, columns, harmonics)
+            file.problems.append(f"row {line}, stable = {word!r}: must be yes, no or unknown.")
+        rows.append({"name": name or f"orbit {i}", "value": own[i - 1], "stable": word})
+    return rows
 
 
-def _number(text: str | None, where: str, problems: list[str]) -> float:
-    if text is None or not text.strip():
-        return math.nan
-    try:
-        return float(text)
-    except ValueError:
-        problems.append(f"{where} = {text!r}: must be a number.")
-        return math.nan
-
-
-def _name_problems(model: Model, parameter: str, state: str) -> list[str]:
+def _name_problems(model: Model, axis: str, state: str, parameter: str) -> list[str]:
+    """Return problems of the axis, which the table calls `parameter`, and of the state."""
     names = (*model.parameter_names, *(() if model.crossing is not None else (FREQUENCY_DIM,)))
-    found = [] if spelling_of(parameter, model)[0] in names else [unknown_name("parameter", parameter, names)]
+    found = [] if axis in names else [unknown_name("parameter", parameter, names)]
     return found + ([] if state in model.state_names else [unknown_name("state", state, model.state_names)])
 
 
 def _dataset(
     model: Model,
-    parameter: str,
+    axis: str,
     state: str,
     rows: list[dict[str, Any]],
     columns: list[dict[str, float]],
@@ -283,10 +275,8 @@ def _dataset(
 ) -> xr.Dataset:
     unit = model.state(state).unit
     units = {"frequency": "Hz"}
-    axis, convert = spelling_of(parameter, model)
-    own = convert(np.array([row["value"] for row in rows], float))
     variables: dict[str, Any] = {
-        "value": ("orbit", own, {"units": parameter_units(axis, model)}),
+        "value": ("orbit", [float(row["value"]) for row in rows], {"units": parameter_units(axis, model)}),
         "stability": (
             "orbit",
             np.array([STABILITIES.index(_YES[str(row["stable"])]) for row in rows], np.int8),
@@ -398,7 +388,7 @@ def rms_of(measured: xr.Dataset, stability: str) -> float:
 def branch_table(measured: xr.Dataset) -> Table:
     """Return a table of the measured orbits, with their distances from the computed branches if they were compared."""
     name = parameter_name(str(measured.attrs["parameter"]))
-    name = f"{name} (parameter)" if name in _SHOWN else name
+    name = f"{OWN}{name}" if name in _KNOWN else name
     rows = [_row(measured.isel(orbit=k), name) for k in range(measured.sizes["orbit"])]
     lines = [f"{counted(len(rows), 'measured orbit')} of {measured.attrs['state']} along {name}"]
     unit = _unit(measured)
