@@ -25,6 +25,8 @@ from pipeline.specification.tables import FREQUENCY, RATES
 POINT = "measured"
 """Dim of measured points."""
 
+_MEASURED = "measured "
+
 OWN = "parameter_"
 """Prefix of the column of a parameter that has the name of a measured column."""
 
@@ -95,7 +97,8 @@ def read_points(
             variables[name] = (POINT, file.numbers(place, convert, needed=first), about)
     for name, place in of_column.items():
         if place >= 0:
-            variables[name] = (POINT, file.numbers(place, np.asarray if file.header[place] == name else np.radians))
+            convert = np.asarray if file.header[place] == name else np.radians
+            variables[name] = (POINT, file.numbers(place, convert), {"long_name": f"{_MEASURED}{name}"})
     file.refuse()
     empty = np.all([np.isnan(variables[name][1]) for name in columns if name in variables], axis=0)
     for line in np.array(file.lines)[np.broadcast_to(empty, len(file.lines)) & bool(columns)].tolist():
@@ -107,7 +110,8 @@ def read_points(
 def level_name(points: xr.Dataset, parameter: str) -> str:
     """Return the name of the variable with the levels of a parameter; empty if the points have none."""
     names = (f"{OWN}{parameter}", f"{OWN}{axis_name(parameter)}", parameter, axis_name(parameter))
-    return next((name for name in names if name in points and "long_name" in points[name].attrs), "")
+    told = (name for name in names if name in points)
+    return next((name for name in told if not points[name].attrs["long_name"].startswith(_MEASURED)), "")
 
 
 @dataclass(frozen=True)

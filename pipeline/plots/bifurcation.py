@@ -19,7 +19,9 @@ from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
+from pipeline.plots.measured import columns_of, draw_sections, points_of, with_points
 from pipeline.plots.points import Survey, View, make_view, survey
+from pipeline.plots.style import hold
 from pipeline.products.figures import BifurcationOptions
 
 SHADE: dict[str, Any] = {"color": style.BLUE, "alpha": 0.3, "linewidth": 0.0, "zorder": 2.0}
@@ -65,22 +67,6 @@ def thin(width: float, limits: tuple[float, float], unit: str) -> str:
     if not width < HAIRLINE * abs(limits[1] - limits[0]):
         return ""
     return f", at most {width:.2g}{'' if unit in ('', '1') else f' {labels.raised(unit)}'} wide"
-
-
-def hold(ax: Axes, x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> None:
-    """Widen axes so that they hold some coordinates, but for an axis whose range the user chose."""
-    frame = style.figure_of(ax).frame
-    for values, chosen, get, put in (
-        (x, frame.xlim, ax.get_xlim, ax.set_xlim),
-        (y, frame.ylim, ax.get_ylim, ax.set_ylim),
-    ):
-        known = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
-        known = known[np.isfinite(known)]
-        low, high = get()
-        if chosen is None and len(known) and (known.min() < min(low, high) or known.max() > max(low, high)):
-            room = 0.03 * max(abs(high - low), np.ptp(known))
-            ends = min(low, high, known.min() - room), max(low, high, known.max() + room)
-            put(*(ends if low <= high else ends[::-1]))
 
 
 def _tubes(
@@ -208,6 +194,7 @@ def plot_bifurcation(
     layout: str = "overlay",
     at: Mapping[str, float] | None = None,
     bands: xr.Dataset | None = None,
+    points: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the bifurcation diagram of a run: its section points over the swept parameter, coloured by class of motion.
@@ -235,6 +222,9 @@ def plot_bifurcation(
         Values of all swept parameters but one.
     bands
         From the analysis ``bands``: 95 % bands of the orbits and intervals of the bifurcations, drawn below the points.
+    points
+        Measured points from `read_points`: the drawn state or quantity over the parameter. Those at other values of
+        the axes in `at` are open.
     frame
         Width of the figure and ranges of its axes.
 
@@ -242,7 +232,8 @@ def plot_bifurcation(
     -------
     DataFigure
         For a cube without a finished cell it says so. Its `data` hold the points drawn, as
-        `pipeline.plots.pixels.draw_points` says, and the numbers of ``cells`` and of ``absent`` cells.
+        `pipeline.plots.pixels.draw_points` says, and the numbers of ``cells`` and of ``absent`` cells. Names of
+        measured points begin with ``measured_``.
 
     Raises
     ------
@@ -255,6 +246,10 @@ def plot_bifurcation(
     fig = style.new_figure(4.3, xr.Dataset(), frame)
     panels = _panels(fig, diagram, _layers(diagram.view.layers, layout))
     handles = diagram.handles(layers=layout == "overlay")
+    if points is not None:
+        for panel in panels:
+            measured = draw_sections(panel.ax, points, diagram.measure, [diagram.level])
+        handles += measured
     if bands is not None:
         if quantity:
             raise ValueError(f"bands are of states at the section; drop the quantity {quantity!r}, or the posterior")
@@ -262,7 +257,7 @@ def plot_bifurcation(
             entries = draw_bands(panel.ax, bands, diagram.measure)
         handles += entries
     style.complete(fig, panels[0].ax, diagram.caption, handles)
-    fig.data = diagram.draw(panels)
+    fig.data = with_points(diagram.draw(panels), points)
     if bands is not None:
         fig.data = with_bands(fig.data, bands)
     return fig
@@ -276,6 +271,7 @@ class Diagram:
     survey: Survey
     measure: Measure  # the vertical axis
     parameter: str
+    level: tuple[tuple[str, float], ...]  # values of the other swept parameters
     frame: style.Frame
 
     @classmethod
@@ -294,10 +290,7 @@ class Diagram:
             raise ValueError(f"a diagram is drawn of a state or of a quantity; drop {state!r} or {quantity!r}")
         part = at_points(ds, at)
         parameter = swept_parameter(part)
-        if quantity:
-            measure, values = _extreme(part, quantity, degrees)
-        else:
-            measure, values = _section(part, state, degrees)
+        measure, values = _extreme(part, quantity, degrees) if quantity else _section(part, state, degrees)
 
         def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
             dims = block["status"].dims
@@ -306,7 +299,8 @@ class Diagram:
 
         view = make_view(part, ("extremes" if quantity else "section",), coordinates)
         found = survey(view, along=parameter, xlim=frame.xlim, ylim=frame.ylim)
-        return cls(view, found, measure, parameter, frame)
+        level = tuple((name, float(part[name].values.ravel()[0])) for name in swept_parameters(ds) if name != parameter)
+        return cls(view, found, measure, parameter, level, frame)
 
     @property
     def x(self) -> np.ndarray:
@@ -490,14 +484,21 @@ def draw(run: OpenRun, options: BifurcationOptions) -> style.DataFigure:
     """Draw the figure ``bifurcation`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)
+    state = "" if options.quantity else options.state
+    points = None
+    if options.points:
+        part = at_points(cube, at)
+        measure, _ = _extreme(part, options.quantity, False) if options.quantity else _section(part, state, False)
+        points = points_of(run, options.points, swept_parameter(part), **columns_of(measure))
     figure = plot_bifurcation(
         cube,
-        state="" if options.quantity else options.state,
+        state=state,
         quantity=options.quantity,
         degrees=options.degrees,
         layout=options.layout,
         at=at,
         bands=run.derive("bands", posterior=options.posterior) if options.posterior else None,
+        points=points,
         frame=frame_of(options),
     )
     return noted(figure, notes)

@@ -12,17 +12,18 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from pipeline.analysis.branches.analysis import isolas_of, limits_of
+from pipeline.analysis.branches.analysis import fixed_of, isolas_of, limits_of
 from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
-from pipeline.analysis.branches.levels import refuse_at
+from pipeline.analysis.branches.levels import at_levels, refuse_at
 from pipeline.analysis.run import OpenRun
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bifurcation import Diagram, draw_bands, hold, with_bands, with_diagram
+from pipeline.plots.bifurcation import Diagram, draw_bands, with_bands, with_diagram
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
+from pipeline.plots.measured import columns_of, draw_sections, points_of, with_points
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions, MultiplierOptions
 
@@ -50,6 +51,7 @@ def plot_branches(
     cube: xr.Dataset | None = None,
     *,
     bands: xr.Dataset | None = None,
+    points: xr.Dataset | None = None,
     state: str = "",
     max_period: int | None = None,
     degrees: bool = False,
@@ -69,6 +71,8 @@ def plot_branches(
         Sweep or continuation over the same parameter, drawn below.
     bands
         From the analysis ``bands``: 95 % bands of the orbits and intervals of the bifurcations.
+    points
+        Measured points from `read_points`: the state over the parameter. Those at a level without branches are open.
     state, degrees, at
         As for `plot_bifurcation`.
     max_period
@@ -80,7 +84,7 @@ def plot_branches(
     -------
     DataFigure
         Its `data` are the branches; names with the suffix ``_diagram`` are the data of the diagram below, those with
-        ``_bands`` the data of the bands.
+        ``_bands`` the data of the bands. Names of measured points begin with ``measured_``.
 
     Raises
     ------
@@ -89,7 +93,7 @@ def plot_branches(
     """
     measure = labels.state_measure(ds, state, degrees)
     below = _below(cube, measure, degrees, at, frame)
-    fig = style.new_figure(4.5, _stored(ds), frame)
+    fig = style.new_figure(4.5, with_points(_stored(ds), points), frame)
     ax = fig.add_subplot()
     chosen = _chosen(ds, max_period)
     if below is not None:
@@ -101,6 +105,8 @@ def plot_branches(
         _hold_branches(ax, ds, chosen, measure, below.survey.empty)
     style.label_axes(ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label)
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
+    if points is not None:
+        handles += draw_sections(ax, points, measure, [tuple(fixed_of(ds, i).items()) for i in chosen])
     if bands is not None:
         handles += draw_bands(ax, bands, measure, max_period)
         fig.data = with_bands(fig.data, bands)
@@ -254,7 +260,7 @@ def _hold_branches(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure
     if alone and np.isfinite(y).any() and not measure.on_circle and style.figure_of(ax).frame.ylim is None:
         middle = float(np.nanmedian(y))
         ax.set_ylim(middle, middle + 1e-9 * max(abs(middle), 1.0))
-    hold(ax, [x], [y])
+    style.hold(ax, [x], [y])
 
 
 def _isola(ds: xr.Dataset, branch: int, measure: Measure) -> _Name:
@@ -362,7 +368,9 @@ def draw_branches(run: OpenRun, options: BranchFigureOptions) -> style.DataFigur
     """Draw the figure ``branches`` of a run, over its own bifurcation diagram or that of another run."""
     other = run.of(options.over) if options.over else run
     at, notes = values_of(other, options)
-    found = run.derive("branches", **options.part(BranchOptions))
+    columns = columns_of(labels.state_measure(run.cube(), options.state))
+    points = points_of(run, options.points, options.parameter, **columns)
+    found = at_levels(run.derive("branches", **options.part(BranchOptions)), at)
     cube = other.cube()
     below = cube if axis_name(options.parameter) in cube.dims else None
     bands = None
@@ -372,6 +380,7 @@ def draw_branches(run: OpenRun, options: BranchFigureOptions) -> style.DataFigur
         found,
         below,
         bands=bands,
+        points=points,
         state=options.state,
         max_period=options.shown,
         degrees=options.degrees,

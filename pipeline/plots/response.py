@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,29 +13,18 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of
 from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.kinds import KINDS, LABELS
-from pipeline.analysis.branches.levels import SAME, at_levels
-from pipeline.analysis.points import POINT, read_points
+from pipeline.analysis.branches.levels import at_levels
 from pipeline.analysis.run import OpenRun
-from pipeline.layout.own_words import RATE
-from pipeline.layout.vocabulary import axis_name, model_of, split_dims
+from pipeline.layout.vocabulary import axis_name, model_of
 from pipeline.plots import labels, style
 from pipeline.plots.branches import MARKERS, NAMES, STABLE, UNSTABLE, stretches, with_located
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
+from pipeline.plots.measured import draw_points, points_of, with_points
 from pipeline.products.figures import ResponseFigureOptions
 from pipeline.products.response import ResponseOptions
 from pipeline.specification.problems import SpecError
-from pipeline.specification.tables import FREQUENCY
 
-_POINTS: dict[str, Any] = {
-    "linestyle": "none",
-    "marker": "o",
-    "markersize": 3.0,
-    "markerfacecolor": "black",
-    "markeredgecolor": "white",
-    "markeredgewidth": 0.4,
-    "zorder": 9.0,
-}
 _ARROW: dict[str, Any] = {"arrowstyle": "->", "linewidth": 0.7, "shrinkA": 3.0, "shrinkB": 0.0, "mutation_scale": 7.0}
 
 
@@ -65,7 +54,7 @@ def plot_response(
         Harmonic whose amplitude is drawn; 0 draws half of peak to peak, and the phase of the first harmonic.
     points
         Measured points from `read_points`: ``amplitude`` and perhaps ``phase`` [rad] over the parameter. Points at
-        a level that was computed have its colour, others are black.
+        a level that was computed have its colour, others are black, or open over black curves.
     degrees
         Degrees for phases, and for a channel that is an angle.
     frame
@@ -89,7 +78,9 @@ def plot_response(
     turns = str(ds["unit"].sel(channel=channel).values).startswith("rad")
     measure = labels.quantity_measure(ds, channel, degrees and turns)
     has_phase = model_of(ds).crossing is None and not model_of(ds).autonomous
-    fig = style.new_figure(5.2 if has_phase else 4.0, _stored(ds, points), frame)
+    fig = style.new_figure(
+        5.2 if has_phase else 4.0, with_points(style.storable(ds, "frequency response"), points), frame
+    )
     ratios = [2, 1] if has_phase else [1]
     axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
     levels = levels_of(ds)
@@ -102,7 +93,9 @@ def plot_response(
     if not harmonic:
         _draw_jumps(axes[0], ds, channel, measure, levels)
     _name_isolas(axes[0], ds, measure.shown(chosen[0][0].values))
-    drawn = _draw_points(axes, points, (measure, phase), levels)
+    drawn = []
+    for ax, column, shown in zip(axes, ("amplitude", "phase"), (measure, phase), strict=False):
+        drawn = drawn if points is None else draw_points(ax, points, column, shown, levels)
     name = str(ds.attrs["parameter"])
     what = "amplitude" if not harmonic else f"harmonic {harmonic}"
     style.label_axes(axes[-1], labels.swept_label(name, ds.attrs["parameter_units"]), "")
@@ -115,11 +108,6 @@ def plot_response(
     style.legend_above(fig, _handles(ds, levels, drawn), size=fig.look.tick)
     style.finish(fig)
     return fig
-
-
-def _stored(ds: xr.Dataset, points: xr.Dataset | None) -> xr.Dataset:
-    measured = {} if points is None else {f"measured_{name}": v for name, v in points.variables.items()}
-    return style.storable(ds, "frequency response").assign(measured)
 
 
 def levels_of(ds: xr.Dataset) -> dict[tuple[tuple[str, float], ...], str]:
@@ -205,36 +193,6 @@ def _name_isolas(ax: Axes, ds: xr.Dataset, amplitude: np.ndarray) -> None:
         )  # fmt: skip
 
 
-def _draw_points(
-    axes: np.ndarray, points: xr.Dataset | None, measures: tuple[Measure, Measure], levels: Mapping[Any, str]
-) -> list[dict[str, Any]]:
-    """Draw measured points in the colours of their levels; return their legend entries."""
-    looks = list(_by_level(points, levels)) if points is not None else []
-    for ax, name, measure in zip(axes, ("amplitude", "phase"), measures, strict=False):
-        for own, look in looks:
-            if points is not None and name in points:
-                ax.plot(points["parameter"].values[own], measure.shown(points[name].values[own]), **look)
-    return [look for _, look in looks]
-
-
-def _by_level(points: xr.Dataset, levels: Mapping[Any, str]) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
-    """Yield the points of each level with their look, and at last those that belong to no level of the curves."""
-    rest = np.ones(points.sizes[POINT], bool)
-    for level, colour in levels.items():
-        told = {name: value for name, value in level if axis_name(name) in points or name in points}
-        own = rest.copy()
-        for name, value in told.items():
-            values = points[name if name in points else axis_name(name)].values
-            own &= np.isclose(values, value, rtol=SAME, atol=0.0)
-        if own.any() and (told or len(levels) == 1):
-            rest &= ~own
-            text = ", ".join(f"{name} = {value:g}" for name, value in told.items()) if len(levels) > 1 else ""
-            yield own, {**_POINTS, "markerfacecolor": colour, "label": f"measured{', ' if text else ''}{text}"}
-    if rest.any():
-        other = "at other levels" if any(name in points for level in levels for name, _ in level) else ""
-        yield rest, {**_POINTS, "label": f"measured {other}".rstrip()}
-
-
 def _handles(ds: xr.Dataset, levels: Mapping[Any, str], points: list[dict[str, Any]]) -> list[Line2D]:
     lines = [{**STABLE, "label": "stable"}, {**UNSTABLE, "label": "unstable"}]
     if len(levels) > 1:
@@ -245,19 +203,12 @@ def _handles(ds: xr.Dataset, levels: Mapping[Any, str], points: list[dict[str, A
     return style.handles([*lines, *points])
 
 
-def _points_of(run: OpenRun, options: ResponseFigureOptions) -> xr.Dataset:
-    """Read the measured points of a figure: over its parameter, with the levels of the other swept ones."""
-    cube, along = run.cube(), axis_name(options.parameter)
-    others = [d for d in split_dims(cube["status"])[0] if d != along]
-    return read_points(options.points, run.model, along, others=others, rate=str(cube.attrs.get(RATE, FREQUENCY)))
-
-
 def draw(run: OpenRun, options: ResponseFigureOptions) -> style.DataFigure:
     """Draw the figure ``response`` of a run."""
     if options.harmonic > options.harmonics:
         raise SpecError(f"--harmonic {options.harmonic}: only {options.harmonics} are computed; raise --harmonics.")
     at, notes = values_of(run, options)
-    points = _points_of(run, options) if options.points else None
+    points = points_of(run, options.points, options.parameter)
     found = at_levels(run.derive("response", **options.part(ResponseOptions)), at)
     chosen: dict[str, Any] = {name: getattr(options, name) for name in ("channel", "harmonic", "degrees")}
     return noted(plot_response(found, points=points, frame=frame_of(options), **chosen), notes)

@@ -449,6 +449,22 @@ def handles(looks: Iterable[Mapping[str, Any]]) -> list[Line2D]:
     return [Line2D([], [], **{name: value for name, value in look.items() if name != "zorder"}) for look in looks]
 
 
+def hold(ax: Axes, x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> None:
+    """Widen axes so that they hold some coordinates, but for an axis whose range the user chose."""
+    frame = figure_of(ax).frame
+    for values, chosen, get, put in (
+        (x, frame.xlim, ax.get_xlim, ax.set_xlim),
+        (y, frame.ylim, ax.get_ylim, ax.set_ylim),
+    ):
+        known = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
+        known = known[np.isfinite(known)]
+        low, high = get()
+        if chosen is None and len(known) and (known.min() < min(low, high) or known.max() > max(low, high)):
+            room = 0.03 * max(abs(high - low), np.ptp(known))
+            ends = min(low, high, known.min() - room), max(low, high, known.max() + room)
+            put(*(ends if low <= high else ends[::-1]))
+
+
 def storable(ds: xr.Dataset, title: str) -> xr.Dataset:
     """Return a dataset with a title and without what NetCDF cannot store."""
     return ds.drop_vars([name for name, v in ds.variables.items() if v.dtype == object]).assign_attrs(title=title)

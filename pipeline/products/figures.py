@@ -25,7 +25,13 @@ def _without(options: FigureOptions, name: str) -> str:
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 
-class BifurcationOptions(StateOptions):
+class PointOptions(FigureOptions):
+    """Options of a figure that shows measured points over its curves."""
+
+    points: str = option("", "CSV file of measured points: a column of the axis, and one of each thing drawn.")
+
+
+class BifurcationOptions(PointOptions, StateOptions):
     """Options of a bifurcation diagram."""
 
     quantity: str = option(
@@ -90,7 +96,7 @@ class DimensionFigureOptions(DimensionOptions, FigureOptions):
     """Options of a figure of a correlation sum and its fit."""
 
 
-class BranchFigureOptions(BranchOptions, StateOptions):
+class BranchFigureOptions(BranchOptions, PointOptions, StateOptions):
     """Options of a figure of branches of periodic orbits over a bifurcation diagram."""
 
     over: str = option("", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR.")
@@ -115,12 +121,11 @@ class GenealogyOptions(EventOptions, FigureOptions):
     """Options of a figure of the events of attractors."""
 
 
-class ResponseFigureOptions(ResponseOptions, FigureOptions):
+class ResponseFigureOptions(ResponseOptions, PointOptions):
     """Options of a figure of frequency responses."""
 
     channel: str = option("", "State or quantity to draw; by default the model's first state.")
     harmonic: int = option(0, "Draw the amplitude of this harmonic; 0 draws half of peak to peak.", ge=0)
-    points: str = option("", "CSV file of measured points: columns of the parameter, amplitude and, if known, phase.")
 
 
 class SensitivityFigureOptions(SensitivityOptions, FigureOptions):

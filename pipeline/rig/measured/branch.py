@@ -108,6 +108,8 @@ _YES = {
 }  # fmt: skip
 _NUMBERS = ("amplitude", "amplitude_sd", "mean", "mean_sd", "frequency", "frequency_sd")
 _HARMONICS = tuple(f"harmonic_{k + 1}" for k in range(N_HARMONICS))
+_BESIDE = " (parameter)"
+"""Suffix of the parameter's name in tables if another column has the name."""
 _KNOWN = ("name", "stable", "stability", "n_cycles", *_NUMBERS, *_HARMONICS)
 
 
@@ -220,7 +222,7 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     parameter = file.header[first]
     others = {name: file.place(name, {name}, first + 1) for name in _KNOWN[1:]}
     others["name"] = 0 if first else file.place("name", {"name"}, 1)
-    own = parameter.removeprefix(OWN)
+    own = parameter.removesuffix(_BESIDE).removeprefix(OWN)
     axis, convert = spelling_of(own if own in _KNOWN else parameter, model)
     chosen = state or model.section_states[0]
     file.problems.extend(_name_problems(model, axis, chosen, parameter))
@@ -388,7 +390,7 @@ def rms_of(measured: xr.Dataset, stability: str) -> float:
 def branch_table(measured: xr.Dataset) -> Table:
     """Return a table of the measured orbits, with their distances from the computed branches if they were compared."""
     name = parameter_name(str(measured.attrs["parameter"]))
-    name = f"{OWN}{name}" if name in _KNOWN else name
+    name = f"{name}{_BESIDE}" if name in _KNOWN else name
     rows = [_row(measured.isel(orbit=k), name) for k in range(measured.sizes["orbit"])]
     lines = [f"{counted(len(rows), 'measured orbit')} of {measured.attrs['state']} along {name}"]
     unit = _unit(measured)

@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.plots import labels, style
-from pipeline.plots.bifurcation import hold, thin
+from pipeline.plots.bifurcation import thin
 from pipeline.rig.measured.branch import STABILITIES
 
 
@@ -92,7 +92,7 @@ def plot_branch(
     room = 0.12 * (high - low) or 0.1 * abs(high) or 1.0
     bars = measured["amplitude"].values + BARS * np.nan_to_num(measured["amplitude_sd"].values)
     style.limits(ax, frame, (low - room, high + room), (0.0, 1.15 * float(np.nanmax(bars))))
-    hold(ax, *_drawn(branches, computed, bands))
+    style.hold(ax, *_drawn(branches, computed, bands))
     if bands is not None and bands.tubes:
         width = max(float(np.nanmax(tube["high"] - tube["low"])) for tube in bands.tubes)
         entries[0].set_label(f"95 %{thin(width, ax.get_ylim(), unit)}")

@@ -31,7 +31,7 @@ from pipeline.plots import (
     save_figure,
     style,
 )
-from pipeline.plots.bifurcation import hold
+from pipeline.plots.style import hold
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import (
     DUFFING,
