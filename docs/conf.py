@@ -105,10 +105,10 @@ GROUPS = {
 def grouped() -> dict[str, list[str]]:
     """Return every name of `import magpend`, by group."""
     import magpend
-    from pipeline.products.registry import COMMANDS
+    from pipeline.products.registry import ANALYSES
 
     found = {group: list(names) for group, names in GROUPS.items()}
-    found["Analyses"] += COMMANDS
+    found["Analyses"] += ANALYSES.listed
     placed = {name for names in found.values() for name in names}
     left = [n for n in dir(magpend) if not n.startswith("_") and n not in placed]
     found["Figures and animations"] += [n for n in left if n.startswith("plot_")]
@@ -119,10 +119,10 @@ def grouped() -> dict[str, list[str]]:
 def _docstrings() -> str:
     """Directives that show the docstrings, as MyST takes them."""
     import magpend
-    from pipeline.products.registry import COMMANDS
+    from pipeline.products.registry import ANALYSES
 
     # methods for analyses are shown as functions
-    shown = {"Run": f"   :members:\n   :exclude-members: {', '.join(COMMANDS)}\n", "Spec": "   :members:\n"}
+    shown = {"Run": f"   :members:\n   :exclude-members: {', '.join(ANALYSES.listed)}\n", "Spec": "   :members:\n"}
     parts = []
     for group, names in grouped().items():
         parts.append(f"## {group}\n")

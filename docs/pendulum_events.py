@@ -17,9 +17,9 @@ from typing import Any
 import pandas as pd
 
 import magpend
-from pipeline.analysis.tabular import plain
+from pipeline.analysis.branches.figure import NAMES
 from pipeline.layout.vocabulary import letter
-from pipeline.plots.branches import NAMES
+from pipeline.results.tabular import plain
 
 PAGE = Path(__file__).resolve().parent / "tutorials" / "bifurcations.md"
 

@@ -18,9 +18,10 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
 import magpend
-from pipeline.products.registry import COMMANDS, FIGURES
+from pipeline.products.registry import ANALYSES as PRODUCTS
+from pipeline.products.registry import FIGURES
 from pipeline.runs.derive import stored_each
-from tests.pipeline.results import complaints
+from tests.pipeline.declared import complaints
 
 pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
 
@@ -188,7 +189,7 @@ def test_simulate(call, day):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ELSEWHERE])
+@pytest.mark.parametrize("name", [name for name in PRODUCTS.listed if name not in ELSEWHERE])
 def test_analyse(runs, name):
     """Prints a table for people, and the same for programs."""
     words = ("analyse", name, *ANALYSES[name].split())
@@ -205,7 +206,7 @@ def test_analyse(runs, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ELSEWHERE])
+@pytest.mark.parametrize("name", [name for name in PRODUCTS.listed if name not in ELSEWHERE])
 def test_result__each_variable_is_declared_and_says_what_it_is_and_in_which_unit(runs, day, name):
     runs("analyse", name, *ANALYSES[name].split())
     run = magpend.Run.open(day / ANALYSES[name].split()[0])

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from magpend_core.models import LIBRARY, load_model
-from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import EQUILIBRIUM
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.files import shipped_workflows
 

@@ -17,13 +17,14 @@ import xarray as xr
 from matplotlib import pyplot as plt
 
 import magpend
+from magpend._names import Analyses, Figures
 from magpend._plots import Plots
 from pipeline.cli import reference
 from pipeline.plots import pixels
 from pipeline.plots.style import TARGET, Target
 from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
-from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
+from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.runs.arguments import in_python
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
@@ -71,10 +72,10 @@ def defaults_of(method, aside: set[str]) -> dict[str, object]:
     return {p.name: p.default for p in parameters if p.name not in aside}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ANALYSES.listed)
 def test_run__has_each_analysis_with_the_defaults_of_its_options(name):
     method, options = getattr(magpend.Run, name), ANALYSES[name].options
-    assert vars(magpend.Run)[name].options is options
+    assert vars(Analyses)[name].options is options
     assert defaults_of(method, {"echo", "workers", "scheduler"}) == declared(options)
     headings = re.findall(r"^(\w+)\n    \w", inspect.getdoc(method), re.MULTILINE)
     assert sorted(headings) == sorted([*options.model_fields, "echo", "workers", "scheduler", "Dataset", "SpecError"])
@@ -85,12 +86,12 @@ def test_run__has_each_analysis_with_the_defaults_of_its_options(name):
 @pytest.mark.parametrize("name", FIGURES)
 def test_plots__have_each_figure_with_the_defaults_of_its_options(name):
     options = FIGURES[name].options
-    assert vars(Plots)[name].options is options
+    assert vars(Figures)[name].options is options
     assert defaults_of(getattr(Plots, name), {"ax", "figure", "echo"}) == declared(options, ("out", "format"))
 
 
 def test_methods__complete_and_refuse_as_written_ones_do(run):
-    assert set(COMMANDS) <= set(dir(run))
+    assert set(ANALYSES.listed) <= set(dir(run))
     assert set(FIGURES) <= set(dir(run.plot))
     assert next(iter(inspect.signature(run.basins).parameters)) == "interval"
     assert "Measure the basins" in pydoc.render_doc(magpend.Run.basins)

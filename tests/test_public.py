@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 import magpend
-from pipeline.products.registry import COMMANDS
+from pipeline.products.registry import ANALYSES
 from tests.programs import ROOT, fresh_python
 
 
@@ -20,7 +20,7 @@ def test_magpend__every_name_is_there(name):
 
 def test_magpend__completes_and_refuses_as_modules_do():
     names = dir(magpend)
-    assert {"open_run", "run", "load_model", "sections", "trajectory", "plot_basins", *COMMANDS} <= set(names)
+    assert {"open_run", "run", "load_model", "sections", "trajectory", "plot_basins", *ANALYSES.listed} <= set(names)
     with pytest.raises(AttributeError, match="no attribute 'atractors'"):
         magpend.atractors  # noqa: B018
     assert magpend.basins is magpend.Run.basins

@@ -16,7 +16,7 @@ import pipeline
 from magpend_core import Status
 from magpend_core.engine import lanes
 from magpend_core.models.pendulum.sides import Side
-from pipeline.analysis.sides import classify
+from pipeline.results.sides import classify
 from pipeline.specification.files import shipped_workflows
 from tests.programs import ROOT, program
 

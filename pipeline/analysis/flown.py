@@ -9,7 +9,7 @@ import numpy as np
 from magpend_core.models.model import Parameters
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, Samples, sample
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
+from pipeline.results.tolerances import PORTRAIT_RTOL
 
 
 def flown(

@@ -300,13 +300,13 @@ _COMMANDS: dict[str, tuple[Any, str]] = {
     "branch": (branch, "MeasuredBranchOptions"),
     "trace": (trace, ""),
 }
-"""Commands, and the names of their options in `pipeline.products.measured`; empty if there are none."""
+"""Commands, and the names of their options in `pipeline.rig.measured.declaration`; empty if there are none."""
 
 _DRAWING = ("diagram", "compare", "series", "branch")
 
 
 def _make(name: str) -> Any:
-    from pipeline.products import measured
+    from pipeline.rig.measured import declaration as measured
 
     function, options = _COMMANDS[name]
     command = taking(getattr(measured, options), function) if options else function

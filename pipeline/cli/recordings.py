@@ -102,7 +102,7 @@ def spectrum(
         if as_json or csv:
             console.note(*found.attrs["notes"].splitlines())
         if out is not None:
-            from pipeline.plots.spectrum import plot_spectrum
+            from pipeline.analysis.spectrum.figure import plot_spectrum
 
             _save(plot_spectrum(found, axis=axis), out, as_json or csv)
     except ValueError as error:
@@ -135,7 +135,7 @@ def analyse(
         raise SpecError(f"{file}: {error}") from None
     tell(series_table(found), csv, as_json)
     if out is not None:
-        from pipeline.plots.series import plot_series
+        from pipeline.analysis.series.figure import plot_series
 
         _save(plot_series(found), out, as_json or csv)
 

@@ -1,4 +1,4 @@
-"""Write the tables of README and docs from the code.
+"""Write the tables of README and docs, and the methods of the Python package, from the code.
 
 The command is ``python -m pipeline.cli.reference``.
 
@@ -374,11 +374,11 @@ def variables() -> str:
 def results() -> str:
     """Return the Markdown text on the variables of the result of each analysis."""
     from pipeline.products.column import POINTS, STARTS
-    from pipeline.products.registry import ANALYSES, COMMANDS
+    from pipeline.products.registry import ANALYSES
 
     dims = {POINTS: "swept parameters", STARTS: "starts"}
     parts = []
-    for name in COMMANDS:
+    for name in ANALYSES.listed:
         rows = [
             (f"`{c.own or c.name}`", ", ".join(dims.get(d, f"`{d}`") for d in c.dims.split()), c.unit, c.text)
             for c in ANALYSES[name].columns
@@ -460,9 +460,73 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
+# ---- methods of Python --------------------------------------------------------------------------
+
+FACE = ROOT / "pipeline/face/magpend"
+
+
+def methods() -> str:
+    """Return the module with the analyses of a run and its figures as methods, for type checkers and for ``help``."""
+    from pipeline.products.registry import ANALYSES, FIGURES, OWN
+
+    imports: dict[str, str] = {}
+
+    def declared(name: str, kind: str, options: type) -> str:
+        room, _, module = options.__module__.rpartition(".")
+        alias = f"of_{room.rpartition('.')[2] if module == 'declaration' else module}"
+        imports[alias] = f"from {room} import {module} as {alias}"
+        return f"    {name} = {kind}({alias}.{options.__name__})"
+
+    def panels(name: str) -> str:
+        figure = FIGURES[name]
+        if name == "bifurcation":
+            return "Bifurcation"
+        return {"one": "OnePanel", "several": "SeveralPanels"}.get("" if figure.unless else figure.panels, "AnyPanels")
+
+    analyses = [declared(name, "AnalysisMethod", ANALYSES[name].options) for name in OWN if name in ANALYSES]
+    figures = [declared(name, panels(name), FIGURES[name].options) for name in OWN if name in FIGURES]
+    kinds = sorted({line.partition(" = ")[2].partition("(")[0] for line in analyses + figures})
+    return "\n".join(
+        [
+            '"""The analyses of a run and its figures as methods, made by ``python -m pipeline.cli.reference``."""',
+            "",
+            "from __future__ import annotations",
+            "",
+            f"from magpend._methods import {', '.join(kinds)}",
+            *sorted(imports.values()),
+            "",
+            "",
+            "class Analyses:",
+            '    """The analyses of a run."""',
+            "",
+            *analyses,
+            "",
+            "",
+            "class Figures:",
+            '    """The figures of a run."""',
+            "",
+            *figures,
+            "",
+        ]
+    )
+
+
+def names() -> str:
+    """Return the stub of the Python package, whose last lines list the functions of analyses."""
+    from pipeline.products.registry import ANALYSES, OWN
+
+    stub = (FACE / "__init__.pyi").read_text("utf-8")
+    listed = [f"{name} = Run.{name}" for name in OWN if name in ANALYSES]
+    return "\n".join([stub.partition(_OF_ANALYSES)[0] + _OF_ANALYSES, *listed, ""])
+
+
+_OF_ANALYSES = "# analyses, made by python -m pipeline.cli.reference"
+
+
 def stale() -> dict[Path, str]:
-    """Return the new texts of the pages that are out of date, by path."""
+    """Return the new texts of the pages and modules that are out of date, by path."""
     texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
+    texts |= {FACE / "_names.py": methods(), FACE / "__init__.pyi": names()}
     return {path: text for path, text in texts.items() if path.read_text("utf-8") != text}
 
 

@@ -99,6 +99,13 @@ def parameter_name(axis: str) -> str:
     return FREQUENCY if axis in (FREQUENCY, FREQUENCY_DIM) else axis
 
 
+def parameter_units(parameter: str, model: Model | None) -> str:
+    """Return the unit of a parameter or of the drive frequency; an empty text if there is no model."""
+    if axis_name(parameter) == FREQUENCY_DIM:
+        return "Hz"
+    return model.parameter(parameter).unit if model is not None else ""
+
+
 def model_attribute(model: Model) -> str:
     """Return the attribute ``model`` of a dataset: a model's name, or its text as JSON."""
     reference = model.reference

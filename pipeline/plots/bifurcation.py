@@ -12,8 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from pipeline.analysis.draws import LEAST_SHARE, interval_of, stretches
-from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
@@ -22,7 +20,9 @@ from pipeline.plots.labels import Measure
 from pipeline.plots.measured import columns_of, draw_sections, points_of, with_points
 from pipeline.plots.points import Survey, View, make_view, survey
 from pipeline.plots.style import hold
-from pipeline.products.figures import BifurcationOptions
+from pipeline.products.diagrams import BifurcationOptions
+from pipeline.results.draws import LEAST_SHARE, interval_of, stretches
+from pipeline.results.run import OpenRun
 
 SHADE: dict[str, Any] = {"color": style.BLUE, "alpha": 0.3, "linewidth": 0.0, "zorder": 2.0}
 BAR: dict[str, Any] = {"color": style.BLUE, "linewidth": 2.2, "solid_capstyle": "butt", "zorder": 7.5}

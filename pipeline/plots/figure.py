@@ -18,16 +18,16 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from magpend_core.models.parameters import has_controls
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import place, select_points, snap
 from pipeline.layout.own_words import axis_in_own_words, rate_of
 from pipeline.layout.vocabulary import split_dims, told_by
 from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.plots.looks import DPI, LOCK, VECTORS
 from pipeline.plots.style import DataFigure, Frame
-from pipeline.products.figures import AnimationOptions
+from pipeline.products.diagrams import AnimationOptions
 from pipeline.products.product import FigureOptions, Options, function_of
 from pipeline.products.registry import FIGURES
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import place, select_points, snap
 from pipeline.specification.problems import unknown_name
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from pipeline.analysis.branches.levels import SAME
-from pipeline.analysis.points import POINT, level_name, read_points
-from pipeline.analysis.run import OpenRun
 from pipeline.layout.own_words import rate_of
 from pipeline.layout.vocabulary import axis_name, split_dims
 from pipeline.plots import labels, style
 from pipeline.plots.labels import Measure
+from pipeline.results.points import POINT, level_name, read_points
+from pipeline.results.run import OpenRun
+from pipeline.results.tolerances import SAME_LEVEL
 
 Level = tuple[tuple[str, float], ...]
 """Values of further swept parameters, by name."""
@@ -66,7 +66,10 @@ def by_level(points: xr.Dataset, levels: Levels) -> Iterator[tuple[np.ndarray, d
             has_level |= bool(values)
             if not values and len(colours) > 1:
                 continue
-            near = [np.isclose(points[told[name]].values, value, rtol=SAME, atol=0.0) for name, value in values.items()]
+            near = [
+                np.isclose(points[told[name]].values, value, rtol=SAME_LEVEL, atol=0.0)
+                for name, value in values.items()
+            ]
             own |= rest & np.all([rest, *near], axis=0)
             text = "".join(f", {name} = {value:g}" for name, value in values.items()) if len(colours) > 1 else ""
         if own.any():

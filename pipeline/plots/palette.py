@@ -20,10 +20,6 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.analysis import outcomes
-from pipeline.analysis.ragged import N_IDS, SET, is_ragged
-from pipeline.analysis.sets import rows_by_number
-from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import (
     ABSENT,
     ATTRACTS,
@@ -42,6 +38,10 @@ from pipeline.layout.vocabulary import (
     period_of,
 )
 from pipeline.plots import style
+from pipeline.results import outcomes
+from pipeline.results.ragged import N_IDS, SET, is_ragged
+from pipeline.results.sets import rows_by_number
+from pipeline.results.sides import classify
 
 MOTION_COLOURS = (
     style.BLUE,
@@ -108,7 +108,7 @@ GREYS = {
     "chatter": "#320836",
     "pending": "0.95",
 }
-"""Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`.
+"""Cells that do not end on an attractor, with their greys; see `pipeline.results.outcomes`.
 
 Three are tinted: between twelve colours there are not ten greys that can be told apart.
 """

@@ -10,17 +10,17 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import dense, dims_of, isel
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import place, select_points
 from pipeline.layout.vocabulary import model_of, section_name, split_dims
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import absent_handles, fixed_of, say_empty
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.plots.palette import Motions
 from pipeline.plots.points import View, make_view, survey
-from pipeline.products.figures import SectionOptions
+from pipeline.products.diagrams import SectionOptions
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import dense, dims_of, isel
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import place, select_points
 
 _MOST_PT, _LEAST_PT = 1.7, 0.45
 

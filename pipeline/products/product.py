@@ -269,7 +269,7 @@ class Analysis:
         Kinds of motion that its runs may have: ``"steady"``, ``"drifting"``, ``"noisy"``; see `pipeline.motion`.
     by_point : bool
         Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
-        results `pipeline.analysis.ragged.joined` joins.
+        results `pipeline.results.ragged.joined` joins.
     finish : str
         ``"module:function"`` or empty: ``finish(ds, options)`` completes the result of all parameter points by what
         needs them all.
@@ -332,6 +332,10 @@ class FigureOptions(Options):
         first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
         order = [*first, *(name for name in given if name not in first)]
         return "".join(f"_{_words(name, given[name])}" for name in order)
+
+    def label_without(self, name: str) -> str:
+        """Return the part of the figure's file name that lists the options, without one of them."""
+        return FigureOptions.label(self.model_copy(update={name: ""}))
 
 
 class StateOptions(FigureOptions):

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.selection import place
-from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import parameter_name, split_dims
 from pipeline.products.registry import ANALYSES
 from pipeline.report.estimates import Estimate, Results, absent
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.selection import place
+from pipeline.results.sides import classify
 from pipeline.runs.derive import shown_table
 from pipeline.specification.problems import SpecError, unknown_name
 

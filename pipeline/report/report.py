@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.analysis.events.names import RANGE_END
-from pipeline.analysis.outcomes import sentence
-from pipeline.analysis.tabular import axis_ranges, counted, distinct, leading, number
+from pipeline.analysis.spectrum.declaration import SpectrumOptions
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
 from pipeline.products.registry import ANALYSES, FIGURES
-from pipeline.products.spectrum import SpectrumOptions
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
+from pipeline.results.outcomes import sentence
+from pipeline.results.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.runs.derive import AnalysedRun, shown_table
 from pipeline.runs.drawing import figure
 from pipeline.runs.naming import in_own_words as options_in_own_words

@@ -45,7 +45,7 @@ def drawn(outcome: Outcome, name: str) -> DataFigure:
 
 def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
     """Return the fraction of torque curves whose single-curve fit reaches a coefficient of determination of ``r2``."""
-    from pipeline.analysis.intervals import binomial_interval
+    from pipeline.results.intervals import binomial_interval
 
     r2 = np.array([fit.quality.r2 for fit in outcome.curves])
     count = int((r2 >= options["r2"]).sum())
@@ -104,7 +104,7 @@ def _width(values: Mapping[str, float]) -> float:
 def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
     """Return the fraction of readings in which torque and distance from the transition angle have the same sign."""
     from magpend_core.models.pendulum import magnet_torque as laws
-    from pipeline.analysis.intervals import binomial_interval
+    from pipeline.results.intervals import binomial_interval
 
     m = outcome.measured
     line = laws.transition(outcome.joint.values)

@@ -22,8 +22,6 @@ from magpend_core.models import import_model
 from magpend_core.models.imported import origin
 from magpend_core.models.model import Model
 from magpend_core.precision import Precision
-from pipeline.analysis.ragged import isel, joined
-from pipeline.analysis.run import OpenRun
 from pipeline.compute import clients, execute
 from pipeline.compute.clients import Where
 from pipeline.compute.threads import writing_results
@@ -31,6 +29,8 @@ from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import report
+from pipeline.results.ragged import isel, joined
+from pipeline.results.run import OpenRun
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.versions import current, key_of
 from pipeline.specification.spec import Spec
@@ -48,7 +48,7 @@ PlacedRun = Any
 
 @dataclass(frozen=True)
 class Part:
-    """A run of which only a block of parameter points is analysed, see `pipeline.analysis.run.OpenRun`."""
+    """A run of which only a block of parameter points is analysed, see `pipeline.results.run.OpenRun`."""
 
     run: OpenRun
     block: Block

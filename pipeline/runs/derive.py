@@ -31,9 +31,9 @@ from magpend_core.precision import Precision
 from pipeline.layout.columns import described
 from pipeline.layout.conventions import conventional
 from pipeline.layout.own_words import in_own_words, rate_attribute, with_own_names, with_plain_names
-from pipeline.layout.vocabulary import overrides_attribute
+from pipeline.layout.vocabulary import model_attribute, overrides_attribute
 from pipeline.products.product import Analysis, Options, Table, function_of
-from pipeline.products.registry import ANALYSES, COMMANDS
+from pipeline.products.registry import ANALYSES
 from pipeline.runs.extend import refine
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
@@ -183,6 +183,7 @@ def derive(
     with bar_in_notebook():
         computed = _compute(run, analysis, wanted, can_keep=not why)
         others = {k: value for k, value in computed.attrs.items() if k not in key}
+        others.setdefault("model", model_attribute(run.model))
         complete = computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told})
         result = _kept(run, place, with_own_names(complete, analysis.columns))
     if is_chosen:
@@ -192,9 +193,11 @@ def derive(
 
 def shown_table(name: str, ds: xr.Dataset) -> Table:
     """Return the table of an analysis' result, in the words of the run's specification."""
-    from pipeline.analysis.tabular import shown
+    from pipeline.results.tabular import shown
 
-    return shown(in_own_words(ds), function_of(ANALYSES[name].table))
+    analysis, plain = ANALYSES[name], in_own_words(ds)
+    order = [column.name for column in analysis.columns if column.name in plain.data_vars]
+    return shown(plain[[*order, *(n for n in plain.data_vars if n not in order)]], function_of(analysis.table))
 
 
 def analyses_in(text: str) -> list[str]:
@@ -207,8 +210,8 @@ def analyses_in(text: str) -> list[str]:
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
-        if name not in COMMANDS:
-            raise SpecError(f"--analyse: {unknown_name('analysis', name, COMMANDS)}")
+        if name not in ANALYSES.listed:
+            raise SpecError(f"--analyse: {unknown_name('analysis', name, ANALYSES.listed)}")
         validated(ANALYSES[name].options, {})
     return names
 

@@ -23,7 +23,7 @@ from pipeline.layout.vocabulary import (
     parameters_of,
     start_dims,
 )
-from pipeline.products.figures import AnimationOptions
+from pipeline.products.diagrams import AnimationOptions
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun, Echo, Source, refused
 from pipeline.runs.instants import RTOL, Moving
@@ -79,7 +79,7 @@ def animation(
     source
         Run directory, or an opened run; None for a start without one.
     options, more
-        Options of `pipeline.products.figures.AnimationOptions` that differ from the defaults.
+        Options of `pipeline.products.diagrams.AnimationOptions` that differ from the defaults.
     attractors
         Letters of attractors of the run. By default, without `cells` and `start`, all attractors at the
         parameter point.
@@ -195,11 +195,11 @@ def of_attractors(
     SpecError
         If the run does not have the point, or an attractor does not exist there.
     """
-    from pipeline.analysis.ragged import dense
-    from pipeline.analysis.selection import choose
-    from pipeline.analysis.selection import start_dims as dims_of_starts
     from pipeline.plots import palette
     from pipeline.plots.figure import values_of
+    from pipeline.results.ragged import dense
+    from pipeline.results.selection import choose
+    from pipeline.results.selection import start_dims as dims_of_starts
 
     with refused(run.name):
         at, notes = values_of(run, options)
@@ -390,8 +390,8 @@ def point_of_run(run: AnalysedRun, options: AnimationOptions) -> tuple[Parameter
     SpecError
         If several points are left, or the run does not have the point.
     """
-    from pipeline.analysis.selection import select_points
     from pipeline.plots.figure import values_of
+    from pipeline.results.selection import select_points
 
     _refuse(run)
     cube = run.cube()

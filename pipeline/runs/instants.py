@@ -11,7 +11,7 @@ import numpy as np
 
 from magpend_core.models.sectioned import of_flow
 from pipeline.layout.vocabulary import model_attribute, section_attributes
-from pipeline.products.figures import MOST_FRAMES, AnimationOptions
+from pipeline.products.diagrams import MOST_FRAMES, AnimationOptions
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 
 from magpend_core.versions import ENGINE
-from pipeline.products.attractors import AttractorOptions
+from pipeline.analysis.attractors.declaration import AttractorOptions
 from pipeline.products.product import Analysis, Options
 from pipeline.products.registry import ANALYSES
 from pipeline.store.errors import DamagedError

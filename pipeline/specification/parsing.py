@@ -16,7 +16,7 @@ from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import Preset, is_file
 from magpend_core.models.text.reading import KINDS as MODEL_KINDS
 from pipeline.products.product import Options
-from pipeline.products.registry import CELL_PRODUCTS, COMMANDS, FIGURES
+from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, FIGURES
 from pipeline.specification import drift as moving
 from pipeline.specification.files import IDENTIFICATION, odd_data, with_text
 from pipeline.specification.models import A_MODEL, add_model, stand_in
@@ -210,7 +210,7 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
 
 def _no_product(path: str, name: str) -> str:
     """Return the message for a name that is no product of cells; analyses and figures are made of a finished run."""
-    for products, command in ((COMMANDS, "analyse"), (FIGURES, "plot")):
+    for products, command in ((ANALYSES.listed, "analyse"), (FIGURES, "plot")):
         if name in products:
             return f"{path}: is made of a finished run; drop it here, and use magpend {command} {name}."
     return unknown_key(path, name, CELL_PRODUCTS)

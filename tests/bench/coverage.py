@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.analysis.branches.bands import bifurcation_data
 from pipeline.analysis.branches.carrying import OrbitData, Solution, settled, solve
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF
-from pipeline.analysis.draws import LEVELS
+from pipeline.results.draws import LEVELS
 from pipeline.rig.identify.build import build
 from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.measured_orbits import read_orbits

@@ -24,7 +24,7 @@ import numpy as np
 from magpend_core import Crossing, load_model, sections
 from pipeline.analysis.attractors.extension.clouds import OTHER, group, mixing
 from pipeline.analysis.attractors.extension.extending import LEAST_STAY
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 UEDA = {
     "name": "ueda",

@@ -83,7 +83,7 @@ def _time_limit(seconds: float) -> Iterator[None]:
 def analysed(data: Mapping[str, Any], folder: Path) -> tuple[Any, list[dict[str, Any]]]:
     """Run a specification and find its attractors; returns the analysis' dataset and the table's rows."""
     from pipeline.analysis.attractors.analysis import attractors_table
-    from pipeline.analysis.ragged import dense
+    from pipeline.results.ragged import dense
     from pipeline.runs.derive import derive
     from pipeline.runs.run import run
 
@@ -94,8 +94,8 @@ def analysed(data: Mapping[str, Any], folder: Path) -> tuple[Any, list[dict[str,
 
 def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]], units: Units | None = None) -> Verdict:
     """Judge the rows of all parameter points of a run, whose numbers may have other units."""
-    from pipeline.analysis.sets import Geometry
     from pipeline.layout.vocabulary import model_of, split_dims
+    from pipeline.results.sets import Geometry
 
     model = model_of(ds)
     units = units or plain_units(model.state_names)

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.outcomes import other_cells, sentence, share_interval, shares_of_others
-from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, places_of_rows, row_of_cells
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import (
+from pipeline.analysis.attractors.declaration import AttractorOptions, IdentifyOptions
+from pipeline.layout.small_states import small_states
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims, time_unit
+from pipeline.products.product import Table
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.outcomes import other_cells, sentence, share_interval, shares_of_others
+from pipeline.results.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, places_of_rows, row_of_cells
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import (
     FEW_POINTS,
     FRACTION,
     Row,
@@ -33,10 +37,6 @@ from pipeline.analysis.tabular import (
     with_interval,
     words_of,
 )
-from pipeline.layout.small_states import small_states
-from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims, time_unit
-from pipeline.products.attractors import AttractorOptions, IdentifyOptions
-from pipeline.products.product import Table
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model

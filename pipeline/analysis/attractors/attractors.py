@@ -18,7 +18,7 @@ Schema
 parameter point, in the order of the points), ``sample``, ``transition``, ``state``, ``multiplier``, and the
 dim of the model's angles. Coordinates are those of the cube, and ``attractor`` (set), the id. `ragged` reads rows.
 
-`pipeline.products.attractors` lists the variables.
+`pipeline.analysis.attractors.declaration` lists the variables.
 
 `attractor_points` holds an orbit's points in the order of time, or a sample of any other set. A model
 without angles, classifier, energy or symmetry lacks the variables that need it. For a polished orbit, ranges
@@ -59,6 +59,7 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
 from magpend_core.precision import Precision
+from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
@@ -67,13 +68,12 @@ from pipeline.analysis.attractors.finding.requests import Settings, answer_all
 from pipeline.analysis.attractors.finding.searching import Search
 from pipeline.analysis.attractors.labelling import Found, analyse, follow
 from pipeline.analysis.attractors.matching import match
+from pipeline.analysis.chaos.declaration import ChaosOptions
 from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
-from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, index_of_rows
-from pipeline.analysis.sides import flags_of
-from pipeline.analysis.tolerances import CLOSURE
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, DECISIONS, EVIDENCE, KINDS, STABILITIES, split_dims
-from pipeline.products.attractors import IdentifyOptions
-from pipeline.products.chaos import ChaosOptions
+from pipeline.results.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, index_of_rows
+from pipeline.results.sides import flags_of
+from pipeline.results.tolerances import CLOSURE
 
 __all__ = ["identify", "match"]
 

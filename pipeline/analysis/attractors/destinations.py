@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.status import Status
+from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.extension.clouds import INSIDE, REACHED, Cloud, members
 from pipeline.analysis.attractors.extension.courses import DIVERGED as COURSE_DIVERGED
 from pipeline.analysis.attractors.extension.courses import Course, rest_number
@@ -27,12 +28,11 @@ from pipeline.analysis.attractors.finding.points import Dynamics, Point
 from pipeline.analysis.attractors.finding.requests import LEG, Settings, answer_all
 from pipeline.analysis.attractors.finding.spirals import keys_of
 from pipeline.analysis.attractors.flight import Flight
-from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.ragged import dense, isel
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import CLOSURE
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT, split_dims
-from pipeline.products.attractors import IdentifyOptions
+from pipeline.results.outcomes import DIVERGED
+from pipeline.results.ragged import dense, isel
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import CLOSURE
 
 UNDECIDED, ELSEWHERE = -1, -3
 """Labels of trajectories that end on no known attractor: undecided, and on an attractor that no cell shows."""

@@ -29,10 +29,10 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
 from pipeline.analysis.flown import flown
-from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, order_of_points, rows_by_number
-from pipeline.analysis.sides import UNKNOWN
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, samples_per_period
+from pipeline.results.sets import TWO_PI, Geometry, hashes, mean_distance, order_of_points, rows_by_number
+from pipeline.results.sides import UNKNOWN
+from pipeline.results.tolerances import PORTRAIT_RTOL
 
 ENERGY = "energy"
 """Name of the model's quantity whose range is computed for each attractor."""

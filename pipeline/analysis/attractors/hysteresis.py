@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import (
+from pipeline.analysis.attractors.declaration import HysteresisOptions
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import parameter_name
+from pipeline.products.product import Table
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import dense
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import (
     Row,
     Words,
     aligned,
@@ -26,10 +30,6 @@ from pipeline.analysis.tabular import (
     values,
     words_of,
 )
-from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import parameter_name
-from pipeline.products.attractors import HysteresisOptions
-from pipeline.products.product import Table
 
 
 def find_hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:

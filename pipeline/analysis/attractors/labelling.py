@@ -29,10 +29,6 @@ from pipeline.analysis.attractors.finding.probing import is_approaching, probe_e
 from pipeline.analysis.attractors.finding.requests import Slopes, Work
 from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.finding.spirals import keys_of
-from pipeline.analysis.intervals import lifetime_interval
-from pipeline.analysis.sets import Geometry, looked_up, order_by_points, rows_by_number
-from pipeline.analysis.sides import UNKNOWN
-from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 from pipeline.layout.vocabulary import (
     APPROACHING,
     AT_REST,
@@ -48,6 +44,10 @@ from pipeline.layout.vocabulary import (
     SAME_SET,
     UNDECIDED,
 )
+from pipeline.results.intervals import lifetime_interval
+from pipeline.results.sets import Geometry, looked_up, order_by_points, rows_by_number
+from pipeline.results.sides import UNKNOWN
+from pipeline.results.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 
 MOST_PROBES = 8
 """Most degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories."""

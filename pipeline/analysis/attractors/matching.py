@@ -38,10 +38,10 @@ from magpend_core.ordering import SAME_DIGITS
 from pipeline.analysis.branches.connecting import Web, connect
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.sheets import GOING, OPEN, UNTRIED, Axis, Grid
-from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, point_of_rows, points_of_rows, rows_at, take
-from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
 from pipeline.layout.vocabulary import PERIODIC_ORBIT, frequency_of, model_of, parameters_of
 from pipeline.products.reporting import track
+from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, point_of_rows, points_of_rows, rows_at, take
+from pipeline.results.sets import Geometry, mean_distance, order_by_points
 
 BASES = ("absent", "first_appearance", "branch", "doubling", "distance")
 """Meanings of `match_basis`."""

@@ -13,10 +13,10 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
-from pipeline.analysis.ragged import dense
-from pipeline.analysis.selection import choose, start_dims
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import APERIODIC, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, told_by
+from pipeline.results.ragged import dense
+from pipeline.results.selection import choose, start_dims
+from pipeline.results.tolerances import PORTRAIT_RTOL
 
 
 def portraits(

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.ragged import SET, dims_of
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, at_point, header_of, number, plain, sets_of, values
 from pipeline.layout.vocabulary import APERIODIC, model_of, periods_of
 from pipeline.products.product import Options, Table
+from pipeline.results.ragged import SET, dims_of
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, at_point, header_of, number, plain, sets_of, values
 
 VARIABLES = (
     "kind",

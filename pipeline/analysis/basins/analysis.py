@@ -9,13 +9,17 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.basins.boundaries import basin_entropy, box_sides, epsilons_of, uncertainty_exponent
+from pipeline.analysis.basins.declaration import OTHERS, BasinOptions
 from pipeline.analysis.basins.numbers import basin_rows
 from pipeline.analysis.basins.wada import wada_merge_test
-from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.outcomes import DIVERGED, other_cells, outcomes, told
-from pipeline.analysis.ragged import dims_of, places_of_rows
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import (
+from pipeline.layout import vocabulary
+from pipeline.layout.vocabulary import letter, split_dims
+from pipeline.products.product import Table
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.outcomes import DIVERGED, other_cells, outcomes, told
+from pipeline.results.ragged import dims_of, places_of_rows
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import (
     FEW_POINTS,
     FRACTION,
     Row,
@@ -28,10 +32,6 @@ from pipeline.analysis.tabular import (
     summary,
     with_interval,
 )
-from pipeline.layout import vocabulary
-from pipeline.layout.vocabulary import letter, split_dims
-from pipeline.products.basins import OTHERS, BasinOptions
-from pipeline.products.product import Table
 
 
 def needs_starts(run: OpenRun, options: BasinOptions) -> None:
@@ -184,7 +184,7 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
     ids
         Result of `match` or `identify` for the cube.
     options
-        By default the defaults of `BasinOptions`. See `pipeline.analysis.intervals.binomial_interval` for the
+        By default the defaults of `BasinOptions`. See `pipeline.results.intervals.binomial_interval` for the
         intervals, `boundaries.basin_entropy` for the boxes, `boundaries.uncertainty_exponent` for the scaling, and
         `wada.wada_merge_test` for radius and metric.
     changes
@@ -194,7 +194,7 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
     -------
     Dataset
         On the cells: `attractor_id`, `decision`, `status`, `n_periods`, and `outcome`, the attractor that a
-        cell ends on, -2 where it diverged, -1 else (`pipeline.analysis.outcomes`). One row (`pipeline.analysis.ragged`)
+        cell ends on, -2 where it diverged, -1 else (`pipeline.results.outcomes`). One row (`pipeline.results.ragged`)
         for each outcome of cells at each parameter point, with `attractor`, the id or -2: the variables of
         `numbers.basin_rows`, in which cells without an outcome count as unfinished. On the
         parameter dims the number of the latter by reason, such as `n_not_settled` and `n_no_return` (`OTHERS`);

@@ -16,8 +16,8 @@ from scipy import special
 
 from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_exponent
 from pipeline.analysis.basins.wada import wada_merge_test
-from pipeline.analysis.intervals import Interval, binomial_interval
-from pipeline.analysis.ragged import ROW_SIZE, SET
+from pipeline.results.intervals import Interval, binomial_interval
+from pipeline.results.ragged import ROW_SIZE, SET
 
 __all__ = ["basin_entropy", "basin_rows", "binomial_interval", "uncertainty_exponent", "wada_merge_test"]
 
@@ -43,12 +43,12 @@ def basin_rows(
     confidence
         Two-sided level of the intervals, one-sided level of the `unseen` bounds.
     method
-        See `pipeline.analysis.intervals.binomial_interval`.
+        See `pipeline.results.intervals.binomial_interval`.
 
     Returns
     -------
     Dataset
-        Rows (`pipeline.analysis.ragged`) with the outcome as `attractor`, and `n_sets`, their number at each point. In
+        Rows (`pipeline.results.ragged`) with the outcome as `attractor`, and `n_sets`, their number at each point. In
         each row: `count`, and `n_inferred` of them; `fraction` of all cells, with `low` and `high`;
         `fraction_if_all`, the fraction if all unfinished cells belonged to the outcome, and `high_if_all`, the upper
         end of its interval. At each point: `n_cells`, `n_unfinished`,

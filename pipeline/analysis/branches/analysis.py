@@ -11,6 +11,7 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.completeness import counted_lines, searched_lines
+from pipeline.analysis.branches.declaration import COEFFICIENTS, BranchOptions, CurveOptions
 from pipeline.analysis.branches.kinds import (
     BRANCH_POINTS,
     BRANCHING,
@@ -22,12 +23,11 @@ from pipeline.analysis.branches.kinds import (
     LIMITS,
     PITCHFORK,
 )
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values
 from pipeline.layout.own_words import RATE, axis_in_own_words, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
-from pipeline.products.branches import COEFFICIENTS, BranchOptions, CurveOptions
 from pipeline.products.product import Table
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.tables import FREQUENCY
 

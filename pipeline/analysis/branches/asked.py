@@ -16,15 +16,15 @@ from magpend_core.models.text.intervals import Rates
 from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at
 from pipeline.analysis.branches.boxes import Box, enclose_equilibria, search_equilibria
+from pipeline.analysis.branches.declaration import BranchOptions, StartOptions
 from pipeline.analysis.branches.deflation import orbit_near
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.searching import family_at, rows_of, where_variables
-from pipeline.analysis.run import OpenRun
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import axis_in_own_words
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
-from pipeline.products.branches import BranchOptions, StartOptions
+from pipeline.results.run import OpenRun
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.tables import FREQUENCY
 

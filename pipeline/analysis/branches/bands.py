@@ -30,15 +30,15 @@ from pipeline.analysis.branches.carrying import (
     settled,
     solve,
 )
+from pipeline.analysis.branches.declaration import BandOptions, BranchOptions
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, TORUS
 from pipeline.analysis.branches.problems import FREQUENCY
-from pipeline.analysis.draws import LEVELS, interval_of
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import aligned, words_of
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
-from pipeline.products.branches import BandOptions, BranchOptions
 from pipeline.products.product import Table
 from pipeline.products.reporting import report
+from pipeline.results.draws import LEVELS, interval_of
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import aligned, words_of
 from pipeline.specification.problems import SpecError
 
 GRID = 41

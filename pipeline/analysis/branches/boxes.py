@@ -24,7 +24,7 @@ from magpend_core.equilibria import find_equilibria, newton_steps
 from magpend_core.models.text.intervals import Rates
 from magpend_core.orbits import scaled_distance, wrap_angles
 from pipeline.analysis.branches.deflation import ITERATIONS, LONGEST_STEP, ROUNDS, FoundOrbit, stretch
-from pipeline.analysis.tolerances import SAME_ON_BRANCH
+from pipeline.results.tolerances import SAME_ON_BRANCH
 
 BATCH, MOST_BOXES = 2048, 300_000
 """Boxes that are looked at together, and in all; what is left then is not decided."""

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.tabular import Row, aligned, counted, words_of
 from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import parameter_name
+from pipeline.results.tabular import Row, aligned, counted, words_of
 from pipeline.specification.tables import FREQUENCY
 
 _VERDICTS = {

@@ -26,8 +26,8 @@ from scipy.sparse import csr_array
 from magpend_core.ordering import canonical_order
 from pipeline.analysis.branches.sheets import ENDED, GOING, LONGEST, NEAR, OPEN, UNTRIED, Array, Grid, Orbits, Values
 from pipeline.analysis.branches.strobe import other_side
-from pipeline.analysis.tolerances import SAME_CONNECTED
 from pipeline.products.reporting import report
+from pipeline.results.tolerances import SAME_CONNECTED
 
 SHORTEST, LEAST_STEPS = 2.0**-13, 16
 """Step at which following ends [ranges of the axis]; it is shorter where `LEAST_STEPS` of them exceed the way."""

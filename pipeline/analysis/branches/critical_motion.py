@@ -18,7 +18,7 @@ from magpend_core.pointwise import rates_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.problems import Rows
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 
 @dataclass(frozen=True)

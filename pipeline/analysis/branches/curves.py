@@ -59,9 +59,9 @@ from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, DOUBLIN
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
-from pipeline.analysis.tabular import plain
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import frequency_of, model_attribute, parameter_name, section_attributes
+from pipeline.results.tabular import plain
 
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Settings with longer steps than on a branch, since nothing is located in between. The residual includes the

@@ -21,16 +21,16 @@ from pipeline.analysis.branches.bifurcations import (
     eigenvalues_of,
     multipliers_of,
 )
+from pipeline.analysis.branches.declaration import BRANCH_COLUMNS
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.images import images_of
 from pipeline.analysis.branches.kinds import HOPF, KINDS
 from pipeline.analysis.branches.limits import cut_ends
-from pipeline.analysis.branches.problems import FREQUENCY, parameter_units
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import model_attribute, section_attributes
-from pipeline.products.branches import BRANCH_COLUMNS
+from pipeline.layout.vocabulary import model_attribute, parameter_units, section_attributes
 from pipeline.products.reporting import track
+from pipeline.results.tolerances import BRANCH_RTOL
 
 CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
 

@@ -22,8 +22,8 @@ import numpy as np
 from magpend_core.engine.system import System
 from magpend_core.orbits import polish_orbits, scaled_distance, section_map, wrap_angles
 from magpend_core.pointwise import rates_at
-from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_EQUILIBRIUM, SAME_ON_BRANCH
 from pipeline.products.reporting import report
+from pipeline.results.tolerances import BRANCH_RTOL, SAME_EQUILIBRIUM, SAME_ON_BRANCH
 
 WIDER, WIDEST = 1.5, 10.0
 """Sides of the least and the largest box of random starts, in units of that which the states seen span: orbits that no

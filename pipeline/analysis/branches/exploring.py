@@ -39,7 +39,7 @@ from pipeline.analysis.branches.limits import settle_limits
 from pipeline.analysis.branches.lockstep import Steps, run_alone, run_together
 from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import Family, OrbitProblem
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 AT_HOPF = 0.05
 """Largest scaled distance of the last cycle of a branch from the Hopf point at which it ends."""

@@ -33,7 +33,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct, kerne
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Rows, Value
 from pipeline.analysis.branches.steep_orbits import flown
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 SETTINGS = Settings(first_step=5e-3, longest_step=0.04, max_points=400, tolerance=1e-9, max_iterations=8)
 """Settings of the continuation; Newton's method mostly ends far below the tolerance."""

@@ -49,8 +49,8 @@ from pipeline.analysis.branches.homoclinic import (
 from pipeline.analysis.branches.kinds import HOMOCLINIC, SNIC
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.tabular import words_of
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tabular import words_of
+from pipeline.results.tolerances import BRANCH_RTOL
 
 HETEROCLINIC = "heteroclinic"
 """End of a curve of homoclinic orbits near another equilibrium."""

@@ -13,7 +13,7 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.bifurcations import SAME_PLACE, Bifurcation
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 Located = tuple[Family, Bifurcation]
 """A bifurcation with the family of its orbit."""

@@ -17,7 +17,7 @@ from pipeline.analysis.branches.following import Branch, problem_of
 from pipeline.analysis.branches.kinds import FOLD
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.tolerances import SAME_ON_BRANCH
+from pipeline.results.tolerances import SAME_ON_BRANCH
 
 GUESS = 0.05
 """Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""

@@ -9,10 +9,8 @@ import xarray as xr
 
 from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.layout.vocabulary import axis_name, parameter_name
+from pipeline.results.tolerances import SAME_LEVEL
 from pipeline.specification.problems import SpecError, unknown_name
-
-SAME = 1e-6
-"""Largest relative difference of two values of a parameter that count as one, as for values on an axis."""
 
 
 def at_levels(ds: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
@@ -51,7 +49,7 @@ def levels_of_bifurcations(ds: xr.Dataset) -> list[dict[str, float]]:
     """Return for each bifurcation of the analysis ``sensitivities`` the parameters that differ among them, by name."""
     values = ds["parameter_value"].values
     low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
-    differ = np.flatnonzero(high - low > SAME * np.maximum(np.abs(low), np.abs(high)))
+    differ = np.flatnonzero(high - low > SAME_LEVEL * np.maximum(np.abs(low), np.abs(high)))
     names = [parameter_name(str(name)) for name in ds["parameter"].values]
     return [{names[i]: float(one[i]) for i in differ} for one in values]
 
@@ -77,7 +75,7 @@ def _kept(levels: Sequence[Mapping[str, float]], at: Mapping[str, float], along:
             others = sorted({n for level in levels for n in level})
             raise SpecError(unknown_name("axis that stays fixed", name, others) + f" {name} is the axis of the figure.")
         own = {level[name] for level in levels if name in level}
-        near = {v for v in own if abs(v - value) <= SAME * max(abs(v), abs(value))}
+        near = {v for v in own if abs(v - value) <= SAME_LEVEL * max(abs(v), abs(value))}
         if own and not near:
             there = ", ".join(f"{v:.10g}" for v in sorted(own))
             raise SpecError(f"at {name} = {value:.10g}: there is no {what}; there are some at {name} = {there}.")

@@ -32,8 +32,8 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.following import Branch, Limit, grows_without_bound, leading_of, opposite, problem_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.vocabulary import parameter_name
+from pipeline.results.tolerances import BRANCH_RTOL
 
 NEAR = 0.05
 """Largest distance of an equilibrium that is near to an orbit, in units of the orbit's size."""

@@ -12,8 +12,8 @@ from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from pipeline.analysis import together
 from pipeline.analysis.branches.problems import Ends, Problem, Rows, Value
-from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.products.reporting import report
+from pipeline.results.tolerances import BRANCH_RTOL
 
 
 @dataclass(frozen=True)

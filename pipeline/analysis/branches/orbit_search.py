@@ -10,6 +10,7 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from pipeline.analysis.branches.asked import has_equilibria, start_problems
+from pipeline.analysis.branches.declaration import OrbitOptions
 from pipeline.analysis.branches.deflation import (
     FoundOrbit,
     coverage,
@@ -21,12 +22,11 @@ from pipeline.analysis.branches.deflation import (
     starts_around,
 )
 from pipeline.analysis.branches.starting_orbits import parameters_at, sections_of
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
-from pipeline.analysis.tabular import Row, Words, aligned, counted, state_columns
 from pipeline.layout.vocabulary import model_attribute, model_of, parameters_of, section_attributes, split_dims
-from pipeline.products.branches import OrbitOptions
 from pipeline.products.product import Table
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import select_points
+from pipeline.results.tabular import Row, Words, aligned, counted, state_columns
 from pipeline.specification.problems import SpecError
 
 

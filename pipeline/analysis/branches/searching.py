@@ -29,10 +29,10 @@ from pipeline.analysis.branches.deflation import (
 )
 from pipeline.analysis.branches.following import Branch
 from pipeline.analysis.branches.known import Start, chords_at, same_others
-from pipeline.analysis.branches.problems import Family, parameter_units
+from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at, sections_of
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, split_dims
+from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, parameter_units, split_dims
 
 STARTS = (100, 400)
 """Starts per period: of the search, and of a second one where the sum of the indices shows that orbits are missing."""

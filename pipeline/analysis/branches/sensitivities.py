@@ -20,17 +20,17 @@ from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of, settle_branches
 from pipeline.analysis.branches.bands import digest_of_draws, draws_of, moving_of
+from pipeline.analysis.branches.declaration import BranchOptions, SensitivityOptions
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, LABELS
 from pipeline.analysis.branches.lockstep import integrated
-from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test, parameter_units
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, values, words_of
-from pipeline.analysis.tolerances import NO_INFLUENCE
+from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import axis_name, frequency_of, parameter_name, parameters_of
-from pipeline.products.branches import BranchOptions, SensitivityOptions
+from pipeline.layout.vocabulary import axis_name, frequency_of, parameter_name, parameter_units, parameters_of
 from pipeline.products.product import Table
 from pipeline.products.reporting import track
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, counted, plain, values, words_of
+from pipeline.results.tolerances import NO_INFLUENCE
 from pipeline.specification.problems import SpecError, unknown_name
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from pipeline.analysis.branches.problems import ONE_SIDED_STEP
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import CONNECT_RTOL, SAME_CONNECTED
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import CONNECT_RTOL, SAME_CONNECTED
 
 Array = np.ndarray
 

@@ -15,10 +15,10 @@ from magpend_core.orbits import scaled_distance
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.ragged import points_of_rows
-from pipeline.analysis.tabular import sets_of
-from pipeline.analysis.tolerances import RECURRENCE
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameter_name, split_dims
+from pipeline.results.ragged import points_of_rows
+from pipeline.results.tabular import sets_of
+from pipeline.results.tolerances import RECURRENCE
 
 TRIES = 16
 """Most recurrences tried per period."""

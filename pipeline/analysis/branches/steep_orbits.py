@@ -30,7 +30,7 @@ from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.lockstep import Query, Steps, integrated
 from pipeline.analysis.branches.problems import ONE_SIDED_STEP, Ends, Family, Rows, Value
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 
 @dataclass(frozen=True)

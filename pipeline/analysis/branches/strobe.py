@@ -14,7 +14,7 @@ from magpend_core.engine.system import System
 from magpend_core.orbits import crossed_state, scaled_distance, wrap_angles
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 SHARES = (1e-5, 1e-4, 1e-3, 1e-2)
 """Distances in time of the states from the section, in drive periods, tried in turn: the impact lies nearer to it."""

@@ -20,6 +20,7 @@ from pipeline.analysis.branches.analysis import interval_of, swept_axis, windows
 from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.declaration import TongueOptions
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.following import Branch, problem_of
 from pipeline.analysis.branches.kinds import FOLD, KINDS
@@ -27,15 +28,14 @@ from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
-from pipeline.analysis.tabular import Row as TableRow
-from pipeline.analysis.tabular import Words, aligned, counted, number
-from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of, split_dims
-from pipeline.products.branches import TongueOptions
 from pipeline.products.product import Table
 from pipeline.products.rotation import RotationFlag
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import select_points
+from pipeline.results.tabular import Row as TableRow
+from pipeline.results.tabular import Words, aligned, counted, number
+from pipeline.results.tolerances import BRANCH_RTOL
 from pipeline.specification.problems import SpecError
 
 BISECTIONS = 26

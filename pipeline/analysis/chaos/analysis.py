@@ -15,15 +15,19 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.chaos.declaration import ChaosOptions, DimensionOptions
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import Motion, is_closed, motion_attrs, summarise
 from pipeline.analysis.chaos.per_attractor import Nature, chaos_per_attractor, pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
 from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
-from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
-from pipeline.analysis.tabular import (
+from pipeline.layout.conventions import code_flags
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, model_of, period_of, split_dims, time_unit
+from pipeline.products.product import Table
+from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import select_points
+from pipeline.results.tabular import (
     FEW_POINTS,
     Row,
     Words,
@@ -41,10 +45,6 @@ from pipeline.analysis.tabular import (
     with_error,
     with_interval,
 )
-from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, model_of, period_of, split_dims, time_unit
-from pipeline.products.chaos import ChaosOptions, DimensionOptions
-from pipeline.products.product import Table
 
 _FLAGS = {
     "n_transient": "transient",
@@ -394,7 +394,7 @@ def section_dimension(
     Returns
     -------
     Dataset
-        Rows of sets, see `pipeline.analysis.ragged`: the variables of
+        Rows of sets, see `pipeline.results.ragged`: the variables of
         `pipeline.analysis.chaos.dimensions.correlation_dimension`; `n_cells`, `share`, `kind`; `reason`, the
         reason why there is no dimension (`REASONS`); `stability`, `n_sampled`, `n_left`, `lifetime_low` of
         `identify`.

@@ -15,10 +15,10 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.analysis.chaos.section_samples import Floats, at_least, computed, geometry_of, with_coords
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import SAME_POINT
 from pipeline.products.lyapunov import LyapunovFlag
 from pipeline.products.reporting import track
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import SAME_POINT
 
 
 def kaplan_yorke_dimension(

@@ -6,7 +6,7 @@ Rows of sets on the dim ``set``, as in `pipeline.analysis.attractors.attractors`
 many as there are states; ``multiplier``. Variables, beside the copies of ``kind``, ``orbit_period``,
 ``n_cells``, ``share``, ``multiplier_real``, ``multiplier_imag``, ``stability``, ``evidence``:
 
-`pipeline.products.chaos` lists the variables.
+`pipeline.analysis.chaos.declaration` lists the variables.
 
 A polished orbit's exponents are the logarithms of its Floquet multipliers over its period. They are complete
 and free of sampling errors, whether the cube has exponents or not. A bounded set's exponents are means over
@@ -26,10 +26,10 @@ import numpy.typing as npt
 import xarray as xr
 
 from magpend_core.orbits import orbit_exponents
+from pipeline.analysis.chaos.declaration import ChaosOptions
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of
-from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     APERIODIC,
@@ -43,8 +43,8 @@ from pipeline.layout.vocabulary import (
     model_of,
     split_dims,
 )
-from pipeline.products.chaos import ChaosOptions
 from pipeline.products.lyapunov import LyapunovFlag
+from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 
 CHAOTIC_K, REGULAR_K = 0.9, 0.1
 """Least median of K that shows chaos, and largest that shows order, by the 0-1 test alone."""

@@ -10,10 +10,10 @@ import numpy.typing as npt
 import xarray as xr
 
 from magpend_core.status import Status
-from pipeline.analysis.sets import Geometry
+from pipeline.analysis.chaos.declaration import CHAOS_COLUMNS, DIMENSION_COLUMNS
 from pipeline.layout.columns import described
 from pipeline.layout.vocabulary import model_of
-from pipeline.products.chaos import CHAOS_COLUMNS, DIMENSION_COLUMNS
+from pipeline.results.sets import Geometry
 
 Floats = npt.NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import xarray as xr
 from scipy import fft
 
 from pipeline.analysis.chaos.section_samples import Floats, at_least, computed, geometry_of, with_coords
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import SAME_POINT
 from pipeline.products.reporting import report
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import SAME_POINT
 
 BUDGET = 64 * 2**20
 """Most memory of a step of the 0-1 test [bytes]."""

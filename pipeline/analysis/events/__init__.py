@@ -19,5 +19,5 @@ an attractor has one kind and period) and ``end``: the first and the last value 
 a graph, whose edges are the events: ``stretch_of`` leads to each ``to_stretch``. Ends at one bifurcation are one event,
 see ``same_as``.
 
-`pipeline.products.events` lists the variables.
+`pipeline.analysis.events.declaration` lists the variables.
 """

@@ -11,11 +11,13 @@ import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.analysis import settle_branches, swept_axis
+from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.analysis.branches.kinds import FOLD, KINDS, SNIC
 from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises
 from pipeline.analysis.events.dataset import dataset_of
+from pipeline.analysis.events.declaration import EventOptions
 from pipeline.analysis.events.grazing import grazing_of
 from pipeline.analysis.events.lines import (
     AT_BRANCH_POINT,
@@ -37,11 +39,6 @@ from pipeline.analysis.events.one_event import are_mirrored, is_at_one_value, on
 from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
 from pipeline.analysis.events.scene import Event, Scene, Stretch
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import isel, points_of_rows, rows_at
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import choose, select_points, start_dims
-from pipeline.analysis.tabular import plain
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     EQUILIBRIUM,
@@ -54,8 +51,11 @@ from pipeline.layout.vocabulary import (
     parameters_of,
 )
 from pipeline.layout.vocabulary import KINDS as SETS
-from pipeline.products.branches import BranchOptions
-from pipeline.products.events import EventOptions
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import isel, points_of_rows, rows_at
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import choose, select_points, start_dims
+from pipeline.results.tabular import plain
 
 _AT_EVEN_TIMES = "a limit cycle seen at even times has no branch; see it at crossings: [section] of a new run"
 

@@ -23,8 +23,8 @@ from pipeline.analysis.events.contact import SectionMap, map_along
 from pipeline.analysis.events.lines import at
 from pipeline.analysis.events.names import BREAKUP, UNDECIDED
 from pipeline.analysis.events.scene import Event, Scene, Stretch
-from pipeline.analysis.ragged import points_of_rows
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
+from pipeline.results.ragged import points_of_rows
 
 VALUES, ROUNDS = 15, 3
 """Further values in each round, and rounds, each between the last torus and the first chaotic set of the one before."""

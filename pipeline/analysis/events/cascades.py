@@ -11,8 +11,8 @@ import xarray as xr
 from pipeline.analysis.branches.kinds import DOUBLING, KINDS, TORUS
 from pipeline.analysis.events.lines import Fate, at
 from pipeline.analysis.events.names import CASCADE
-from pipeline.analysis.sets import Geometry, mean_distance
-from pipeline.analysis.tabular import words_of
+from pipeline.results.sets import Geometry, mean_distance
+from pipeline.results.tabular import words_of
 
 DELTA = 4.669201609
 """Feigenbaum's constant: the limit of the ratio of successive intervals between doublings of smooth maps."""

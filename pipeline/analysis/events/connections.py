@@ -39,7 +39,7 @@ from pipeline.analysis.events.contact import (
     sample_of,
 )
 from pipeline.analysis.events.transients import ALL, FEWEST_ESCAPES, FEWEST_LIFETIMES, Place
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 RETURNS, PER_RETURN = 64, 64
 """Returns of each trajectory on which passages of an equilibrium are looked for, and states of each."""

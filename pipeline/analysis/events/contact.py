@@ -30,8 +30,8 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.problems import Family, Rows
 from pipeline.analysis.events.scene import Scene
-from pipeline.analysis.sets import Geometry, nearest_distances
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
+from pipeline.results.sets import Geometry, nearest_distances
+from pipeline.results.tolerances import PORTRAIT_RTOL
 
 NEAR, WIDEST = (0.03, 0.018, 0.05), 0.25
 """Distances within which a trajectory passes an orbit, tried in turn, and the largest one if a set is further away, as

@@ -36,10 +36,10 @@ from pipeline.analysis.events.lines import at
 from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TRANSIENT, TWINS
 from pipeline.analysis.events.scene import Event, Scene, Stretch
 from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transient_of
-from pipeline.analysis.ragged import points_of_rows, rows_at
-from pipeline.analysis.sets import nearest_distances
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter, parameter_name
+from pipeline.results.ragged import points_of_rows, rows_at
+from pipeline.results.sets import nearest_distances
 
 OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""

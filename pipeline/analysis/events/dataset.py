@@ -16,9 +16,9 @@ from pipeline.analysis.events.lines import Fate
 from pipeline.analysis.events.names import LIVES_ON, NAMES, UNDECIDED
 from pipeline.analysis.events.one_event import is_own, same_as
 from pipeline.analysis.events.scene import Event, Scene, Stretch
-from pipeline.analysis.outcomes import DIVERGED
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.results.outcomes import DIVERGED
 
 Columns = dict[str, Sequence[object]]
 """Values of the columns of events, by name."""

@@ -9,12 +9,12 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.events.names import RANGE_END
-from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.outcomes import DIVERGED, outcomes
-from pipeline.analysis.selection import start_dims
-from pipeline.analysis.tabular import Row, values
 from pipeline.layout.own_words import RATE
 from pipeline.layout.vocabulary import letter, parameter_name
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.outcomes import DIVERGED, outcomes
+from pipeline.results.selection import start_dims
+from pipeline.results.tabular import Row, values
 from pipeline.specification.tables import FREQUENCY, RATES
 
 NOWHERE = {DIVERGED: "diverged", -1: "no attractor"}

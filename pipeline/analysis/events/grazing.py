@@ -26,7 +26,7 @@ from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.events.lines import Line
 from pipeline.analysis.events.names import GRAZING, SLIDING
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 SAMPLES = 4000
 """Instants of an orbit between which its peaks are interpolated."""

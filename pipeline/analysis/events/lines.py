@@ -16,10 +16,10 @@ from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LIMITS, PIT
 from pipeline.analysis.branches.known import GUESS, NEAR_FOLD, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tabular import words_of
-from pipeline.analysis.tolerances import SAME_ON_BRANCH
 from pipeline.layout.vocabulary import parameter_name
+from pipeline.results.sets import Geometry
+from pipeline.results.tabular import words_of
+from pipeline.results.tolerances import SAME_ON_BRANCH
 
 CROSSING = [KINDS.index(kind) for kind in (BRANCHING, PITCHFORK, TRANSCRITICAL)]
 """Codes of the bifurcations at which another branch passes."""

@@ -15,8 +15,8 @@ from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate
 from pipeline.analysis.events.names import BREAKUP, CRISES, RANGE_END, UNDECIDED
 from pipeline.analysis.events.scene import Event, Scene
-from pipeline.analysis.tolerances import SAME_ON_BRANCH
 from pipeline.layout.vocabulary import EQUILIBRIUM
+from pipeline.results.tolerances import SAME_ON_BRANCH
 
 
 def same_as(scene: Scene, named: Sequence[Event]) -> list[int]:

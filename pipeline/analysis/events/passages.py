@@ -31,8 +31,8 @@ from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.lines import at
 from pipeline.analysis.events.names import INTERMITTENCY, LOCKING
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tabular import plain
+from pipeline.results.sets import Geometry
+from pipeline.results.tabular import plain
 
 TYPES = {FOLD: "i", TORUS: "ii", DOUBLING: "iii"}
 """Types of intermittency by the bifurcation of the orbit."""

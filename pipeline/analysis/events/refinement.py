@@ -7,11 +7,11 @@ from pathlib import PurePath
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.events.declaration import EventOptions
 from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import counted
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
-from pipeline.products.events import EventOptions
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import counted
 from pipeline.specification.tables import RATES
 
 PARTS = 4

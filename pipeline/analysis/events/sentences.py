@@ -25,8 +25,10 @@ from pipeline.analysis.events.names import (
     TWINS,
     UNDECIDED,
 )
-from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.tabular import (
+from pipeline.layout.vocabulary import letter, parameter_name
+from pipeline.products.product import Table
+from pipeline.results.outcomes import DIVERGED
+from pipeline.results.tabular import (
     MOST_ROWS,
     Row,
     Words,
@@ -37,8 +39,6 @@ from pipeline.analysis.tabular import (
     values,
     with_interval,
 )
-from pipeline.layout.vocabulary import letter, parameter_name
-from pipeline.products.product import Table
 
 _NAMES = (
     *("attractor", "set", "period", "period_after", "rises", "what", "criticality", "value", "value_error", "seen"),

@@ -17,11 +17,11 @@ from scipy.optimize import brentq, minimize_scalar
 
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import polish_orbits
+from pipeline.analysis.branches.declaration import OrbitOptions
 from pipeline.analysis.branches.orbit_search import needs_point, point_of
 from pipeline.analysis.branches.starting_orbits import parameters_at
+from pipeline.analysis.manifolds.declaration import ManifoldOptions, TangencyOptions
 from pipeline.analysis.manifolds.growing import Manifold, Resolution, Saddle, stable_manifold, unstable_manifold
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, aligned, counted, header_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     FREQUENCY_DIM,
@@ -31,10 +31,10 @@ from pipeline.layout.vocabulary import (
     parameters_of,
     section_attributes,
 )
-from pipeline.products.branches import OrbitOptions
-from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
 from pipeline.products.product import Table
 from pipeline.products.reporting import track
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, aligned, counted, header_of
 
 ENDS = ("length", "most", "generations", "lost")
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map, wrap_angles
-from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_POINT
+from pipeline.results.tolerances import BRANCH_RTOL, SAME_POINT
 
 FIRST = 1e-5
 """Scaled distance of the first segment from the orbit."""

@@ -11,14 +11,14 @@ from scipy.signal import find_peaks
 
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.status import Status
+from pipeline.analysis.noise.declaration import DENSITY_COLUMNS, DensityOptions
 from pipeline.analysis.noise.escapes import mean_and_spread
 from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, point_dims
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, points_of, values
 from pipeline.layout.columns import on_points
 from pipeline.layout.vocabulary import model_of
-from pipeline.products.noise import DENSITY_COLUMNS, DensityOptions
 from pipeline.products.product import Table
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, at_point, number, points_of, values
 
 MOST_PEAKS = 16
 """Most peaks whose places are kept."""

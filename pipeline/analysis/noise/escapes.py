@@ -11,7 +11,7 @@ from scipy import stats
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.model import Model
 from magpend_core.sizes import NOISE_PREFIX
-from pipeline.analysis.intervals import binomial_interval
+from pipeline.analysis.noise.declaration import ESCAPES_COLUMNS, EscapeOptions
 from pipeline.analysis.noise.exits import (
     Exits,
     PointCells,
@@ -22,12 +22,12 @@ from pipeline.analysis.noise.exits import (
     labels_of,
     point_dims,
 )
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, points_of, unit_of, values, words_of
 from pipeline.layout.columns import on_points
 from pipeline.layout.vocabulary import FREQUENCY_DIM
-from pipeline.products.noise import ESCAPES_COLUMNS, EscapeOptions
 from pipeline.products.product import Table
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, at_point, number, points_of, unit_of, values, words_of
 
 _IN_AND_OUT = ("inside", "outside")
 

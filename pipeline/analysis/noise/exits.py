@@ -14,12 +14,12 @@ from magpend_core.models.model import Model
 from magpend_core.models.text.scene import MIXED
 from magpend_core.noisy import cell_words, first_passages, noisy_sections
 from magpend_core.status import Status
-from pipeline.analysis.run import OpenRun
+from pipeline.analysis.noise.declaration import EscapeOptions
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, parameters_of, split_dims
 from pipeline.motion.noisy import Noisy
 from pipeline.motion.steady import Inputs
-from pipeline.products.noise import EscapeOptions
+from pipeline.results.run import OpenRun
 
 NOT_LEFT = -1
 

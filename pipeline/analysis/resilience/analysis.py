@@ -1,9 +1,9 @@
-"""Measure the response of a run's attractors to shocks, as an analysis (`pipeline.products.resilience`).
+"""Measure the response of a run's attractors to shocks, as an analysis (`pipeline.analysis.resilience.declaration`).
 
-The Dataset has a row for each set (`pipeline.analysis.ragged`), and the dim ``state``. Sizes are in units of the
+The Dataset has a row for each set (`pipeline.results.ragged`), and the dim ``state``. Sizes are in units of the
 states' scales (coordinate ``state_scale``), jumps of states in their own units.
 
-`pipeline.products.resilience` lists the variables.
+`pipeline.analysis.resilience.declaration` lists the variables.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from magpend_core.models.text.grammar import Tree
 from pipeline.analysis.attractors.destinations import Destinations, Followed, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
-from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.outcomes import DIVERGED, outcomes
-from pipeline.analysis.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
+from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.resilience.expressions import density_at, mean_over_cells, read_expression
 from pipeline.analysis.resilience.local import local_stability
 from pipeline.analysis.resilience.shocks import (
@@ -34,22 +32,6 @@ from pipeline.analysis.resilience.shocks import (
     bases_of,
     search_together,
     sizes,
-)
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import listed, select_points
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tabular import (
-    FEW_POINTS,
-    Row,
-    Words,
-    number,
-    point_table,
-    points_of,
-    ranges,
-    sets_of,
-    summary,
-    values,
-    with_interval,
 )
 from pipeline.layout.evaluation import parameter_points
 from pipeline.layout.vocabulary import (
@@ -65,7 +47,25 @@ from pipeline.layout.vocabulary import (
     told_by,
 )
 from pipeline.products.product import Table
-from pipeline.products.resilience import ResilienceOptions
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.outcomes import DIVERGED, outcomes
+from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import listed, select_points
+from pipeline.results.sets import Geometry
+from pipeline.results.tabular import (
+    FEW_POINTS,
+    Row,
+    Words,
+    number,
+    point_table,
+    points_of,
+    ranges,
+    sets_of,
+    summary,
+    values,
+    with_interval,
+)
 from pipeline.specification.tables import FREQUENCY
 
 MOST_SEEDS = 8

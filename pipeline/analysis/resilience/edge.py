@@ -1,9 +1,9 @@
-"""Track the edge states between two attractors of a run, as an analysis (`pipeline.products.resilience`).
+"""Track the edge states between two attractors of a run, as an analysis (`pipeline.analysis.resilience.declaration`).
 
 The Dataset has the dims ``edge`` (different edge states), ``point``, ``state``, ``multiplier``, ``pair`` (tracked
 pairs) and ``step`` (sections of their paths).
 
-`pipeline.products.resilience` lists the variables.
+`pipeline.analysis.resilience.declaration` lists the variables.
 
 The attribute ``between`` has the ids of the two attractors, and ``between_letters`` their letters.
 """
@@ -21,15 +21,9 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import padded
 from pipeline.analysis.resilience.analysis import start_states
+from pipeline.analysis.resilience.declaration import EdgeOptions
 from pipeline.analysis.resilience.edge_tracking import REASONS, Pair, Tracking, nearest_pairs, orbits_on
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, words_of
-from pipeline.analysis.tolerances import SAME_EQUILIBRIUM
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import (
     ATTRACTS,
@@ -43,7 +37,13 @@ from pipeline.layout.vocabulary import (
     told_by,
 )
 from pipeline.products.product import Table
-from pipeline.products.resilience import EdgeOptions
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import padded
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import select_points
+from pipeline.results.sets import Geometry
+from pipeline.results.tabular import Row, Words, aligned, counted, plain, words_of
+from pipeline.results.tolerances import SAME_EQUILIBRIUM
 
 CANDIDATES = 4
 """Pairs that are bisected for each that is tracked: between some of them a third basin lies."""

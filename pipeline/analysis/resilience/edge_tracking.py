@@ -29,10 +29,10 @@ from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.flown import flown
-from pipeline.analysis.sets import nearest_distances
-from pipeline.analysis.tolerances import RECURRENCE
+from pipeline.analysis.resilience.declaration import EdgeOptions
 from pipeline.products.reporting import report
-from pipeline.products.resilience import EdgeOptions
+from pipeline.results.sets import nearest_distances
+from pipeline.results.tolerances import RECURRENCE
 
 REASONS = ("none", "third_attractor", "undecided", "lost", "not_settled", "parted")
 NONE, THIRD, UNKNOWN, LOST, NOT_SETTLED, PARTED = range(len(REASONS))

@@ -27,8 +27,8 @@ from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.resilience.shocks import Bases, bases_of
-from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.results.tolerances import PORTRAIT_RTOL
 
 PHASES, MOST_PHASES, MOST_ROWS = 64, 512, 4096
 """Phases of a drive period, or of a flow's orbit, at which an orbit is sampled, most of a whole orbit, and most of

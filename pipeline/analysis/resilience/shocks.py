@@ -29,11 +29,11 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.flown import flown
-from pipeline.analysis.outcomes import DIVERGED
+from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.together import run_together
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, samples_per_period
 from pipeline.products.reporting import report
-from pipeline.products.resilience import ResilienceOptions
+from pipeline.results.outcomes import DIVERGED
 
 Norm = Literal["euclidean", "largest"]
 K = TypeVar("K", bound=Hashable)

@@ -15,16 +15,16 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, listed
 from pipeline.analysis.branches.completeness import searched_lines
+from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.analysis.branches.kinds import LABELS
+from pipeline.analysis.response.declaration import ResponseOptions
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, words_of
-from pipeline.analysis.tolerances import CLOSURE, PORTRAIT_RTOL
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameter_name, parameters_of
-from pipeline.products.branches import BranchOptions
 from pipeline.products.product import Table
-from pipeline.products.response import ResponseOptions
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, words_of
+from pipeline.results.tolerances import CLOSURE, PORTRAIT_RTOL
 
 BEYOND = 1e-3
 """How far beyond the end of a stable orbit a trajectory is integrated, as a share of the interval."""

@@ -19,6 +19,7 @@ from pipeline.analysis.branches.curves import lies_on
 from pipeline.analysis.branches.lockstep import run_alone, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.response.analysis import channel_coordinates, channel_rows, measured_along
+from pipeline.analysis.response.declaration import BackboneOptions
 from pipeline.analysis.response.resonance import (
     ENDS,
     Curve,
@@ -29,13 +30,12 @@ from pipeline.analysis.response.resonance import (
     normal_mode,
     phase_resonance,
 )
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, Words, aligned, counted, plain, words_of
-from pipeline.analysis.tolerances import SAME_EQUILIBRIUM
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import model_attribute, parameter_name, parameters_of, section_attributes
-from pipeline.products.backbone import BackboneOptions
 from pipeline.products.product import Table
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, Words, aligned, counted, plain, words_of
+from pipeline.results.tolerances import SAME_EQUILIBRIUM
 from pipeline.specification.problems import SpecError, unknown_name
 
 KINDS = ("phase_resonance", "normal_mode")

@@ -13,7 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import drive_level, evaluate
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.results.tolerances import BRANCH_RTOL
 
 FEWEST, MOST = 512, 8192
 """Samples per drive period or return: at first, and at most."""

@@ -15,9 +15,8 @@ from scipy import stats
 
 from magpend_core.models.model import Model
 from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
-from pipeline.analysis.intervals import binomial_interval, half_width
-from pipeline.analysis.run import OpenRun
 from pipeline.analysis.series.correlation import Sums, correlation_sums
+from pipeline.analysis.series.declaration import SERIES_COLUMNS, SeriesOptions
 from pipeline.analysis.series.divergence import Divergence, divergence
 from pipeline.analysis.series.embedding import (
     FEW_FALSE,
@@ -33,15 +32,16 @@ from pipeline.analysis.series.embedding import (
 from pipeline.analysis.series.recurrence import Recurrence, recurrence
 from pipeline.analysis.series.returns import Returns, returns_of
 from pipeline.analysis.series.surrogates import N_SURROGATES, against_noise
-from pipeline.analysis.sets import Geometry
 from pipeline.analysis.spectrum.estimate import pieces_of, spectrum_of
 from pipeline.analysis.spectrum.motions import channels_of, clock_of, motions_of, sampled
-from pipeline.analysis.tabular import Row, Words, aligned, number, plain
 from pipeline.layout.columns import described
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import model_of, told_by
 from pipeline.products.product import Table
-from pipeline.products.spectrum import SERIES_COLUMNS, SeriesOptions
+from pipeline.results.intervals import binomial_interval, half_width
+from pipeline.results.run import OpenRun
+from pipeline.results.sets import Geometry
+from pipeline.results.tabular import Row, Words, aligned, number, plain
 
 MOST_VECTORS = 4000
 """Most delay vectors that are kept for the figure."""

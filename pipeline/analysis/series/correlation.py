@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.analysis.intervals import half_width
 from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, slope, spread
+from pipeline.results.intervals import half_width
 
 LARGEST, PER_OCTAVE, N_OCTAVES = 4.0, 4, 12
 """Largest radius [standard deviations], radii per factor of two, and factors of two from it to the least."""

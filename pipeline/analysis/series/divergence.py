@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.analysis.intervals import half_width
 from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, Ints, slope
+from pipeline.results.intervals import half_width
 
 N_REFERENCES = 1600
 """Vectors whose neighbours are followed."""

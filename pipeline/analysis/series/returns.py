@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from pipeline.analysis.intervals import half_width
 from pipeline.analysis.series.embedding import N_BLOCKS, Floats, Series
 from pipeline.analysis.series.surrogates import repeats_by_chance
+from pipeline.results.intervals import half_width
 
 PROMINENCE = 0.1
 """Least height of a maximum over the minima beside it, in standard deviations."""

@@ -16,8 +16,12 @@ import xarray as xr
 from scipy import signal
 
 from pipeline.analysis.response.orbits import AT_ONCE, Orbit, measures_of
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
+from pipeline.analysis.spectrum.declaration import (
+    SpectraOptions,
+    SpectrumFigureOptions,
+    SpectrumOptions,
+    WaterfallOptions,
+)
 from pipeline.analysis.spectrum.estimate import ALL, Averaged, averaged, frequencies_of, power_unit
 from pipeline.analysis.spectrum.motions import (
     Motion,
@@ -29,13 +33,13 @@ from pipeline.analysis.spectrum.motions import (
     sampled,
     swept_by,
 )
-from pipeline.analysis.tabular import Row, Words, aligned, number, plain, words_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import EQUILIBRIUM, KINDS, PERIODIC_ORBIT, STABILITIES, TORUS, split_dims, told_by
-from pipeline.products.figures import SpectrumFigureOptions, WaterfallOptions
 from pipeline.products.product import Table
-from pipeline.products.spectrum import SpectraOptions, SpectrumOptions
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import select_points
+from pipeline.results.tabular import Row, Words, aligned, number, plain, words_of
 from pipeline.specification.tables import FREQUENCY
 
 FEWEST, MOST = 128, 2048

@@ -11,11 +11,11 @@ import numpy as np
 import xarray as xr
 from scipy import optimize, signal
 
+from pipeline.analysis.spectrum.declaration import SPECTRUM_COLUMNS
 from pipeline.analysis.spectrum.gaps import Filled, filled
 from pipeline.layout.columns import described
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
-from pipeline.products.spectrum import SPECTRUM_COLUMNS
 
 UNEVEN = 0.01
 """Largest deviation of a sampling interval from their median, as a share of it, at which a series counts as even."""

@@ -15,11 +15,11 @@ from magpend_core.sampling import Drive
 from magpend_core.status import Status
 from pipeline.analysis.attractors.portraits import mean_return
 from pipeline.analysis.flown import flown
-from pipeline.analysis.ragged import dims_of, places_of_rows, points_of_rows
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import select_points
+from pipeline.analysis.spectrum.declaration import SPECTRUM_COLUMNS, CellOptions, MotionOptions
 from pipeline.layout.vocabulary import BOUNDED_SET, NOT_SETTLED, frequency_of, letter, parameters_of, split_dims
-from pipeline.products.spectrum import SPECTRUM_COLUMNS, CellOptions, MotionOptions
+from pipeline.results.ragged import dims_of, places_of_rows, points_of_rows
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import select_points
 from pipeline.specification.problems import unknown_name
 
 Chosen = TypeVar("Chosen", bound=MotionOptions)

@@ -11,17 +11,24 @@ import xarray as xr
 
 from magpend_core import Status
 from magpend_core.models.model import Model
-from pipeline.analysis.branches.problems import parameter_units
-from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.tabular import Row, aligned, counted, header_of, plain, unit_of, words_of
+from pipeline.analysis.tipping.declaration import TippingOptions
 from pipeline.analysis.tipping.endings import NONE, Final, Group, endings, ends_s, finals_of
 from pipeline.layout.cells import CellMap, initial_states
-from pipeline.layout.vocabulary import axis_name, drift_attributes, letter, model_attribute, parameter_name, split_dims
+from pipeline.layout.vocabulary import (
+    axis_name,
+    drift_attributes,
+    letter,
+    model_attribute,
+    parameter_name,
+    parameter_units,
+    split_dims,
+)
 from pipeline.motion.drifting import Drifting
 from pipeline.products.product import Table
 from pipeline.products.reporting import report
-from pipeline.products.tipping import TippingOptions
+from pipeline.results.outcomes import DIVERGED
+from pipeline.results.run import OpenRun
+from pipeline.results.tabular import Row, aligned, counted, header_of, plain, unit_of, words_of
 from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:

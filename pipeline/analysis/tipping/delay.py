@@ -10,13 +10,13 @@ import xarray as xr
 
 from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tabular import Row, aligned, at_point, counted, number, points_of
+from pipeline.analysis.tipping.declaration import DelayOptions
 from pipeline.layout.cells import at_section
 from pipeline.layout.vocabulary import drift_attributes, model_attribute, model_of, split_dims
 from pipeline.products.product import Table
-from pipeline.products.tipping import DelayOptions
+from pipeline.results.run import OpenRun
+from pipeline.results.sets import Geometry
+from pipeline.results.tabular import Row, aligned, at_point, counted, number, points_of
 
 
 def lags(section: np.ndarray, period: int, model: Model) -> np.ndarray:

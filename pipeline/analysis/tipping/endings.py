@@ -13,12 +13,12 @@ from magpend_core import Status
 from magpend_core.models.drift.ramps import motions_of
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.attractors import identify
-from pipeline.analysis.outcomes import DIVERGED, outcomes
-from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import OpenRun
+from pipeline.analysis.tipping.declaration import TippingOptions
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute
 from pipeline.motion.steady import Inputs, Steady
-from pipeline.products.tipping import TippingOptions
+from pipeline.results.outcomes import DIVERGED, outcomes
+from pipeline.results.ragged import dense
+from pipeline.results.run import OpenRun
 from pipeline.specification.spec import Spec
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)

@@ -6,18 +6,18 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.basins.analysis import check_starts
-from pipeline.analysis.intervals import binomial_interval
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import dense
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import choose, place, start_dims
-from pipeline.analysis.tabular import Row, aligned, with_interval
 from pipeline.analysis.tipping.analysis import outcome_word
+from pipeline.analysis.tipping.declaration import OVERLAPS_COLUMNS, OverlapOptions
 from pipeline.layout.columns import on_points
 from pipeline.layout.own_words import rate_of
 from pipeline.layout.vocabulary import axis_name
 from pipeline.products.product import Table
-from pipeline.products.tipping import OVERLAPS_COLUMNS, OverlapOptions
+from pipeline.results.intervals import binomial_interval
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import dense
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import choose, place, start_dims
+from pipeline.results.tabular import Row, aligned, with_interval
 
 UNKNOWN = -1
 

@@ -1,7 +1,7 @@
 """Analyse the transfer operator of a run's section map: slow sets, committors, passage times and rates of escape.
 
-Rows are sets (dim ``set``, see `pipeline.analysis.ragged`); the boxes of a set are its samples (dim ``sample``). Steps
-are drive periods or returns. `pipeline.products.transfer.COLUMNS` lists the variables.
+Rows are sets (dim ``set``, see `pipeline.results.ragged`); the boxes of a set are its samples (dim ``sample``). Steps
+are drive periods or returns. `pipeline.analysis.transfer.declaration.TRANSFER_COLUMNS` lists the variables.
 
 Intervals are percentiles of resamples: of whole cells if there are enough, else of stretches of cells. Sets and cores
 stay those of all cells. ``_coarse`` is the number on boxes of twice the width: its distance from the number itself
@@ -18,19 +18,19 @@ import numpy as np
 import xarray as xr
 from scipy.sparse import csr_array
 
-from pipeline.analysis.intervals import lifetime_interval
 from pipeline.analysis.noise.exits import PointCells, cells_at_points, coordinates_of, inputs_at, point_dims
-from pipeline.analysis.ragged import N_POINTS, ROW_SIZE, rows_at
-from pipeline.analysis.run import OpenRun
-from pipeline.analysis.selection import listed
-from pipeline.analysis.tabular import Row, Words, aligned, number, points_of, with_interval
 from pipeline.analysis.transfer import ulam
+from pipeline.analysis.transfer.declaration import TRANSFER_COLUMNS, TransferOptions
 from pipeline.analysis.transfer.ulam import Chain, Grid
 from pipeline.layout.columns import on_points
 from pipeline.layout.vocabulary import letter, model_of
 from pipeline.products.column import POINTS
 from pipeline.products.product import Table
-from pipeline.products.transfer import COLUMNS, TransferOptions
+from pipeline.results.intervals import lifetime_interval
+from pipeline.results.ragged import N_POINTS, ROW_SIZE, rows_at
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import listed
+from pipeline.results.tabular import Row, Words, aligned, number, points_of, with_interval
 from pipeline.specification.problems import unknown_name
 
 MOST_SETS = 16
@@ -311,7 +311,7 @@ def _dataset(
 ) -> xr.Dataset:
     model, dims = model_of(cube), point_dims(cube)
     shape = tuple(cube.sizes[d] for d in dims)
-    of_points = {column.name for column in COLUMNS if column.dims.startswith(POINTS)}
+    of_points = {column.name for column in TRANSFER_COLUMNS if column.dims.startswith(POINTS)}
     values: dict[str, np.ndarray] = {}
     for name in parts[0]:
         rows = [np.asarray(part[name]) for part in parts]
@@ -320,7 +320,7 @@ def _dataset(
     kept = ("model", "parameters", "noise", "title", "source")
     about = {name: cube.attrs[name] for name in kept if name in cube.attrs}
     about |= {"confidence": options.confidence, "core": options.core}
-    return xr.Dataset(on_points(COLUMNS, values, dims), {**coordinates_of(cube, dims), **axis}, about)
+    return xr.Dataset(on_points(TRANSFER_COLUMNS, values, dims), {**coordinates_of(cube, dims), **axis}, about)
 
 
 def transfer_table(ds: xr.Dataset) -> Table:

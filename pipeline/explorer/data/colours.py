@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magpend_core.status import Status
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import N_IDS
 from pipeline.layout.vocabulary import BRANCH, split_dims
 from pipeline.plots import palette, style
 from pipeline.plots.palette import motion_codes, motions_of
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import N_IDS
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -11,19 +11,19 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.declaration import BranchOptions
+from pipeline.analysis.branches.figure import NAMES
 from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.events.names import RANGE_END, UNDECIDED
-from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import isel
-from pipeline.analysis.tabular import plain
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import finite
 from pipeline.explorer.data.overlays import SAME_VALUE
 from pipeline.explorer.data.parameter_plane import packed_orbit
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, frequency_of, parameter_name
-from pipeline.plots.branches import NAMES
-from pipeline.products.branches import BranchOptions
+from pipeline.results.outcomes import outcomes
+from pipeline.results.ragged import isel
+from pipeline.results.tabular import plain
 from pipeline.runs.derive import AnalysedRun, options_of, shown_table
 from pipeline.store.run import RunDirectory
 

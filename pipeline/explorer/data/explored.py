@@ -76,8 +76,7 @@ class ExploredRun(RunDirectory):
 
     def kept(self, name: str) -> xr.Dataset | None:
         """Return the stored result of an analysis; None if it has not been computed."""
-        found = self.kept_each(name)
-        return found[0] if found else None
+        return self.remembered(f"derived {name}", lambda: next(map(with_plain_names, stored_each(self, name)), None))
 
     def kept_each(self, name: str) -> list[xr.Dataset]:
         """Return all stored results of an analysis, such as one for each pair of attractors; see `stored_each`."""

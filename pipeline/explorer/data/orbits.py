@@ -14,8 +14,6 @@ from magpend_core import evaluate, trajectory
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.status import Status
-from pipeline.analysis.outcomes import share_interval
-from pipeline.analysis.ragged import dense, dims_of, isel
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
@@ -32,6 +30,8 @@ from pipeline.layout.vocabulary import (
     samples_per_period,
 )
 from pipeline.plots.palette import motion_codes, motions_of
+from pipeline.results.outcomes import share_interval
+from pipeline.results.ragged import dense, dims_of, isel
 from pipeline.store.run import RunDirectory
 
 SAMPLES = 128

@@ -13,12 +13,11 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.branches.figure import NAMES, pieces
 from pipeline.analysis.branches.kinds import KINDS as BIFURCATIONS
 from pipeline.analysis.branches.kinds import LABELS
-from pipeline.analysis.outcomes import share_interval
-from pipeline.analysis.ragged import dense, isel
+from pipeline.analysis.chaos.lyapunov_figure import EXPONENT_COLOURS
 from pipeline.analysis.resilience.analysis import end_of
-from pipeline.analysis.tabular import sets_of
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import finite, parts_of, share_bounds, shown
@@ -36,9 +35,10 @@ from pipeline.layout.vocabulary import (
     time_unit,
 )
 from pipeline.plots import palette
-from pipeline.plots.branches import NAMES, pieces
 from pipeline.plots.labels import state_measure
-from pipeline.plots.lyapunov import EXPONENT_COLOURS
+from pipeline.results.outcomes import share_interval
+from pipeline.results.ragged import dense, isel
+from pipeline.results.tabular import sets_of
 from pipeline.store.run import RunDirectory
 
 SAME_VALUE = 1e-9

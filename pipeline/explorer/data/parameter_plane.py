@@ -11,16 +11,16 @@ from matplotlib.colors import to_hex
 
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
+from pipeline.analysis.branches.figure import NAMES
 from pipeline.analysis.branches.kinds import CURVE_KINDS, HOMOCLINIC, LABELS
-from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import TOLERANCE, fixed_points, orbit_series, parts_of
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
-from pipeline.plots.branches import NAMES
 from pipeline.plots.labels import swept_label
+from pipeline.results.ragged import ROW_SIZE, point_of_rows
 from pipeline.store.run import RunDirectory
 
 NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or name their run with --curves"

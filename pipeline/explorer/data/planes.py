@@ -18,7 +18,7 @@ NONE = -1
 """Label of a start that leads to nothing known."""
 
 _DIVERGED = -2
-"""Label of a start that diverges, as in `pipeline.analysis.outcomes`."""
+"""Label of a start that diverges, as in `pipeline.results.outcomes`."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import xarray as xr
 
 from magpend_core.status import Status
 from pipeline.analysis.attractors import features
+from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.destinations import KnownSets
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, raw_orbit
@@ -27,13 +28,12 @@ from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.limit_cycles import number_of_cycle, tell_cycles
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.spirals import Recurrence
-from pipeline.analysis.ragged import N_IDS, dense, dims_of, isel
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import SAME_SECONDS, STRICT
 from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.settling import Place
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
-from pipeline.products.attractors import IdentifyOptions
+from pipeline.results.ragged import N_IDS, dense, dims_of, isel
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import SAME_SECONDS, STRICT
 
 MOST_ENTRIES = 64
 """Attractors told apart besides those of the run; what closes elsewhere is told by its period alone."""

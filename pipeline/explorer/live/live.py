@@ -18,7 +18,6 @@ from magpend_core.equilibria import newton_steps
 from magpend_core.models.parameters import ParameterError
 from magpend_core.orbits import section_map
 from magpend_core.status import Status
-from pipeline.analysis.ragged import dims_of, isel
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
@@ -31,6 +30,7 @@ from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES, axis_name
 from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
 from pipeline.plots.palette import MOTION_COLOURS as MOTION_COLOURS
+from pipeline.results.ragged import dims_of, isel
 from pipeline.specification.tables import FREQUENCY
 from pipeline.store.run import RunDirectory
 

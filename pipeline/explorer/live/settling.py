@@ -14,8 +14,8 @@ from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.flight import Flight
-from pipeline.analysis.tolerances import EXTEND_CLOSURE, EXTEND_RTOL
 from pipeline.explorer import RequestError
+from pipeline.results.tolerances import EXTEND_CLOSURE, EXTEND_RTOL
 from pipeline.specification.tables import Integration
 
 MOST_STEPS = 200_000

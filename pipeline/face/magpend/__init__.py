@@ -59,7 +59,13 @@ def __getattr__(name: str) -> Any:
 
         return metadata.version("magpend")
     if name.startswith("_") or name not in _homes():
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from pipeline.products.registry import ANALYSES
+
+        if name.startswith("_") or name not in ANALYSES.listed:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from magpend._methods import analysis
+
+        return analysis(name)  # of another package
     value = globals()[name] = _naming_arguments(resolve_name(_homes()[name]), _homes()[name])
     return value
 

@@ -29,10 +29,23 @@ from magpend_core.sections import run_branches as run_branches
 from magpend_core.sections import sections as sections
 from magpend_core.status import Status as Status
 from magpend_core.trajectory import trajectory as trajectory
+from pipeline.analysis.attractors.figure import plot_gallery as plot_gallery
+from pipeline.analysis.basins.figure import plot_basins as plot_basins
+from pipeline.analysis.basins.fractions_figure import plot_coexisting as plot_coexisting
+from pipeline.analysis.basins.fractions_figure import plot_fractions as plot_fractions
+from pipeline.analysis.basins.regimes_figure import plot_curves as plot_curves
+from pipeline.analysis.basins.regimes_figure import plot_regimes as plot_regimes
+from pipeline.analysis.branches.figure import plot_branches as plot_branches
+from pipeline.analysis.branches.figure import plot_multipliers as plot_multipliers
+from pipeline.analysis.chaos.convergence_figure import plot_convergence as plot_convergence
+from pipeline.analysis.chaos.dimension_figure import plot_dimension as plot_dimension
 from pipeline.analysis.chaos.dimensions import correlation_dimension as correlation_dimension
 from pipeline.analysis.chaos.dimensions import kaplan_yorke_dimension as kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
+from pipeline.analysis.chaos.lyapunov_figure import plot_lyapunov as plot_lyapunov
+from pipeline.analysis.chaos.lyapunov_figure import plot_lyapunov_map as plot_lyapunov_map
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
+from pipeline.analysis.manifolds.figure import plot_manifolds as plot_manifolds
 from pipeline.analysis.series.analysis import series_of as series_of
 from pipeline.analysis.spectrum.estimate import spectrum_of as spectrum_of
 from pipeline.compute.simulate import simulate as simulate
@@ -40,20 +53,7 @@ from pipeline.explorer.notebook import explorer as explorer
 from pipeline.plots import DataFigure as DataFigure
 from pipeline.plots import Frame as Frame
 from pipeline.plots import draw_figure as draw_figure
-from pipeline.plots import plot_basins as plot_basins
 from pipeline.plots import plot_bifurcation as plot_bifurcation
-from pipeline.plots import plot_branches as plot_branches
-from pipeline.plots import plot_coexisting as plot_coexisting
-from pipeline.plots import plot_convergence as plot_convergence
-from pipeline.plots import plot_curves as plot_curves
-from pipeline.plots import plot_dimension as plot_dimension
-from pipeline.plots import plot_fractions as plot_fractions
-from pipeline.plots import plot_gallery as plot_gallery
-from pipeline.plots import plot_lyapunov as plot_lyapunov
-from pipeline.plots import plot_lyapunov_map as plot_lyapunov_map
-from pipeline.plots import plot_manifolds as plot_manifolds
-from pipeline.plots import plot_multipliers as plot_multipliers
-from pipeline.plots import plot_regimes as plot_regimes
 from pipeline.plots import plot_section as plot_section
 from pipeline.plots import plot_trajectory as plot_trajectory
 from pipeline.plots import save_data as save_data
@@ -84,30 +84,31 @@ from pipeline.specification.spec import Spec as Spec
 
 __version__: str
 
+# analyses, made by python -m pipeline.cli.reference
 attractors = Run.attractors
-basins = Run.basins
-hysteresis = Run.hysteresis
 settling = Run.settling
+hysteresis = Run.hysteresis
+basins = Run.basins
+resilience = Run.resilience
+edge = Run.edge
+transfer = Run.transfer
+overlaps = Run.overlaps
 chaos = Run.chaos
 dimension = Run.dimension
-series = Run.series
 spectrum = Run.spectrum
+series = Run.series
 branches = Run.branches
+events = Run.events
+response = Run.response
+backbone = Run.backbone
 bands = Run.bands
 sensitivities = Run.sensitivities
 curves = Run.curves
 orbits = Run.orbits
-events = Run.events
-response = Run.response
-backbone = Run.backbone
 tongues = Run.tongues
 manifolds = Run.manifolds
 tangency = Run.tangency
 tipping = Run.tipping
 delay = Run.delay
-overlaps = Run.overlaps
-resilience = Run.resilience
-edge = Run.edge
 escapes = Run.escapes
 density = Run.density
-transfer = Run.transfer

@@ -130,7 +130,7 @@ class DatasetAccessor:
         --------
         >>> run.attractors().magpend.sets().share.groupby("attractor_id").max()            # doctest: +SKIP
         """
-        from pipeline.analysis.ragged import sets
+        from pipeline.results.ragged import sets
 
         return sets(self._rows("sets"))
 
@@ -154,7 +154,7 @@ class DatasetAccessor:
         --------
         >>> run.attractors().magpend.dense().share.plot()                                  # doctest: +SKIP
         """
-        from pipeline.analysis.ragged import dense
+        from pipeline.results.ragged import dense
 
         return dense(self._rows("dense"), points=True)
 
@@ -216,7 +216,7 @@ class DatasetAccessor:
         --------
         >>> ds.magpend.sel_cell(frequency_hz=2.2, x_deg=20)                  # doctest: +SKIP
         """
-        from pipeline.analysis.selection import place
+        from pipeline.results.selection import place
         from pipeline.runs.naming import place as axis_of
 
         cube = self._cube("sel_cell")
@@ -236,7 +236,7 @@ class DatasetAccessor:
         return self._ds
 
     def _rows(self, name: str) -> xr.Dataset:
-        from pipeline.analysis.ragged import is_ragged
+        from pipeline.results.ragged import is_ragged
 
         if not is_ragged(self._known()):
             what = self._ds.attrs.get("derived_product", "a cube")

@@ -4,31 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MethodType
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from magpend._methods import AnalysisMethod
-from pipeline.products.attractors import AttractorOptions, HysteresisOptions
-from pipeline.products.backbone import BackboneOptions
-from pipeline.products.basins import BasinOptions
-from pipeline.products.branches import (
-    BandOptions,
-    BranchOptions,
-    CurveOptions,
-    OrbitOptions,
-    SensitivityOptions,
-    TongueOptions,
-)
-from pipeline.products.chaos import ChaosOptions, DimensionOptions
-from pipeline.products.events import EventOptions
-from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
-from pipeline.products.noise import DensityOptions, EscapeOptions
-from pipeline.products.product import Options, Table
-from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS
-from pipeline.products.resilience import EdgeOptions, ResilienceOptions
-from pipeline.products.response import ResponseOptions
-from pipeline.products.spectrum import SeriesOptions, SpectrumOptions
-from pipeline.products.tipping import DelayOptions, OverlapOptions, TippingOptions
-from pipeline.products.transfer import TransferOptions
+from magpend._methods import analysis
+from magpend._names import Analyses
+from pipeline.products.product import Table
+from pipeline.products.registry import ANALYSES, CELL_PRODUCTS
 from pipeline.runs.arguments import names_arguments
 from pipeline.runs.derive import shown_table, stale, stored_each
 from pipeline.runs.progress import bar_in_notebook
@@ -49,7 +31,7 @@ if TYPE_CHECKING:
     from pipeline.store.files import Files
 
 
-class Run(RunDirectory):
+class Run(Analyses, RunDirectory):
     """An opened run directory with its analyses as methods and its figures under `plot`.
 
     A run holds the commit records found when it was opened, so that all its results use the same cells. Open it
@@ -73,33 +55,13 @@ class Run(RunDirectory):
     >>> ax = run.plot.bifurcation(degrees=True)                         # doctest: +SKIP
     """
 
-    attractors = AnalysisMethod(AttractorOptions)
-    basins = AnalysisMethod(BasinOptions)
-    hysteresis = AnalysisMethod(HysteresisOptions)
-    settling = AnalysisMethod(Options)
-    chaos = AnalysisMethod(ChaosOptions)
-    dimension = AnalysisMethod(DimensionOptions)
-    spectrum = AnalysisMethod(SpectrumOptions)
-    series = AnalysisMethod(SeriesOptions)
-    branches = AnalysisMethod(BranchOptions)
-    bands = AnalysisMethod(BandOptions)
-    sensitivities = AnalysisMethod(SensitivityOptions)
-    curves = AnalysisMethod(CurveOptions)
-    orbits = AnalysisMethod(OrbitOptions)
-    tongues = AnalysisMethod(TongueOptions)
-    events = AnalysisMethod(EventOptions)
-    response = AnalysisMethod(ResponseOptions)
-    backbone = AnalysisMethod(BackboneOptions)
-    manifolds = AnalysisMethod(ManifoldOptions)
-    tangency = AnalysisMethod(TangencyOptions)
-    tipping = AnalysisMethod(TippingOptions)
-    delay = AnalysisMethod(DelayOptions)
-    overlaps = AnalysisMethod(OverlapOptions)
-    resilience = AnalysisMethod(ResilienceOptions)
-    edge = AnalysisMethod(EdgeOptions)
-    escapes = AnalysisMethod(EscapeOptions)
-    density = AnalysisMethod(DensityOptions)
-    transfer = AnalysisMethod(TransferOptions)
+    def __getattr__(self, name: str) -> Any:  # analyses of other packages
+        if name.startswith("_") or name not in ANALYSES.listed:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return MethodType(analysis(name), self)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *ANALYSES.listed})
 
     @classmethod
     def open(cls, source: str | Path | Files | RunDirectory) -> Self:
@@ -174,8 +136,8 @@ class Run(RunDirectory):
         SpecError
             If the analysis or an option is unknown or out of bounds, or if the run does not suit.
         """
-        if name not in COMMANDS:
-            raise SpecError(unknown_name("analysis", name, COMMANDS))
+        if name not in ANALYSES.listed:
+            raise SpecError(unknown_name("analysis", name, ANALYSES.listed))
         return table(getattr(self, name)(**options))
 
     @names_arguments
@@ -516,7 +478,7 @@ def _tree_of(run: Run, chunks: Any, check: bool | None) -> xr.DataTree:
     import xarray as xr
 
     nodes = {"cube": run.cube(chunks, check=check)}
-    for name in COMMANDS:
+    for name in ANALYSES.listed:
         for k, result in enumerate(stored_each(run, name, lazy=True)):
             folder = str(result.encoding["source"]).rpartition("/")[2]
             nodes[folder.removesuffix(".zarr") if k else name] = result if chunks is None else result.chunk(chunks)

@@ -17,9 +17,9 @@ from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.carrying import ORBIT, PARAMETER, Along, Array, Datum, OrbitData, Solution, settled
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, KINDS, TORUS
-from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
 from pipeline.layout.writing import json_value
+from pipeline.results.tabular import words_of
 from pipeline.rig.identify.specification import OrbitsTable, setting_problems
 from pipeline.rig.measured.branch import STABILITIES, branch_table, compare, nearest_orbit, read_branch
 from pipeline.rig.measured.branch_computed import amplitudes, branches_along

@@ -14,10 +14,10 @@ from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from pipeline.analysis.branches.bands import bifurcation_data, carried, orbit_data, place_variables, solvable
 from pipeline.analysis.branches.carrying import ORBIT, OrbitData, Solution, solve
-from pipeline.analysis.draws import LEVELS, interval_of, stretches
 from pipeline.layout.writing import write_netcdf
 from pipeline.plots.figure import save_data, save_figure
 from pipeline.products.product import Table
+from pipeline.results.draws import LEVELS, interval_of, stretches
 from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result, stored_tables
 from pipeline.rig.identify.measured_orbits import MeasuredTable
 from pipeline.rig.identify.orbit_residuals import quantities_of

@@ -12,13 +12,13 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.attractors.matching import match_across
-from pipeline.analysis.draws import LEVELS
-from pipeline.analysis.ragged import dense
-from pipeline.analysis.tabular import FEW_POINTS, points_of, words_of
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.layout.writing import write_atomically
 from pipeline.products.product import Table
+from pipeline.results.draws import LEVELS
+from pipeline.results.ragged import dense
+from pipeline.results.tabular import FEW_POINTS, points_of, words_of
 from pipeline.rig.identify.directory import read_result
 from pipeline.rig.identify.posterior import kept_draws
 from pipeline.runs.derive import AnalysedRun

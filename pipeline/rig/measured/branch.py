@@ -14,13 +14,12 @@ from pydantic import Field
 
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
-from pipeline.analysis.branches.problems import parameter_units
-from pipeline.analysis.points import OWN, PointFile
-from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import spelling_of
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_attribute, model_of, parameter_name
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_attribute, model_of, parameter_name, parameter_units
 from pipeline.products.product import Table
+from pipeline.results.points import OWN, PointFile
+from pipeline.results.tabular import Row, Words, aligned, counted, number, values, words_of
 from pipeline.rig.recordings import parse_mapping, read_recording
 from pipeline.specification import tables as specification
 from pipeline.specification.files import read_toml
@@ -144,7 +143,7 @@ def read_branch(path: str | Path, model: Model | None = None, state: str = "") -
     """Read a measured branch from a CSV table of orbits, or from a TOML specification of recorded orbits,
     ``[measured.branch]``.
 
-    The first column of a CSV file is the parameter of `model`, in any spelling (`pipeline.analysis.points`). Others are
+    The first column of a CSV file is the parameter of `model`, in any spelling (`pipeline.results.points`). Others are
     ``amplitude``, ``amplitude_sd``, ``mean``, ``frequency`` (with ``_sd``), ``stable`` (yes, no, unknown) and ``name``.
     The tables that ``magpend measured branch --csv`` writes can be read as well. `state` is by default the model's
     first. Return over the dim ``orbit`` the parameter's ``value``, ``amplitude``, ``mean`` and ``frequency`` with the

@@ -23,11 +23,11 @@ import xarray as xr
 from scipy.optimize import linear_sum_assignment, linprog
 from scipy.sparse import eye_array, kron, vstack
 
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.sides import flags_of
-from pipeline.analysis.tabular import Row, Words, aligned, counted
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
+from pipeline.results.sets import Geometry
+from pipeline.results.sides import flags_of
+from pipeline.results.tabular import Row, Words, aligned, counted
 from pipeline.rig.measured.computed import Candidate, Computed
 from pipeline.rig.measured.diagram import with_sides
 from pipeline.runs.derive import AnalysedRun

@@ -13,10 +13,10 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model, Parameters
-from pipeline.analysis.ragged import dense
-from pipeline.analysis.selection import choose, select_points, start_dims
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims
+from pipeline.results.ragged import dense
+from pipeline.results.selection import choose, select_points, start_dims
+from pipeline.results.sets import Geometry
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.specification.problems import SpecError
 

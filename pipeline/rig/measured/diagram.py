@@ -20,12 +20,12 @@ import numpy.typing as npt
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
-from pipeline.analysis.sides import UNKNOWN, flags_of
-from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values
 from pipeline.layout.vocabulary import model_attribute, model_of
-from pipeline.products.measured import MAX_PERIOD, SweepOptions
 from pipeline.products.product import Table
+from pipeline.results.sides import UNKNOWN, flags_of
+from pipeline.results.tabular import Row, Words, aligned, counted, number, values
 from pipeline.rig.edges import Edges, edges_of
+from pipeline.rig.measured.declaration import MAX_PERIOD, SweepOptions
 from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import LEAST, Stretch, cut
 from pipeline.specification.problems import SpecError

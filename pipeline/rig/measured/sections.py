@@ -19,8 +19,8 @@ import xarray as xr
 
 from magpend_core.models.model import Model, Parameters, State
 from pipeline.layout.vocabulary import model_attribute, model_of
-from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import Edges, find_edges
+from pipeline.rig.measured.declaration import WINDOW_S
 from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]

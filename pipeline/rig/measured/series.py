@@ -10,8 +10,8 @@ import xarray as xr
 
 from magpend_core.models.model import Parameters
 from pipeline.layout.vocabulary import model_attribute, model_of
-from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of
+from pipeline.rig.measured.declaration import WINDOW_S
 from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError

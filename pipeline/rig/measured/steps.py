@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.products.measured import TRANSIENT
 from pipeline.rig.edges import Edges, Timing
+from pipeline.rig.measured.declaration import TRANSIENT
 from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]

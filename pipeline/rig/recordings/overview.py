@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.tabular import aligned, number
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
+from pipeline.results.tabular import aligned, number
 from pipeline.rig.recordings.channels import Raw, findings_of, summary
 from pipeline.rig.recordings.clock import step_of
 from pipeline.rig.recordings.mapping import DRIVE

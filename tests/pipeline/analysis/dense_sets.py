@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.analysis.attractors import attractors
-from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, dense, is_ragged
+from pipeline.results.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, dense, is_ragged
 
 
 def identify(*given, **options):

@@ -9,7 +9,7 @@ from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Slopes
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 N_KEEP = 20
 

@@ -11,10 +11,10 @@ import pytest
 import xarray as xr
 
 import magpend
-from pipeline.analysis.ragged import dense
 from pipeline.cli.console import Exit
 from pipeline.plots import bifurcation
-from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
+from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.runs.preview import figure_command
 from pipeline.specification import files
@@ -24,7 +24,8 @@ from pipeline.store.run import RunDirectory
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("verb", "guide", "names"), [("analyse", ANALYSES.groups, COMMANDS), ("plot", FIGURES.groups, tuple(FIGURES))]
+    ("verb", "guide", "names"),
+    [("analyse", ANALYSES.groups, ANALYSES.listed), ("plot", FIGURES.groups, tuple(FIGURES))],
 )
 def test_help__groups_products_by_what_they_need(main, verb, guide, names):
     needs = {name: words for group in guide.values() for name, words in group.items()}

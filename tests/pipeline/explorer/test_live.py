@@ -12,7 +12,6 @@ from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from pipeline.analysis.attractors.destinations import destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
-from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
@@ -33,6 +32,7 @@ from pipeline.layout.vocabulary import (
     split_dims,
 )
 from pipeline.plots import palette
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.runs.status import state
 from pipeline.specification.spec import Spec

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from pipeline.analysis.ragged import dense
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.view import describe_view
 from pipeline.layout.own_words import with_plain_names
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.small_runs import CURVES

@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
-from pipeline.analysis.ragged import dense
 from pipeline.explorer import RequestError
 from pipeline.explorer.data import diagram as diagrams
 from pipeline.explorer.data import tables
@@ -30,6 +29,7 @@ from pipeline.explorer.data.view import describe_view
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.specification.spec import Spec
 from pipeline.store.run import RunDirectory

@@ -7,9 +7,9 @@ import pytest
 import xarray as xr
 
 from magpend_core.models import load_model
+from pipeline.analysis.branches.declaration import BRANCH_COLUMNS, CURVE_COLUMNS
 from pipeline.layout.own_words import RATE, in_own_words, with_own_names, with_plain_names
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.products.branches import BRANCH_COLUMNS, CURVE_COLUMNS
 
 HERTZ = np.array([[0.5, 0.25], [0.125, np.nan]])
 ABOUT = {"model": model_attribute(load_model("duffing"))}

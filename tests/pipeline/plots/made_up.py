@@ -8,7 +8,7 @@ import xarray as xr
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.status import Status
-from pipeline import plots
+from pipeline.analysis.basins import regimes_figure
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from tests.pipeline.analysis.dense_sets import rows_of
 
@@ -106,4 +106,4 @@ def by_gid(fig, axes=None):
 
 def plot_regimes(ds, **options):
     """Draw the map of a result whose sets are on the dim ``attractor``."""
-    return plots.plot_regimes(rows_of(ds), **options)
+    return regimes_figure.plot_regimes(rows_of(ds), **options)

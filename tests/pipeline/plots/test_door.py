@@ -11,7 +11,6 @@ import xarray as xr
 from matplotlib.colors import to_hex
 
 from magpend_core.models import load_model
-from pipeline.analysis.selection import place
 from pipeline.plots import Frame, draw_figure, save_data, save_figure
 from pipeline.plots.bifurcation import plot_bifurcation
 from pipeline.plots.figure import _metadata
@@ -19,6 +18,7 @@ from pipeline.plots.palette import motions_of
 from pipeline.plots.style import GREY, PALETTE
 from pipeline.products.product import Options, default_of
 from pipeline.products.registry import FIGURES
+from pipeline.results.selection import place
 from tests.pipeline.plots.made_up import PENDULUM
 
 

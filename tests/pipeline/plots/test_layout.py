@@ -10,9 +10,12 @@ import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from magpend_core.models.pendulum.sides import Side
+from pipeline.analysis.attractors.figure import plot_gallery
+from pipeline.analysis.basins.figure import plot_basins
+from pipeline.analysis.basins.fractions_figure import plot_coexisting, plot_fractions
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
-from pipeline.plots import Frame, plot_basins, plot_bifurcation, plot_coexisting, plot_fractions, plot_gallery
+from pipeline.plots import Frame, plot_bifurcation
 from pipeline.plots.style import COLUMN_MM
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import make_attractors, make_portraits

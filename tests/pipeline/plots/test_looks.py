@@ -11,7 +11,8 @@ from cycler import cycler
 from matplotlib import pyplot as plt
 from matplotlib.colors import to_hex
 
-from pipeline.plots import Frame, palette, plot_bifurcation, plot_coexisting, plot_fractions, save_figure
+from pipeline.analysis.basins.fractions_figure import plot_coexisting, plot_fractions
+from pipeline.plots import Frame, palette, plot_bifurcation, save_figure
 from pipeline.plots.looks import check_style, given
 from pipeline.specification.problems import SpecError
 from tests.pipeline.plots.made_up import DUFFING, by_gid, make_attractors

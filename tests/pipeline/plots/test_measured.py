@@ -10,11 +10,12 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.status import Status
-from pipeline.analysis.points import read_points
+from pipeline.analysis.branches.declaration import BranchFigureOptions
 from pipeline.layout.own_words import RATE
 from pipeline.plots import Frame, bifurcation, branches
 from pipeline.plots.measured import by_level
-from pipeline.products.figures import BifurcationOptions, BranchFigureOptions
+from pipeline.products.diagrams import BifurcationOptions
+from pipeline.results.points import read_points
 from pipeline.specification.problems import SpecError
 from tests.pipeline.plots.made_up import DUFFING, PENDULUM, STATES, legend_texts
 

@@ -14,23 +14,12 @@ import xarray as xr
 
 import pipeline.plots
 from magpend_core.models import load_model
+from pipeline.analysis.attractors.figure import plot_gallery
+from pipeline.analysis.basins.figure import plot_basins
+from pipeline.analysis.basins.fractions_figure import plot_coexisting, plot_fractions
+from pipeline.analysis.branches.figure import plot_branches, plot_multipliers
 from pipeline.layout.vocabulary import BOUNDED, CHAOTIC_SET, TRANSIENT
-from pipeline.plots import (
-    Frame,
-    labels,
-    pixels,
-    plot_basins,
-    plot_bifurcation,
-    plot_branches,
-    plot_coexisting,
-    plot_fractions,
-    plot_gallery,
-    plot_multipliers,
-    plot_section,
-    plot_trajectory,
-    save_figure,
-    style,
-)
+from pipeline.plots import Frame, labels, pixels, plot_bifurcation, plot_section, plot_trajectory, save_figure, style
 from pipeline.plots.style import hold
 from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.plots.made_up import (

@@ -10,10 +10,10 @@ import shutil
 
 import pytest
 
-from pipeline.analysis.outcomes import sentence
-from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.report.report import stored_options
+from pipeline.results.outcomes import sentence
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import finished

@@ -11,12 +11,12 @@ from PIL import Image
 from scipy.integrate import solve_ivp
 
 import magpend
-from pipeline.analysis.ragged import dense
 from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import TRANSIENT
 from pipeline.plots import palette
 from pipeline.plots.animation import durations
-from pipeline.products.figures import AnimationOptions
+from pipeline.products.diagrams import AnimationOptions
+from pipeline.results.ragged import dense
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.filming import Start, animation, of_attractors

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from pipeline.layout.identity import numbered
+from pipeline.layout.own_words import with_plain_names
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.runs.versions import version_of
@@ -132,7 +133,10 @@ def of_run(name, folder):
 
 
 def of_analysis(name, analysis, directory):
-    return {"versions": version_of(analysis), "values": told(derive(directory, analysis), exact=False)}
+    return {
+        "versions": version_of(analysis),
+        "values": told(with_plain_names(derive(directory, analysis)), exact=False),
+    }
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis import selection
+from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.layout.own_words import RATE
-from pipeline.products.branches import BranchOptions
 from pipeline.products.product import FigureOptions, StateOptions
+from pipeline.results import selection
 from pipeline.runs.naming import named, place
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory

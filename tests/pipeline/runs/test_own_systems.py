@@ -18,12 +18,11 @@ from magpend_core.engine import jit
 from magpend_core.models import imported
 from pipeline import open_run
 from pipeline.analysis.attractors.analysis import attractors_table
-from pipeline.analysis.branches.analysis import branches_table
 from pipeline.analysis.chaos.analysis import chaos_table
-from pipeline.analysis.ragged import dense
 from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of, parameters_of
-from pipeline.runs.derive import derive
+from pipeline.results.ragged import dense
+from pipeline.runs.derive import derive, shown_table
 from pipeline.specification.problems import SpecError
 from pipeline.store.runfile import read_run
 from pipeline.store.stored_json import seal, unseal
@@ -341,7 +340,7 @@ def test_derive__attractors_chaos_and_branches(directory):
     assert {row["nature"] for row in chaos.rows} == {"regular"}
     assert {row["exponents_from"] for row in chaos.rows} == {"multipliers", "eigenvalues"}
     assert not any("drive" in line for line in chaos.lines)
-    branches = branches_table(derive(directory, "branches", {"low": -0.3, "high": 0.1}))
+    branches = shown_table("branches", derive(directory, "branches", {"low": -0.3, "high": 0.1}))
     # the cycles leave the Hopf point on another section than the run's, and are found on both only once
     assert [row["type"] for row in branches.rows] == ["fold", "hopf"]
     assert [row["mu"] for row in branches.rows] == pytest.approx([-0.25, 0.0], abs=1e-8)

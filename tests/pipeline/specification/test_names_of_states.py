@@ -10,8 +10,8 @@ import pytest
 import magpend
 from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.branches.orbit_search import orbits_table
-from pipeline.analysis.tabular import state_columns
 from pipeline.layout.cells import initial_states
+from pipeline.results.tabular import state_columns
 from pipeline.runs.zoom import Changes, Widening, put_value, widened, zoom
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec

@@ -12,10 +12,10 @@ from matplotlib.text import Text
 from scipy.integrate import solve_ivp
 
 import magpend
+from pipeline.analysis.branches.declaration import BranchOptions, CurveOptions
 from pipeline.compute.simulate import simulate
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.own_words import in_own_words
-from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.product import StateOptions
 from pipeline.runs.naming import named
 from pipeline.specification.problems import SpecError
@@ -134,7 +134,7 @@ def test_left_out__has_the_word_of_the_specification(runs):
 @pytest.mark.slow
 def test_options__take_values_in_the_word_that_they_name(runs):
     part = runs["frequency_hz"].branches(parameter="omega", low=1.3, high=1.5, max_period=1)
-    assert (part.attrs["parameter"], len(part["value"])) == ("frequency", 1)
+    assert (part.attrs["parameter"], len(part["bifurcation_frequency"])) == ("frequency", 1)
     np.testing.assert_allclose(part["frequency"].max(), 1.5 / (2 * pi), rtol=1e-12)
     own = runs["period"].branches(low=2 * pi / 1.5, high=2 * pi / 1.3, max_period=1)  # of the only axis, so in its word
     np.testing.assert_allclose(own["bifurcation_frequency"], part["bifurcation_frequency"], rtol=1e-7)

@@ -31,9 +31,9 @@ from pipeline.analysis.attractors.extension.growth import Growth, growth_of, kin
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Settings, Slopes, Work
-from pipeline.analysis.sets import TWO_PI, Geometry
-from pipeline.analysis.tolerances import PORTRAIT_RTOL, ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
+from pipeline.results.sets import TWO_PI, Geometry
+from pipeline.results.tolerances import PORTRAIT_RTOL, ROUGH_SLOPE_RTOL, SLOPE_RTOL
 
 SLOPES = (1024, 4096)
 """Most derivatives of the section map for the exponents of a set: at first, and if the first are too few."""

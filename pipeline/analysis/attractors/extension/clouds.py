@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from magpend_core.neighbours import n_nearer
-from pipeline.analysis.sets import Geometry, nearest_distances
+from pipeline.results.sets import Geometry, nearest_distances
 
 SAME, OTHER = 0.25, 0.05
 """Share of neighbours in the other sample from which two samples are one set, and below which two sets."""

@@ -22,8 +22,8 @@ from pipeline.analysis.attractors.extension.extending import LEAST_BUDGET, LEAST
 from pipeline.analysis.attractors.extension.growth import Escape, Growth, growth_of
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Settings, Work
-from pipeline.analysis.tolerances import SLOPE_RTOL
 from pipeline.layout.vocabulary import CHAOTIC_SET
+from pipeline.results.tolerances import SLOPE_RTOL
 
 MOST_LEVELS = 32
 """Most values of constant quantities whose cells get rows of their own."""

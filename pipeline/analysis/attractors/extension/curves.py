@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from magpend_core.rotation import section_turns, weights
-from pipeline.analysis.sets import TWO_PI, Geometry
+from pipeline.results.sets import TWO_PI, Geometry
 
 LEAST_POINTS, MOST_POINTS = 256, 2048
 """Fewest section points that are fitted, and most."""

@@ -39,10 +39,10 @@ from pipeline.analysis.attractors.finding.equilibria import approaching, rest_ne
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Work
 from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
-from pipeline.analysis.intervals import lifetime_interval
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import REACH
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET, NEUTRAL, NOT_SETTLED
+from pipeline.results.intervals import lifetime_interval
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import REACH
 
 LEAST_BUDGET = 16_384
 """Least budget of a parameter point [periods], however short the run was."""

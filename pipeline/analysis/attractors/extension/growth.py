@@ -23,8 +23,8 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from magpend_core.stretching import stretched
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
+from pipeline.results.sets import Geometry
 
 N_SIGMA = 3.0
 """Half width of an exponent's interval in standard errors; `_mean` widens it if blocks are few."""

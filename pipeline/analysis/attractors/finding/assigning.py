@@ -12,9 +12,9 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import LOOSE_SHARE, REACH, STRICT
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import LOOSE_SHARE, REACH, STRICT
 
 MOST_PAIRS = 2**18
 """Most distances between cells and points of orbits that are held at once."""

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from magpend_core.status import Status
-from pipeline.analysis.sets import Geometry, groups, hashes
+from pipeline.results.sets import Geometry, groups, hashes
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import position_error
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
-from pipeline.analysis.sets import Geometry, order_by_points, order_of_points, rounded_points
-from pipeline.analysis.tolerances import (
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
+from pipeline.results.sets import Geometry, order_by_points, order_of_points, rounded_points
+from pipeline.results.tolerances import (
     EXTEND_CLOSURE,
     EXTEND_RTOL,
     MATRIX_ERROR,
@@ -31,7 +32,6 @@ from pipeline.analysis.tolerances import (
     SAME_HALF,
     SAME_ORBIT,
 )
-from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
 NEAR_STEPS = 8
 """Most Newton steps of the first polish."""

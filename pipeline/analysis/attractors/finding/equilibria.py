@@ -22,8 +22,8 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.held import held_near, ways
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.sets import Geometry, hashes, order_of_points
-from pipeline.analysis.tolerances import AT_EQUILIBRIUM, NEAR_REST, SAME_EQUILIBRIUM, WAIT_RTOL
+from pipeline.results.sets import Geometry, hashes, order_of_points
+from pipeline.results.tolerances import AT_EQUILIBRIUM, NEAR_REST, SAME_EQUILIBRIUM, WAIT_RTOL
 
 WAITS = 16
 """Most repetitions of the wait for a return, for cells that are near no equilibrium yet."""

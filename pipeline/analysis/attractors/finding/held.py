@@ -22,8 +22,8 @@ from magpend_core.sections import run_branches
 from magpend_core.sizes import natural_size
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import BRANCH_RTOL, MATRIX_ERROR, NEAR_REST, SAME_EQUILIBRIUM, WAIT_RTOL
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import BRANCH_RTOL, MATRIX_ERROR, NEAR_REST, SAME_EQUILIBRIUM, WAIT_RTOL
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 """Ratio of the two times over which a state must not move: no motion has a period that divides both."""

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import RATE_ERROR, ROUNDING
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import RATE_ERROR, ROUNDING
 
 
 @dataclass(frozen=True)

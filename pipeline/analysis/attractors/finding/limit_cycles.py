@@ -21,9 +21,9 @@ from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.finding.closed_orbits import orbit_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.sets import Geometry, hashes
-from pipeline.analysis.tolerances import BRANCH_RTOL, CROSSING_RTOL, REACH, SAME_ORBIT, SAME_RETURN, SAME_SECONDS
 from pipeline.layout.vocabulary import ATTRACTS
+from pipeline.results.sets import Geometry, hashes
+from pipeline.results.tolerances import BRANCH_RTOL, CROSSING_RTOL, REACH, SAME_ORBIT, SAME_RETURN, SAME_SECONDS
 
 RETURNS = 32
 """Most crossings of the level per period."""

@@ -18,9 +18,9 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.growth import volumes_of
 from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, frequency_of, model_of, parameters_of, split_dims
 from pipeline.products.reporting import UNTOLD, report
+from pipeline.results.sets import Geometry
 
 _READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
 """Variables that are read from a cube."""

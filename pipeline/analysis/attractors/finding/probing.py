@@ -17,7 +17,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Work
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 DISTANCES = (0.5, 0.05, 0.01)
 """Scaled distances at which trajectories start, tried in turn until one shows an approach."""

@@ -21,10 +21,10 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.flight import Flight
-from pipeline.analysis.sets import Geometry, hashes
 from pipeline.analysis.together import run_together
-from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
 from pipeline.products.reporting import UNTOLD, report
+from pipeline.results.sets import Geometry, hashes
+from pipeline.results.tolerances import SLOPE_RTOL, STRICT
 
 FINDING, EXTENDING = "finding attractors", "extending cells"
 """Names of the work before and after the first leg of an extension."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import ClosedCells, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, number_of
@@ -18,9 +19,8 @@ from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Dynamics, Point
 from pipeline.analysis.attractors.finding.requests import Polish, Settings, Work
 from pipeline.analysis.attractors.finding.spirals import MAX_GUESSES, beside, near_closed
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import LOOSE_SHARE, STRICT
-from pipeline.products.attractors import IdentifyOptions
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import LOOSE_SHARE, STRICT
 
 ROUNDS, ROUNDS_LOOSE = 3, 6
 """Most rounds of guessing and polishing, with a strict and with a loose tolerance."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.analysis.attractors.finding.cell_blocks import Guesses, marks_of
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
-from pipeline.analysis.sets import Geometry, hashes
+from pipeline.results.sets import Geometry, hashes
 
 NEAR = 0.05
 """Largest scaled distance between recurring sections at which a cell makes a guess."""

@@ -10,9 +10,9 @@ from scipy.linalg import expm
 from scipy.optimize import fsolve
 from scipy.spatial.distance import cdist
 
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.resilience.shocks import Asked, Bases, search_together
-from pipeline.products.resilience import ResilienceOptions
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import AnalysedRun
 from tests.core.flows import table
 from tests.pipeline.analysis.cubes import WELLS, line, sweep

@@ -9,8 +9,8 @@ from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, CLOSED, EXTENDED, PERIODIC_ORBIT, UNDECIDED
+from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.cubes import STATES, cube_of
 from tests.pipeline.analysis.dense_sets import identify
 

@@ -7,8 +7,8 @@ from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, raw_orbit
 from pipeline.analysis.attractors.finding.spirals import near_closed
-from pipeline.analysis.sets import Geometry, groups, hashes, mean_distance, nearest_distances
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
+from pipeline.results.sets import Geometry, groups, hashes, mean_distance, nearest_distances
 
 GEOMETRY = Geometry((True, True, False, False), (1.0, 1.0, 10.0, 10.0))
 PLANE = Geometry((True, False), (1.0, 10.0))

@@ -11,9 +11,9 @@ from pipeline.analysis.attractors.features import Features
 from pipeline.analysis.attractors.finding.points import PASSING
 from pipeline.analysis.attractors.hysteresis import find_hysteresis
 from pipeline.analysis.attractors.labelling import Found
-from pipeline.analysis.outcomes import share_interval, shares_of_others
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NO_RETURN, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.products.reporting import reporting
+from pipeline.results.outcomes import share_interval, shares_of_others
 from tests.pipeline.analysis.cubes import STATES
 from tests.pipeline.analysis.dense_sets import identify, match
 from tests.pipeline.plots.made_up import make_attractors

@@ -6,7 +6,7 @@ import pytest
 from magpend_core.models import load_model
 from pipeline.analysis.attractors.finding import closed_orbits
 from pipeline.analysis.attractors.finding.closed_orbits import polish
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 from tests.core.cells import scipy_end
 
 pytestmark = pytest.mark.slow

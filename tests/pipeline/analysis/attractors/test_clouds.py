@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.extension.clouds import OTHER, SAME, Cloud, group, is_stationary, members, mixing
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 PLANE = Geometry((False, False), (1.0, 1.0))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.extension.curves import Curve
-from pipeline.analysis.sets import TWO_PI, Geometry
 from pipeline.layout.vocabulary import ATTRACTS, NOT_SETTLED, TORUS
+from pipeline.results.sets import TWO_PI, Geometry
 from tests.pipeline.analysis.maps import MapPoint, settle
 
 PLANE = Geometry((False, False), (1.0, 1.0))

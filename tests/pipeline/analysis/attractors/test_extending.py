@@ -10,9 +10,9 @@ from pipeline.analysis.attractors.extension.extending import Outcome, _Extension
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.analysis.attractors.labelling import _label_courses, _Labels, _preserves_volume, _representatives
-from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
+from pipeline.results.sets import Geometry
+from pipeline.results.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from tests.pipeline.analysis.maps import FIXED, N_KEEP, MapPoint, henon, settle, slopes_of, tent
 
 TENT_SLOPE = 2.05

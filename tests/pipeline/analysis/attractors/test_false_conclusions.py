@@ -10,7 +10,6 @@ from magpend_core.equilibria import find_equilibria
 from magpend_core.models import load_model
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.stability import BY_ONE_SIDE
-from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     BOUNDED_SET,
@@ -25,6 +24,7 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
 from tests.core.flows import table

@@ -9,7 +9,7 @@ from magpend_core.models.model import Mirror
 from pipeline.analysis.attractors import features, matching
 from pipeline.analysis.attractors.finding import closed_orbits
 from pipeline.analysis.attractors.finding.closed_orbits import distinct, raw_orbit
-from pipeline.analysis.sets import Geometry, order_by_points
+from pipeline.results.sets import Geometry, order_by_points
 from tests.core.test_ordering import noisy
 
 GEOMETRY = Geometry((True, False), (1.0, 10.0))

@@ -10,8 +10,8 @@ from pipeline.analysis.attractors.extension.courses import GROWS
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.analysis.attractors.labelling import _preserves_volume
-from pipeline.analysis.sets import TWO_PI, Geometry
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, NEUTRAL
+from pipeline.results.sets import TWO_PI, Geometry
 from tests.pipeline.analysis.maps import N_KEEP, MapPoint, drive, settle
 
 PLANE = Geometry((False, False), (1.0, 1.0))

@@ -12,7 +12,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.probing import probe_orbit
 from pipeline.analysis.attractors.finding.requests import LEG
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 PLANE = Geometry((False, False), (1.0, 1.0))
 

@@ -10,7 +10,7 @@ from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.attractors.finding.equilibria import _path_to, _settled
 from pipeline.analysis.attractors.finding.held import SHARES, rates_shown
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 from pipeline.runs.derive import derive
 from tests.core.flows import table
 from tests.pipeline.analysis.cubes import line, sweep

@@ -7,8 +7,8 @@ from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG
 from pipeline.analysis.attractors.finding.spirals import Recurrence, leap, near_closed
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
+from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.cubes import STATES, cube_of
 from tests.pipeline.analysis.dense_sets import identify
 

@@ -10,9 +10,9 @@ from pipeline.analysis.attractors.features import Features
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.attractors.labelling import _fill_orbit
-from pipeline.analysis.outcomes import other_cells, outcomes, sentence
-from pipeline.analysis.ragged import dense, isel
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, PERIODIC_ORBIT, UNSTABLE
+from pipeline.results.outcomes import other_cells, outcomes, sentence
+from pipeline.results.ragged import dense, isel
 from pipeline.runs.derive import derive, stale
 from tests.core.flows import table
 from tests.pipeline.analysis.cubes import line, sweep

@@ -8,8 +8,8 @@ from scipy.stats import binomtest
 from magpend_core.status import Status
 from pipeline.analysis.basins.analysis import basins_of, basins_table
 from pipeline.analysis.basins.numbers import basin_rows
-from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.branches.bands import GRID, bands_table, moving_of, orbit_data, place_variables
+from pipeline.analysis.branches.bands import GRID, moving_of, orbit_data, place_variables
 from pipeline.analysis.branches.carrying import Along
-from pipeline.analysis.draws import LEVELS, stretches
 from pipeline.plots.bifurcation import draw_bands
 from pipeline.plots.labels import Measure
 from pipeline.plots.style import WIDE, new_figure
-from pipeline.runs.derive import derive, stored
+from pipeline.results.draws import LEVELS, stretches
+from pipeline.runs.derive import derive, shown_table, stored
 from pipeline.runs.drawing import figure
 from pipeline.specification.problems import SpecError
 from tests.pipeline.bautin import SWEEP
@@ -45,7 +45,7 @@ def test_bands__bifurcations_are_those_of_the_closed_form(bench):
     fold = h - 1 / (4 * g)
     np.testing.assert_allclose(by_kind["fold"], fold, atol=1e-6)
     np.testing.assert_allclose(by_kind["hopf"], h, atol=1e-6)
-    row = next(row for row in bands_table(found).rows if row["type"] == "fold")
+    row = next(row for row in shown_table("bands", found).rows if row["type"] == "fold")
     np.testing.assert_allclose([row["low"], row["median"], row["high"]], np.quantile(fold, LEVELS), atol=1e-6)
     assert (row["n_draws"], row["share"]) == (60, 1.0)
     assert row["value"] == pytest.approx(0.05 - 1 / 4.8, abs=1e-7)

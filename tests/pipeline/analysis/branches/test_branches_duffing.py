@@ -8,11 +8,11 @@ from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
+from pipeline.analysis.branches.declaration import CURVE_COLUMNS
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from pipeline.layout.columns import described
-from pipeline.products.branches import CURVE_COLUMNS
 
 pytestmark = pytest.mark.slow
 

@@ -14,10 +14,10 @@ from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.figure import plot_branches
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.limits import FITS, fit_law, grows_without_bound, logarithm, root
 from pipeline.analysis.branches.starting_orbits import family_of
-from pipeline.plots.branches import plot_branches
 from tests.core.cells import scipy_end
 from tests.core.flows import BAUTIN, HOPF, LORENZ, PAIR, ROSSLER, flow, table
 

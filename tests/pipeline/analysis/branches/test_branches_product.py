@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.analysis import attractors_table
-from pipeline.analysis.branches.analysis import branches_table
+from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
-from pipeline.analysis.ragged import dense
 from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
-from pipeline.products.branches import BranchOptions
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import AnalysedRun, derive, prepared, shown_table
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import sweep
@@ -58,17 +57,17 @@ def test_branches__all_periods_or_a_line(directory):
         ds = derive(directory, "branches", ALONG)
     assert sorted(set(ds["orbit_period"].values.tolist())) == [1, 2, 4]
     assert any("following branches" in what and 0 < done <= total for what, done, total in heard)
-    told = branches_table(ds)
+    told = shown_table("branches", ds)
     assert {(row["label"], row["type"]) for row in told.rows} >= {("PD", "period_doubling")}
     lines = told.lines
     assert any("does not close" in line and "--recurrences" in line for line in lines)
     short = derive(directory, "branches", SHORT)
-    left_out = [line for line in branches_table(short).lines if "take it with --period 4" in line]
+    left_out = [line for line in shown_table("branches", short).lines if "take it with --period 4" in line]
     assert len(left_out) == 1
     assert "amplitude = 0.289" in left_out[0]
     # a stored result says it again
     again = derive(directory, "branches", SHORT)
-    assert branches_table(again).lines == branches_table(short).lines
+    assert shown_table("branches", again).lines == shown_table("branches", short).lines
 
 
 def test_branches__none_to_begin_with(directory, main, tmp_path):
@@ -99,7 +98,7 @@ def test_branches__along_the_frequency_by_either_name(directory):
     assert one.attrs["parameter_units"] == "Hz"
     # the branches begin at other amplitudes, and say so
     assert set(np.round(one["amplitude"].values, 3)) == {0.25}
-    for row in branches_table(one).rows:
+    for row in shown_table("branches", one).rows:
         assert [name for name in row if "frequency" in name] == ["frequency_hz"]
         assert row["amplitude"] == 0.25
 

@@ -8,6 +8,7 @@ from scipy.optimize import brentq, fsolve, minimize_scalar
 import magpend
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
+from pipeline.analysis.basins.regimes_figure import plot_curves
 from pipeline.analysis.branches.analysis import curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
@@ -15,8 +16,7 @@ from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.homoclinic import Loop
 from pipeline.analysis.branches.homoclinic_curves import homoclinic_curves, loop_near
 from pipeline.analysis.branches.problems import Family, Value
-from pipeline.analysis.tabular import words_of
-from pipeline.plots.regimes import plot_curves
+from pipeline.results.tabular import words_of
 from tests.core.flows import LORENZ, flow, table
 from tests.pipeline.analysis.branches.test_branches_flows import followed
 

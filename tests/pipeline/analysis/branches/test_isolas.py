@@ -14,9 +14,9 @@ from pipeline.analysis.branches.analysis import branches_table, cut_of, isolas_o
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.kinds import KINDS, PITCHFORK
 from pipeline.analysis.branches.searching import VERDICTS, places_of
-from pipeline.analysis.response.analysis import response_table
 from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import parameters_of
+from pipeline.runs.derive import shown_table
 from tests.pipeline.analysis.cubes import swept
 from tests.pipeline.analysis.response.test_response import cycles_run
 
@@ -198,7 +198,7 @@ def test_deflation__needs_fewer_starts(run, monkeypatch):
 @pytest.mark.slow
 def test_response__names_the_isola(run):
     response = run.response(**SEARCHED)
-    table = response_table(response)
+    table = shown_table("response", response)
     assert [line for line in table.lines if line.endswith("isola")]
     assert {row["isola"] for row in table.rows} == {False, True}
     upper, _ = run.plot.response(**SEARCHED)
@@ -215,7 +215,7 @@ def test_index_sums__per_row_of_a_run(tmp_path):
     words = [VERDICTS[code] for code in ds["index_verdict"].values[:, 0]]
     assert ds["searched_b"].values.tolist() == [-0.3, -0.3, 1.0, 1.0]
     assert words == ["diverged", "diverged", "agrees", "agrees"]
-    lines = "\n".join(branches_table(ds).lines)
+    lines = "\n".join(shown_table("branches", ds).lines)
     assert "as if none is missing" in lines
     assert "says nothing: cells diverged" in lines
 

@@ -10,11 +10,10 @@ from matplotlib.text import Text
 from scipy.optimize import fsolve
 
 import magpend
-from pipeline.analysis.branches.analysis import branches_table
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
-from pipeline.runs.derive import derive
+from pipeline.runs.derive import derive, shown_table
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from tests.pipeline.factories import finished
@@ -137,7 +136,7 @@ def test_logistic__grid_values_on_bifurcations(tmp_path):
         ([3.0], (2.9, 3.1), {"period_doubling": 3.0}, [1, 2]),
     ):
         ds = logistic(tmp_path / str(len(values)), values).branches(parameter="r", low=ends[0], high=ends[1])
-        rows = branches_table(ds).rows
+        rows = shown_table("branches", ds).rows
         assert sorted(ds["orbit_period"].values) == periods
         assert [(row["type"], row["period"]) for row in rows] == [(kind, 1) for kind in known]
         # where branches cross Newton's method is as exact as the root of its residual
@@ -194,7 +193,7 @@ def test_twice__pitchfork_that_turns_sharply(tmp_path):
     run = logistic(tmp_path / "run", [3.83, 3.8425], TWICE)
     known = fsolve(doubling, [0.5, 3.8415], xtol=1e-13)[1]
     ds = run.branches(low=3.82, high=3.848, max_period=3)
-    table = branches_table(ds)
+    table = shown_table("branches", ds)
     (fold, pitchfork, *doublings) = table.rows
     assert [row["type"] for row in table.rows] == ["fold", "pitchfork", "period_doubling", "period_doubling"]
     assert fold["r"] == pytest.approx(1.0 + np.sqrt(8.0), abs=1e-8)

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import root
 
 from pipeline.analysis.branches.tongues import cells_of, fractions_between, tongues_table
-from pipeline.plots.tongues import plot_rotation, plot_tongues
+from pipeline.analysis.branches.tongues_figure import plot_rotation, plot_tongues
 from pipeline.products.rotation import RotationFlag
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError

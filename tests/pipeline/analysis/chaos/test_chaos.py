@@ -10,9 +10,10 @@ import xarray as xr
 from pipeline import open_run
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.chaos.analysis import chaos_of, chaos_table, chaotic_cells, dimension_table, section_dimension
+from pipeline.analysis.chaos.convergence_figure import plot_convergence
+from pipeline.analysis.chaos.dimension_figure import plot_dimension
 from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean
 from pipeline.analysis.chaos.per_attractor import Nature
-from pipeline.analysis.ragged import dense
 from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import (
     ABSENT,
@@ -25,7 +26,7 @@ from pipeline.layout.vocabulary import (
     TRANSIENT,
     UNSTABLE,
 )
-from pipeline.plots import plot_convergence, plot_dimension
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import derive
 from tests.pipeline.analysis.cubes import artists, exponents_cube, sweep
 from tests.pipeline.analysis.dense_sets import rows_of

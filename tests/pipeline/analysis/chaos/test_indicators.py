@@ -7,8 +7,8 @@ import xarray as xr
 from magpend_core.status import Status
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.zero_one import zero_one_test
-from pipeline.analysis.sets import Geometry
 from pipeline.products.lyapunov import LyapunovFlag
+from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.maps import henon
 
 LINE, PLANE = Geometry((False,), (1.0,)), Geometry((False, False), (1.0, 1.0))

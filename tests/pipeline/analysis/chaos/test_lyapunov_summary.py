@@ -6,7 +6,7 @@ from matplotlib.collections import PolyCollection
 
 from magpend_core import Status, load_preset, lyapunov_exponents
 from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
-from pipeline.plots import plot_lyapunov, plot_lyapunov_map
+from pipeline.analysis.chaos.lyapunov_figure import plot_lyapunov, plot_lyapunov_map
 from tests.core.cells import stroboscopic_map
 from tests.pipeline.analysis.cubes import artists, exponents_cube
 from tests.pipeline.analysis.maps import henon, slopes_of

@@ -13,7 +13,7 @@ from pipeline.analysis.branches.starting_orbits import family_of
 from pipeline.analysis.events import connections
 from pipeline.analysis.events.connections import Leaving, Rest, _sides, connection_of, rest_at, rests_in
 from pipeline.analysis.events.contact import Effort, SectionMap, sample_of
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.events.test_events import lorenz_connection
 
 LORENZ = magpend.load_model("lorenz")

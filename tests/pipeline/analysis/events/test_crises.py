@@ -21,7 +21,7 @@ from pipeline.analysis.events.contact import (
 )
 from pipeline.analysis.events.crises import OF_MAP
 from pipeline.analysis.events.transients import fit_lifetimes
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.2)
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mu=0.5)
@@ -50,7 +50,8 @@ def decided(run):
     """The decided events of a run: name, period of the orbit, value and exponent of lifetimes with their errors."""
     table = run.table("events")
     rows = table[~table["what"].isin(["range_end", "not_decided"])]
-    names = ["what", "met_period", "value", "value_error", "exponent", "exponent_error"]
+    (error, _) = [column for column in table if column.endswith("_error")]
+    names = ["what", "met_period", error.removesuffix("_error"), error, "exponent", "exponent_error"]
     return [tuple(row) for row in rows[names].to_numpy()], table
 
 

@@ -20,10 +20,10 @@ from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.lines import Fate, Line, bifurcation_at, crossing_at, follow, lines_of
 from pipeline.analysis.events.one_event import on_circle, same_as, with_images
 from pipeline.analysis.events.scene import Event, Stretch
-from pipeline.analysis.ragged import ROW_SIZE
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.results.ragged import ROW_SIZE
+from pipeline.results.sets import Geometry
 from pipeline.specification.problems import SpecError
 
 CUBIC = magpend.model("x' = mu*x - x**3", name="cubic", kind="map", mirror={"signs": {"x": -1}}, mu=0.5)

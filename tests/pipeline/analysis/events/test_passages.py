@@ -11,7 +11,7 @@ import magpend
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD
 from pipeline.analysis.events import grazing, passages
 from pipeline.analysis.events.passages import Phases, phases, rotation_of, scaling
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 
 LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.83)
 # odd maps whose orbits of period 1 lose stability at e = 0, subcritically, and that come back to 0 from afar

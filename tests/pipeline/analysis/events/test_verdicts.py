@@ -12,10 +12,10 @@ from pipeline.analysis.events.breakups import LOCKED, ROUNDS, VALUES, _Found, br
 from pipeline.analysis.events.cascades import DELTA, _chain, cascade_of, torus_of
 from pipeline.analysis.events.lines import Fate
 from pipeline.analysis.events.names import BREAKUP, CASCADE
-from pipeline.analysis.sets import Geometry
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET
 from pipeline.layout.vocabulary import TORUS as TORUS_SET
+from pipeline.results.sets import Geometry
 
 LINE = Geometry((False,), (1.0,))
 PLANE = Geometry((False, False), (1.0, 1.0))

@@ -22,9 +22,9 @@ from pipeline.analysis.manifolds.analysis import (
     needs_tangency,
     tangency_table,
 )
+from pipeline.analysis.manifolds.declaration import TangencyOptions
 from pipeline.analysis.manifolds.growing import Manifold
 from pipeline.layout.conventions import code_flags
-from pipeline.products.manifolds import TangencyOptions
 from tests.pipeline.analysis.manifolds.test_growing import linear
 
 

@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from magpend_core.status import Status
+from pipeline.analysis.noise.declaration import DensityOptions, EscapeOptions
 from pipeline.analysis.noise.density import _edges, density, density_table, find_density_peaks
 from pipeline.analysis.noise.escapes import (
     _fill_paths,
@@ -22,7 +23,6 @@ from pipeline.analysis.noise.escapes import (
 )
 from pipeline.analysis.noise.exits import cells_at_points, region_of
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.products.noise import DensityOptions, EscapeOptions
 from tests.core.flows import model_of
 
 WELLS = model_of(

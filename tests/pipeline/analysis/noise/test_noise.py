@@ -8,11 +8,11 @@ import xarray as xr
 
 from magpend_core import load_model
 from magpend_core.status import Status
+from pipeline.analysis.noise.declaration import EscapeOptions
 from pipeline.analysis.noise.density import effective_number, find_density_peaks, silverman_bandwidth
 from pipeline.analysis.noise.escapes import NO_FIT, constancy, fit_kramers, mean_and_spread, rate_interval
 from pipeline.analysis.noise.exits import NOT_LEFT, PointCells, find_exits, labels_of, region_of
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.products.noise import EscapeOptions
 from tests.core.flows import table
 
 

@@ -9,14 +9,14 @@ from scipy.linalg import expm
 
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
-from pipeline.analysis.ragged import dense
 from pipeline.analysis.resilience.analysis import resilience_table
+from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.resilience.edge import edge_table, ids_of
+from pipeline.analysis.resilience.edge_figure import plot_edge
+from pipeline.analysis.resilience.figure import plot_resilience
 from pipeline.analysis.resilience.shocks import Asked, Bases, search_together
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, KINDS, PERIODIC_ORBIT
-from pipeline.plots.basins import plot_edge
-from pipeline.plots.resilience import plot_resilience
-from pipeline.products.resilience import ResilienceOptions
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 from tests.core.cells import scipy_end

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.destinations import UNDECIDED
+from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.resilience.shocks import ShockSearch, Trials
-from pipeline.products.resilience import ResilienceOptions
 
 OWN, OTHER = 0, 4
 NORMAL = np.array([0.36, -0.48, 0.8])

@@ -12,8 +12,8 @@ import magpend
 from magpend_core.models import load_model
 from magpend_core.models.parameters import ParameterError
 from pipeline.analysis.branches.lockstep import run_alone
-from pipeline.analysis.response.backbone import backbone_table
 from pipeline.analysis.response.resonance import ModeProblem, mode_family, normal_mode
+from pipeline.runs.derive import shown_table
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import swept
 
@@ -179,7 +179,7 @@ def test_normal_mode__of_a_pendulum_softens_towards_its_upper_rest(tmp_path):
     assert amplitude[-1] > 3.0
     assert float(one["frequency"][-1]) == pytest.approx(0.06, abs=1e-5)
     # with damping there is none, and the table says why
-    assert "grows or decays at the rate -0.05 1/s; see --undamped" in backbone_table(run.backbone()).nothing
+    assert "grows or decays at the rate -0.05 1/s; see --undamped" in shown_table("backbone", run.backbone()).nothing
     assert run.plot.backbone(undamped={"c": 0.0}, low=0.06).get_xlabel() == "frequency [Hz]"
 
 

@@ -21,6 +21,7 @@ from pipeline.analysis.response.backbone import (
     _swing,
     backbone_table,
 )
+from pipeline.analysis.response.declaration import BackboneOptions
 from pipeline.analysis.response.orbits import Measures, Orbit, _amplitude, _highest, _measure, harmonics_of, lags_of
 from pipeline.analysis.response.resonance import (
     ENDS,
@@ -33,7 +34,6 @@ from pipeline.analysis.response.resonance import (
     mode_start,
 )
 from pipeline.layout.conventions import code_flags
-from pipeline.products.backbone import BackboneOptions
 from pipeline.specification.problems import SpecError
 from tests.core.flows import HOPF
 

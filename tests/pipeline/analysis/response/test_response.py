@@ -12,8 +12,8 @@ from scipy.optimize import fsolve
 
 import magpend
 from magpend_core.models import load_model
-from pipeline.analysis.response.analysis import response_table
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
+from pipeline.runs.derive import shown_table
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import swept
 
@@ -104,7 +104,7 @@ def test_duffing__has_the_folds_and_the_landings_of_an_independent_integration(r
         assert (float(response["jump_beyond"][k]) > float(response["bifurcation_frequency"][event])) == rises
         down = float(response["jump_amplitude"][k, 0]) < float(response["bifurcation_amplitude"][event, 0])
         assert down == rises  # a hardening spring falls off as the frequency rises
-    lines = "\n".join(response_table(response).lines)
+    lines = "\n".join(shown_table("response", response).lines)
     assert lines.count("rises") == lines.count("falls") == 2
 
 
@@ -116,7 +116,7 @@ def test_duffing__has_a_response_without_a_bifurcation_to_a_force_called_amplitu
     assert (ds.sizes["bifurcation"], ds.sizes["branch"]) == (0, 2)
     largest = ds["amplitude"].sel(channel="x").max("point")
     np.testing.assert_allclose(largest / ds["parameter_amplitude"], largest[0] / 0.01, rtol=1e-2)
-    row = response_table(ds).rows[0]
+    row = shown_table("response", ds).rows[0]
     assert row["parameter_amplitude"] == 0.01
     assert row["amplitude"] == float(ds["amplitude"][0, 0, 0])
 
@@ -244,7 +244,7 @@ def test_flow__cycles_in_closed_form_that_end_at_a_fold(tmp_path):
     assert not ds["jump_rises"][jump]
     # beyond, trajectories spiral to rest
     assert (ds["jump_amplitude"][jump] < 1e-6).all()
-    assert re.search(r"^ *-0\.25 +LP +falls .* rest$", "\n".join(response_table(ds).lines), re.MULTILINE)
+    assert re.search(r"^ *-0\.25 +LP +falls .* rest$", "\n".join(shown_table("response", ds).lines), re.MULTILINE)
 
 
 @pytest.mark.slow

@@ -11,12 +11,11 @@ import xarray as xr
 import magpend
 from magpend_core.models import load_model
 from pipeline.analysis.spectrum.analysis import axes_of, needs_axis, needs_channel, spectrum_table
+from pipeline.analysis.spectrum.declaration import SpectrumFigureOptions, SpectrumOptions, WaterfallOptions
 from pipeline.analysis.spectrum.estimate import ALL, LOBE, _near, _peak, averaged, frequencies_of, pieces_of, power_unit
 from pipeline.analysis.spectrum.gaps import Settings, _fit, _weights, filled
 from pipeline.analysis.spectrum.motions import _of_cell, clock_of, needs_motion, row_axis, settle_motion, swept_by
 from pipeline.layout.vocabulary import BOUNDED_SET
-from pipeline.products.figures import SpectrumFigureOptions, WaterfallOptions
-from pipeline.products.spectrum import SpectrumOptions
 
 TURN = 2.0 * np.pi
 

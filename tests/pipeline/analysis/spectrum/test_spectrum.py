@@ -12,8 +12,8 @@ import magpend
 from pipeline.analysis.series.analysis import series_table
 from pipeline.analysis.spectrum.analysis import LINES, spectrum_table
 from pipeline.analysis.spectrum.estimate import ALL, frequencies_of
+from pipeline.analysis.spectrum.figure import plot_spectrum
 from pipeline.analysis.spectrum.gaps import filled
-from pipeline.plots.spectrum import plot_spectrum
 from pipeline.specification.problems import SpecError
 from tests.pipeline.analysis.cubes import swept
 
@@ -296,7 +296,7 @@ def test_spectrum__of_a_flow_is_in_hertz(tmp_path):
     found = run.spectrum()
     assert "order" not in found.coords
     closed = found["orbit_period"].values == 1
-    mu = found["at_mu"].values[closed]
+    mu = found["mu"].values[closed]
     np.testing.assert_allclose(found["amplitude"].values[closed, 0], np.sqrt(0.5 + np.sqrt(0.25 + mu)), rtol=1e-8)
     np.testing.assert_allclose(found["frequency_hz"].values[closed, 0], 1.0 / np.pi, rtol=1e-8)
     np.testing.assert_allclose(found["amplitude"].values[closed, 1:], 0.0, atol=1e-8)

@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from magpend_core.models import load_model
-from pipeline.analysis.outcomes import DIVERGED
 from pipeline.analysis.tipping.analysis import (
     Bisection,
     Bracket,
@@ -22,10 +21,11 @@ from pipeline.analysis.tipping.analysis import (
     outcome_word,
     tipping_table,
 )
+from pipeline.analysis.tipping.declaration import TippingOptions
 from pipeline.analysis.tipping.endings import NONE, Final, Group, ends_s, finals_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import KINDS
-from pipeline.products.tipping import TippingOptions
+from pipeline.results.outcomes import DIVERGED
 from pipeline.specification.spec import Spec
 from tests.core.flows import model_of
 from tests.pipeline.factories import FOLD, FOLD_LENGTH

@@ -9,10 +9,10 @@ import pytest
 import xarray as xr
 
 from magpend_core.models.drift.ramps import LINEAR, Ramp
+from pipeline.analysis.tipping.declaration import DELAY_COLUMNS, DelayOptions
 from pipeline.analysis.tipping.delay import delay, delay_table, lags, left_at, moving_parameter, needs_sections
 from pipeline.layout.columns import described
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.products.tipping import DELAY_COLUMNS, DelayOptions
 from tests.core.flows import model_of
 
 MODEL = model_of({"x": "mu*x"}, {"mu": {"value": 0.0, "unit": "1/s"}})

@@ -10,9 +10,9 @@ import xarray as xr
 from scipy.stats import binomtest
 
 from magpend_core.status import Status
-from pipeline.analysis.outcomes import DIVERGED
+from pipeline.analysis.tipping.declaration import OverlapOptions
 from pipeline.analysis.tipping.overlaps import needs_basins, overlaps, overlaps_table
-from pipeline.products.tipping import OverlapOptions
+from pipeline.results.outcomes import DIVERGED
 from tests.pipeline.analysis.basins.test_basins import labelled
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.noise.exits import PointCells
-from pipeline.analysis.ragged import ROW_SIZE
 from pipeline.analysis.transfer import analysis
 from pipeline.analysis.transfer.analysis import (
     Pairs,
@@ -22,8 +21,9 @@ from pipeline.analysis.transfer.analysis import (
     pairs_of,
     sets_of_chain,
 )
+from pipeline.analysis.transfer.declaration import TransferOptions
 from pipeline.analysis.transfer.ulam import OUTSIDE, Grid, chain_of
-from pipeline.products.transfer import TransferOptions
+from pipeline.results.ragged import ROW_SIZE
 
 
 def run_of(*, n_transient: int = 10, n_keep: int = 4, continuation: object = None) -> SimpleNamespace:

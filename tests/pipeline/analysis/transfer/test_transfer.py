@@ -8,8 +8,8 @@ from scipy.stats import norm
 
 import magpend
 from pipeline.analysis.transfer.analysis import Pairs, Sets, _point, numbers_of, transfer_table
+from pipeline.analysis.transfer.declaration import TransferOptions
 from pipeline.analysis.transfer.ulam import Grid, chain_of, closed_classes, committors, passage_times, stationary
-from pipeline.products.transfer import TransferOptions
 
 SIGMA = 0.18
 

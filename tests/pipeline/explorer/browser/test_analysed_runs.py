@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.overlays import disturbances
 from pipeline.explorer.data.parameter_plane import parameter_plane
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import stored
 from pipeline.store.run import RunDirectory
 from tests.pipeline.explorer.browser.conftest import drawn, served

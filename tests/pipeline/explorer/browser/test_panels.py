@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.orbits import orbit
 from pipeline.layout.vocabulary import letter
+from pipeline.results.ragged import dense
 from pipeline.runs.derive import stored
 from pipeline.store.run import RunDirectory, open_run
 from tests.pipeline.explorer.browser.conftest import WAIT_MS, drawn, reused, served

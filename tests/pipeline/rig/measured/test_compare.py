@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.ragged import dense
-from pipeline.products.measured import SweepOptions
+from pipeline.results.ragged import dense
 from pipeline.rig.measured.comparison import compare, compare_with
 from pipeline.rig.measured.computed import Computed
+from pipeline.rig.measured.declaration import SweepOptions
 from pipeline.rig.measured.diagram import measure
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
 from pipeline.runs.derive import AnalysedRun

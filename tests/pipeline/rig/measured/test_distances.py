@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import wasserstein_distance
 
-from pipeline.analysis.sets import Geometry
+from pipeline.results.sets import Geometry
 from pipeline.rig.measured.comparison import Cloud, cloud_of, distance_to, floor_of, wasserstein
 from pipeline.rig.measured.computed import Candidate
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.products.measured import SweepOptions
+from pipeline.rig.measured.declaration import SweepOptions
 from pipeline.rig.measured.diagram import measure
 from pipeline.rig.measured.sections import section_phase
 from pipeline.rig.measured.series import series_of
