@@ -10,9 +10,10 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.status import Status
+from pipeline.analysis.branches import figure as branches
 from pipeline.analysis.branches.declaration import BranchFigureOptions
 from pipeline.layout.own_words import RATE
-from pipeline.plots import Frame, bifurcation, branches
+from pipeline.plots import Frame, bifurcation
 from pipeline.plots.measured import by_level
 from pipeline.products.diagrams import BifurcationOptions
 from pipeline.results.points import read_points

@@ -7,8 +7,7 @@ import xarray as xr
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side, magnet_offset
 from pipeline.results.sides import classify
-
-from .cubes import ORBITS, STATES, attributes_of
+from tests.pipeline.analysis.cubes import ORBITS, STATES, attributes_of
 
 PENDULUM = load_model("pendulum").load()
 
