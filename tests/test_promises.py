@@ -81,7 +81,7 @@ def test_branches__have_the_orbits_and_folds_of_another_integrator(tmp_path):
     found = magpend.branches(finished(tmp_path, RESONANCE), max_period=1)
     folds = found.isel(bifurcation=found.of_branch == 0)
     assert folds.sizes["bifurcation"] == 2
-    for f, state in zip(folds.value.values, folds.bifurcation_section.values[:, 0], strict=True):
+    for f, state in zip(folds.bifurcation_frequency.values, folds.bifurcation_section.values[:, 0], strict=True):
         start = (*state, 1.0, 0.0, 0.0, 1.0)
         end = solve_ivp(hardening, (0.0, 1.0 / f), start, "DOP853", args=(f,), rtol=1e-11, atol=1e-12).y[:, -1]
         np.testing.assert_allclose(end[:2], state, atol=1e-8)

@@ -44,7 +44,7 @@ KNOWS_A_PART = {
 
 LONG_MODULES = {"magpend_core/engine/lanes.py": "the engine's template: one compiled unit"}
 
-DOORS = {"pipeline.cli.main": "lists the commands", "pipeline.face.magpend._runs": "lists the analyses"}
+DOORS = {"pipeline.cli.main": "lists the commands"}
 """Modules that may import more than `MAX_IMPORTS` others."""
 
 LEAVES = {

@@ -26,10 +26,12 @@ class Plots(Figures):
     def __init__(self, source: RunDirectory | xr.Dataset) -> None:
         self._source = source
 
-    def __getattr__(self, name: str) -> Any:  # figures of other packages
-        if name not in FIGURES:
-            raise AttributeError(f"no figure {name!r}; {self}")
-        return MethodType(figure(name), self)
+    if not TYPE_CHECKING:  # which knows no figures of other packages
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in FIGURES:
+                raise AttributeError(f"no figure {name!r}; {self}")
+            return MethodType(figure(name), self)
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *FIGURES})

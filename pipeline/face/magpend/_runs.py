@@ -55,10 +55,12 @@ class Run(Analyses, RunDirectory):
     >>> ax = run.plot.bifurcation(degrees=True)                         # doctest: +SKIP
     """
 
-    def __getattr__(self, name: str) -> Any:  # analyses of other packages
-        if name.startswith("_") or name not in ANALYSES.listed:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return MethodType(analysis(name), self)
+    if not TYPE_CHECKING:  # which knows no analyses of other packages
+
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("_") or name not in ANALYSES.listed:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            return MethodType(analysis(name), self)
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *ANALYSES.listed})
