@@ -110,7 +110,7 @@ class Drive:
             If the drive does not cover it.
         """
         ends = np.cumsum(self.durations_s)
-        slack = engine.COINCIDENT_S
+        slack = engine.COINCIDENT * float(ends[-1])
         if begin_s < self.start_s - slack or end_s > ends[-1] + slack or end_s <= begin_s:
             raise ValueError(
                 f"the drive covers {self.start_s:g} s to {ends[-1]:g} s, not {begin_s:g} s to {end_s:g} s."
@@ -296,7 +296,7 @@ def _drive_table(
             if names:
                 raise ValueError(f"drives[{i}] is None, others are not; give all pieces a drive, or none.")
             # a sample at 0 alone needs an interval, too
-            durations.append(np.array([max(grid[-1], engine.COINCIDENT_S)]))
+            durations.append(np.array([grid[-1] or 1e-9]))
             values.append(np.zeros((1, 0)))
             continue
         durations.append(_check_drive(i, drive, names, grid[-1]))
@@ -320,7 +320,7 @@ def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float
     if not len(durations) or (durations <= 0.0).any() or not 0.0 <= drive.start_s < durations[0]:
         raise ValueError(f"drives[{number}]: durations must be above 0, and the start lie in the first interval.")
     covered = durations.sum() - drive.start_s
-    if covered < end_s - engine.COINCIDENT_S:
+    if covered < end_s * (1.0 - engine.COINCIDENT):
         raise ValueError(
             f"drives[{number}] covers {covered:g} s of a piece of {end_s:g} s; give a longer drive or fewer times."
         )

@@ -45,8 +45,8 @@ from magpend_core.status import Status
 
 BOUNDED = int(Status.BOUNDED)
 
-COINCIDENT_S = 1e-9
-"""Times that differ by less count as equal, since sums of drive intervals have rounding errors."""
+COINCIDENT = 1e-12
+"""Relative difference below which two times count as equal, since sums of drive intervals have rounding errors."""
 
 
 class Samples(NamedTuple):
@@ -191,7 +191,7 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
     if w[base + ROWS.after_rejection + column] == 0.0:
         last = seats.interval[lane] + 1 == samples.first_interval[piece + 1]
         ends = event == REACHED and seats.edge[lane] == NE and last
-        until = w[base + ROWS.time + column] + (COINCIDENT_S if ends else 0.0)
+        until = w[base + ROWS.time + column] * (1.0 + (COINCIDENT if ends else 0.0))
         write_due(samples, seats, lane, until)
         if seats.done[lane] == wanted:
             return BOUNDED if in_bounds(w, base, column) else DIVERGED

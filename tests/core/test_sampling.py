@@ -37,6 +37,25 @@ def test_sample__of_a_linear_oscillator_is_the_closed_form():
     assert found.status[0] == Status.BOUNDED
 
 
+@pytest.mark.parametrize("unit", [0.02, 1.0, 1e8])
+def test_sample__ends_at_the_end_of_the_drive_in_any_unit_of_time(unit):
+    """The last time may lie past the drive's end by rounding, and by no more."""
+    frequency = 0.4
+    linear = DUFFING.load(damping=0.3 / unit, linear=4.0 / unit**2, cubic=0.0, amplitude=0.0)
+    times = unit * np.array([1.0, 5.0, 5.0 / frequency * (1.0 + 1e-13)])
+    asked = {"rtol": 1e-11, "atol": 1e-25}
+    drive = Drive(np.full(5, unit / frequency))
+    found = sample(DUFFING.system, linear.pack()[None], [[0.5, 0.0]], [times], drives=[drive], **asked)
+    root = np.sqrt(4.0 - 0.15**2)
+    known = (
+        0.5 * np.exp(-0.15 * times / unit) * (np.cos(root * times / unit) + 0.15 / root * np.sin(root * times / unit))
+    )
+    assert found.status[0] == Status.BOUNDED
+    np.testing.assert_allclose(found.states[0, :, 0], known, atol=2e-9)
+    with pytest.raises(ValueError, match="covers .* of a piece"):
+        sample(DUFFING.system, linear.pack()[None], [[0.5, 0.0]], [times * (1.0 + 1e-9)], drives=[drive], **asked)
+
+
 @pytest.mark.slow
 def test_sample__does_not_depend_on_the_neighbours():
     """A trajectory has the same bits alone, among others and in any number of lanes."""
