@@ -25,7 +25,6 @@ from magpend_core.engine.system import System
 from magpend_core.engine.tangents import WRITTEN_OUT_MAPS
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import exp, log
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states
 
@@ -181,7 +180,7 @@ def lyapunov_exponents(
     rtol: float = RTOL,
     atol: float = ATOL,
     max_steps_per_period: int = MOST_STEPS,
-    system: System = PENDULUM_FITTED,
+    system: System,
     n_lanes: int = N_LANES,
 ) -> LyapunovExponents:
     """Estimate the largest Lyapunov exponents along trajectories.

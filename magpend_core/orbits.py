@@ -18,7 +18,6 @@ from magpend_core.engine.entry import integrate
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.ordering import canonical_order
 from magpend_core.pointwise import rates_packed
 from magpend_core.precision import limits_at
@@ -115,7 +114,7 @@ def section_map(
     n_periods: int | np.ndarray,
     *,
     rtol: float = RTOL,
-    system: System = PENDULUM_FITTED,
+    system: System,
 ) -> Returns:
     """Iterate the section map from given points; return all images, and the derivative of each last image with respect
     to its starting point.
@@ -222,7 +221,7 @@ def on_section_derivative(monodromy: np.ndarray, slopes: np.ndarray, crossed: in
     return np.asarray(found)
 
 
-def wrap_angles(states: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
+def wrap_angles(states: np.ndarray, system: System) -> np.ndarray:
     """Wrap the angles among states (or differences of states) to (-pi, pi]."""
     wrapped = np.array(states, dtype=np.float64)
     angles = np.asarray(system.is_angle)
@@ -231,7 +230,7 @@ def wrap_angles(states: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndar
     return wrapped
 
 
-def scaled_distance(a: np.ndarray, b: np.ndarray, system: System = PENDULUM_FITTED) -> np.ndarray:
+def scaled_distance(a: np.ndarray, b: np.ndarray, system: System) -> np.ndarray:
     """Return the largest scaled difference between states, with angles on their circle."""
     difference = np.abs(wrap_angles(np.asarray(a) - np.asarray(b), system)) / np.asarray(system.scales)
     return np.asarray(difference.max(axis=-1))
@@ -247,7 +246,7 @@ def polish_orbits(
     max_iterations: int = 12,
     rtol: float = RTOL,
     least_period: bool = True,
-    system: System = PENDULUM_FITTED,
+    system: System,
 ) -> PeriodicOrbits:
     """Find the periodic orbits near given section points by Newton's method.
 

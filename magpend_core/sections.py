@@ -15,7 +15,6 @@ from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD, Settings, window_of
 from magpend_core.engine.system import System
 from magpend_core.models.model import Parameters
-from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_flag, check_frequency, check_states, check_tolerance
 
@@ -78,7 +77,7 @@ def run_branches(
     closure_tolerance: float = CLOSURE,
     max_orbit_period: int = LONGEST_PERIOD,
     step_size: np.ndarray | None = None,
-    system: System = PENDULUM_FITTED,
+    system: System,
     n_lanes: int = N_LANES,
     quantities: Sequence[str] | None = None,
     method: str | None = None,

@@ -45,8 +45,8 @@ from magpend_core.status import Status
 
 BOUNDED = int(Status.BOUNDED)
 
-COINCIDENT = 1e-12
-"""Relative difference below which two times count as equal, since sums of drive intervals have rounding errors."""
+COINCIDENT = 1e-11
+"""Relative difference below which times since the start count as equal, as sums of drive intervals are rounded."""
 
 
 class Samples(NamedTuple):
@@ -191,7 +191,8 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
     if w[base + ROWS.after_rejection + column] == 0.0:
         last = seats.interval[lane] + 1 == samples.first_interval[piece + 1]
         ends = event == REACHED and seats.edge[lane] == NE and last
-        until = w[base + ROWS.time + column] * (1.0 + (COINCIDENT if ends else 0.0))
+        time = w[base + ROWS.time + column]
+        until = time + (COINCIDENT * (seats.clock[lane, 1] + time) if ends else 0.0)
         write_due(samples, seats, lane, until)
         if seats.done[lane] == wanted:
             return BOUNDED if in_bounds(w, base, column) else DIVERGED

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.models.drift.ramps import Motion, Ramp, motion_of
+from magpend_core.models.drift.ramps import Ramp, RampOfCells, motion_of
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
 from pipeline.motion.steady import Inputs
@@ -296,7 +296,7 @@ def moving_coordinates(spec: Spec) -> list[Coordinate]:
     return [_coordinate(spec, ramp) for ramp in spec.ramps]
 
 
-def motion_over(spec: Spec, ramp: Ramp) -> tuple[tuple[ParameterAxis, ...], Motion, np.ndarray]:
+def motion_over(spec: Spec, ramp: Ramp) -> tuple[tuple[ParameterAxis, ...], RampOfCells, np.ndarray]:
     """Return the axes on which a ramp depends, its motion at each of their points, and the drive's frequency there.
 
     The points are in the order of the axes, the last axis varying fastest.

@@ -19,7 +19,7 @@ from magpend_core.models.model import Drawing
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
 from pipeline.plots.labels import Measure
-from pipeline.plots.trajectory import Motion, draw_portrait
+from pipeline.plots.trajectory import DrawnMotion, draw_portrait
 
 TRAIL_S = 0.8
 """Seconds of film that what moves leaves a trail for."""
@@ -114,7 +114,7 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
     dots = one["section"].values
     dots = dots[np.isfinite(dots).all(axis=-1)]
     section = {name: dots[:, k] for k, name in enumerate(model.state_names)}
-    draw_portrait(ax, one, pair, Motion(orbit, section, colour), degrees=degrees)
+    draw_portrait(ax, one, pair, DrawnMotion(orbit, section, colour), degrees=degrees)
     for line in ax.get_lines():
         if str(line.get_gid()).startswith("orbit:"):
             line.set_alpha(0.4 if trail.closed else 0.0)

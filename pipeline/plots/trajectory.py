@@ -23,7 +23,7 @@ _AIR = 1.16
 
 
 @dataclass(frozen=True)
-class Motion:
+class DrawnMotion:
     """One motion to draw: its trajectory, its section points and its colour."""
 
     orbit: Mapping[str, np.ndarray]  # values of each state along the motion, angles not wrapped
@@ -32,7 +32,9 @@ class Motion:
     gid: str = ""  # ends the identifiers of what is drawn
 
 
-def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:
+def draw_portrait(
+    ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: DrawnMotion, *, degrees: bool = False
+) -> None:
     """Draw a phase portrait (`pair` to the right and upwards): the motion as a line, and its section points as dots."""
     states = {s.name: s for s in model_of(ds).states}
     measures = [labels.state_measure(ds, n, degrees and states[n].unit.startswith("rad")) for n in pair]
@@ -82,7 +84,7 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
     style.label_axes(ax, measures[0].label, measures[1].label)
 
 
-def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
+def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: DrawnMotion) -> list[str]:
     """Draw the path of the traced point of the model's drawing, and the near points that do not move.
 
     Return the names of those points. `equalise` the axes once they have their place.
@@ -192,11 +194,11 @@ def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame
     for k, pair in enumerate(model.portraits):
         ax = fig.add_subplot(right[k])
         style.style_axes(ax)
-        draw_portrait(ax, ds, pair, Motion(series, section, _colour(k)), degrees=degrees)
+        draw_portrait(ax, ds, pair, DrawnMotion(series, section, _colour(k)), degrees=degrees)
     handles = _handles(ds, model, bool(strobe.size))
     path = fig.add_subplot(right[-1]) if drawing is not None else None
     if drawing is not None and path is not None:
-        handles += _draw_path(path, ds, drawing, Motion(series, section, "0.35"))
+        handles += _draw_path(path, ds, drawing, DrawnMotion(series, section, "0.35"))
     if frame.xlim:
         axes[-1].set_xlim(*style.check_range("xlim", frame.xlim))
     if path is not None:
@@ -208,7 +210,7 @@ def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame
     return fig
 
 
-def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> list[Any]:
+def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: DrawnMotion) -> list[Any]:
     style.style_axes(ax)
     parameters = parameters_of(ds).as_dict()
     shown = draw_path(ax, drawing, parameters, motion)

@@ -99,10 +99,14 @@ def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = ""
     return Field(default, description=help, json_schema_extra={"unit": unit, "flag": flag}, **bounds)
 
 
+STRICT = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+"""Settings of models of data from users: strict types, no unknown keys, no NaN or infinity."""
+
+
 class Options(BaseModel):
     """Base class of the options of a product: types, defaults, bounds and help."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = STRICT
 
     def plain(self) -> dict[str, Any]:
         """Return all options as JSON values."""

@@ -100,3 +100,7 @@ def reporting(listener: Listener) -> Iterator[None]:
             yield
     finally:
         _listener.reset(token)
+
+
+def silent(_: str) -> None:
+    """Print nothing: the function ``echo`` of a silent run."""

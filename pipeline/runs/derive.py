@@ -34,6 +34,7 @@ from pipeline.layout.own_words import in_own_words, rate_attribute, with_own_nam
 from pipeline.layout.vocabulary import model_attribute, overrides_attribute
 from pipeline.products.product import Analysis, Options, Table, function_of
 from pipeline.products.registry import ANALYSES
+from pipeline.products.reporting import silent
 from pipeline.runs.extend import refine
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
@@ -65,15 +66,11 @@ Source = str | Path | RunDirectory
 _LEFTOVER_SECONDS = 3600.0
 
 
-def _silent(_: str) -> None:
-    pass
-
-
 @dataclass(frozen=True, repr=False)
 class AnalysedRun(RunDirectory):
     """An opened run for analyses; an analysis gets from it the results of other analyses."""
 
-    echo: Echo = _silent  # function that prints a line
+    echo: Echo = silent  # function that prints a line
     # number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`; of
     # threads of the engine for an analysis without blocks
     workers: int | None = None
@@ -85,7 +82,7 @@ class AnalysedRun(RunDirectory):
         run = RunDirectory.open(source)
         if isinstance(run, AnalysedRun) and echo is None and not places:
             return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)}, echo=echo or _silent, **places)
+        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)}, echo=echo or silent, **places)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of an analysis of this run with plain names, computed now or read if it is stored."""

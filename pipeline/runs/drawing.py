@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import FigureOptions
 from pipeline.products.registry import FIGURES
+from pipeline.products.reporting import silent
 from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
 from pipeline.runs.naming import named
 from pipeline.specification.problems import SpecError, unknown_name, validated
@@ -197,13 +198,9 @@ def ready_cube(
     SpecError
         If the figure needs an analysis, or an option names what the cube does not have.
     """
-    run: Any = CubeRun(ds, echo or _silent)
+    run: Any = CubeRun(ds, echo or silent)
     options_of_analyses = {"parameter", "second"} & type(options).model_fields.keys()
     if FIGURES[name].needs or options_of_analyses:
         raise SpecError(f"the cube: {name} needs an analysis. {_REMEDY}")
     completed: Any = named(run, options)
     return run, completed
-
-
-def _silent(_: str) -> None:
-    pass

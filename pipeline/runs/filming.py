@@ -24,6 +24,7 @@ from pipeline.layout.vocabulary import (
     start_dims,
 )
 from pipeline.products.diagrams import AnimationOptions
+from pipeline.products.reporting import silent
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun, Echo, Source, refused
 from pipeline.runs.instants import RTOL, Moving
@@ -124,13 +125,9 @@ def animation(
         raise SpecError(str(error)) from None
     plan = instants.schedule(shown, wanted)
     for line in notes:
-        (echo or _silent)(line)
+        (echo or silent)(line)
     data = with_provenance(instants.filmed(shown, plan).assign_attrs(fps=wanted.fps), told)
     return plot_animation(data, degrees=wanted.degrees, portrait=wanted.portrait, size=wanted.size)
-
-
-def _silent(_: str) -> None:
-    pass
 
 
 def _of_run(

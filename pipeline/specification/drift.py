@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from magpend_core.models.drift.model import drifting
-from magpend_core.models.drift.ramps import NUMBERS, TABLE, Motion, Ramp, motions_of
+from magpend_core.models.drift.ramps import NUMBERS, TABLE, Ramp, RampOfCells, motions_of
 from magpend_core.models.parameters import unknown_name_problem
 from pipeline.specification.files import has_digest
 from pipeline.specification.problems import SpecError, checked, shown
@@ -214,7 +214,7 @@ def motion_problems(
     return list(dict.fromkeys(p for motion in motions for p in _problems_of_motion(motion, values)))
 
 
-def _problems_of_motion(motion: Motion, values: Parameters) -> Iterator[str]:
+def _problems_of_motion(motion: RampOfCells, values: Parameters) -> Iterator[str]:
     name = motion.ramp.parameter
     ends = np.concatenate([motion.begin, motion.end, np.asarray(motion.ramp.values, np.float64)])
     bad = ~(np.isfinite(motion.duration_s) & (motion.duration_s > 0))

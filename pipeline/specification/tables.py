@@ -9,10 +9,11 @@ from fractions import Fraction
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
 
 from magpend_core import defaults
 from magpend_core.models.presets import Preset
+from pipeline.products.product import STRICT
 
 FREQUENCY = "frequency_hz"
 """Name of the drive frequency among the parameters."""
@@ -61,7 +62,7 @@ def word_named(name: str) -> str:
 class Table(BaseModel):
     """A table of the specification: strict types, no unknown keys, no NaN or infinity."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = STRICT
     nested_model: ClassVar[type[BaseModel] | None] = None
 
 

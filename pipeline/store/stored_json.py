@@ -10,9 +10,10 @@ import hashlib
 import json
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from magpend_core.models.parameters import has_controls
+from pipeline.products.product import STRICT
 from pipeline.specification.problems import problems_of
 from pipeline.store.arrays import METADATA
 
@@ -63,7 +64,7 @@ def unseal(content: bytes) -> dict[str, Any]:
 class Stored(BaseModel):
     """A stored object: its keys are all there, no others are, and each value has its type."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = STRICT
 
 
 S = TypeVar("S", bound=Stored)

@@ -128,7 +128,9 @@ def exponents(n: int, n_periods: int, rounds: int) -> None:
     options = {"n_transient": 0, "n_periods": n_periods, "n_blocks": N_BLOCKS}
 
     def some(number: int) -> Callable[[], object]:
-        return lambda: lyapunov_exponents(packed, hertz, settled, n_exponents=number, **options)
+        return lambda: lyapunov_exponents(
+            packed, hertz, settled, n_exponents=number, system=parameters.model.system, **options
+        )
 
     runs = {"plain": run(parameters, EXPONENTS_HZ, settled, n_periods, 1e-8), **{k: some(k) for k in EXPONENTS}}
     found = least(runs, rounds)

@@ -191,6 +191,7 @@ def print_compile_time() -> None:
     loaded = time.process_time()
     parameters = magpend_core.load_preset()
     start, options = time.process_time(), {"n_transient": 1, "n_keep": 1, "rtol": 1e-6, "atol": 1e-6}
+    options["system"] = parameters.model.system
     magpend_core.run_branches(parameters.pack()[None, None], np.full((1, 1), 2.8), np.zeros((1, 4)), **options)
     print(
         f"\nfresh process without compile cache, CPU: imports {loaded:.1f} s, "

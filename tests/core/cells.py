@@ -4,6 +4,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from magpend_core import run_branches
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import polish_orbits, section_map
 
 # quantities that tests watch: an engine is compiled for each choice of them
@@ -31,9 +32,9 @@ def polish(parameters, points, period=1, frequency=None, **options):
     return polish_orbits(packed, hertz, np.asarray(points, float), periods, system=model.system, **options)
 
 
-def stroboscopic_map(*given, **options):
+def stroboscopic_map(*given, system=PENDULUM_FITTED, **options):
     """Images of section points, and the derivatives of the last images."""
-    found = section_map(*given, **options)
+    found = section_map(*given, system=system, **options)
     return found.images, found.derivatives
 
 

@@ -1,12 +1,18 @@
 """Lyapunov exponents: published and analytic values, the divergence, closed orbits, independence of lanes."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from magpend_core import Status, jacobian, lyapunov_exponents, polish_orbits, sections
 from magpend_core.lyapunov import MOST_LOSS
 from magpend_core.models.duffing.system import DUFFING
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from tests.core.cells import stroboscopic_map
+
+exponents_of = partial(lyapunov_exponents, system=PENDULUM_FITTED)
+orbits_of = partial(polish_orbits, system=PENDULUM_FITTED)
 
 UNIT_FREQUENCY = 0.5 / np.pi  # forcing cos t
 CHAOTIC = [0.2, -1.0, 1.0, 0.3]  # damping, linear, cubic, amplitude of the chaotic Duffing oscillator
@@ -19,7 +25,7 @@ def packed(parameters, n):
 def of_duffing(parameters, n_cells=32, **options):
     starts = options.pop("starts", np.random.default_rng(4).uniform(-1.0, 1.0, (n_cells, 2)))
     cells = np.tile(parameters, (len(starts), 1)), np.full(len(starts), UNIT_FREQUENCY), starts
-    return lyapunov_exponents(*cells, system=DUFFING, **options)
+    return exponents_of(*cells, system=DUFFING, **options)
 
 
 def test_duffing__published_exponents_half_the_damping_and_none():
@@ -63,7 +69,7 @@ def test_lyapunov__reference_spectra(preset, reference, case):
     states = run.section[:, -1]
     if case == 1:  # the left attractor, on which the reference is
         states = states[np.abs(states[:, 0] + 0.0557) < 0.01]
-    found = lyapunov_exponents(packed(preset, len(states)), np.full(len(states), frequency), states, n_periods=800)
+    found = exponents_of(packed(preset, len(states)), np.full(len(states), frequency), states, n_periods=800)
     errors = np.hypot(found.stderr.mean(axis=0) / np.sqrt(len(states)), expected["stderr"])
     assert len(states) >= 2
     assert (np.abs(found.exponents.mean(axis=0) - expected["lyapunov_per_s"]) < 3.0 * errors).all()
@@ -75,12 +81,12 @@ def test_lyapunov__on_closed_orbits_the_logarithms_of_the_multipliers(preset, re
     points = np.array([orbit["section"] for orbit in orbits])
     frequency = np.array([orbit["frequency_hz"] for orbit in orbits])
     periods = np.array([orbit["orbit_period"] for orbit in orbits])
-    orbit = polish_orbits(packed(preset, len(points)), frequency, points, periods)
+    orbit = orbits_of(packed(preset, len(points)), frequency, points, periods)
     expected = np.log(np.abs(orbit.multipliers)) * (frequency / periods)[:, None]
     cells, options = (packed(preset, len(points)), frequency, orbit.section), {"rtol": 1e-9, "atol": 1e-9}
-    found = lyapunov_exponents(*cells, **options)
+    found = exponents_of(*cells, **options)
     assert np.sort(found.weighted)[:, ::-1] == pytest.approx(expected, abs=1e-4)
-    largest = lyapunov_exponents(*cells, n_exponents=1, **options)
+    largest = exponents_of(*cells, n_exponents=1, **options)
     assert largest.weighted == pytest.approx(expected[:, :1], abs=1e-4)
     assert largest.divergence == pytest.approx(found.divergence, abs=5e-5)
     # as the docstring says of the plain average
@@ -99,9 +105,7 @@ def test_lyapunov__like_a_qr_of_the_period_maps(preset):
         q, r = np.linalg.qr(derivative[0] @ q)
         logs += np.log(np.abs(np.diag(r))) if i >= 10 else 0.0
         point = image[:, -1]
-    found = lyapunov_exponents(
-        one, np.array([2.4]), start, n_transient=10, n_periods=n, rtol=1e-11, atol=1e-11, n_blocks=2
-    )
+    found = exponents_of(one, np.array([2.4]), start, n_transient=10, n_periods=n, rtol=1e-11, atol=1e-11, n_blocks=2)
     assert found.exponents[0] == pytest.approx(np.sort(logs * 2.4 / n)[::-1], abs=1e-4)
 
 
@@ -116,7 +120,7 @@ def mixed(preset):
 
 @pytest.mark.slow
 def test_lyapunov__sum_is_the_divergence(mixed):
-    found = lyapunov_exponents(*mixed[:3], rtol=1e-10, atol=1e-10, **mixed[3])
+    found = exponents_of(*mixed[:3], rtol=1e-10, atol=1e-10, **mixed[3])
     missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
     assert np.median(missing) < 1e-6
     assert missing.max() < 0.01 * np.abs(found.exponents).sum(axis=1).max()
@@ -126,10 +130,10 @@ def test_lyapunov__sum_is_the_divergence(mixed):
 @pytest.mark.slow
 def test_lyapunov__a_cell_depends_on_itself_alone(mixed):
     parameters, frequency, states, options = mixed
-    together = lyapunov_exponents(parameters, frequency, states, n_lanes=16, **options)
+    together = exponents_of(parameters, frequency, states, n_lanes=16, **options)
     order = np.arange(18)[::-1]
-    back = lyapunov_exponents(parameters[order], frequency[order], states[order], n_lanes=64, **options)
-    alone = lyapunov_exponents(parameters[4:5], frequency[4:5], states[4:5], **options)
+    back = exponents_of(parameters[order], frequency[order], states[order], n_lanes=64, **options)
+    alone = exponents_of(parameters[4:5], frequency[4:5], states[4:5], **options)
     for name in ("exponents", "stderr", "weighted", "blocks", "divergence", "loss"):
         a = getattr(together, name)
         assert (a == getattr(back, name)[order]).all(), name
@@ -147,9 +151,9 @@ def test_lyapunov__a_cell_depends_on_itself_alone(mixed):
 )
 def test_lyapunov__options_out_of_bounds(preset, option, words):
     with pytest.raises(ValueError, match=words):
-        lyapunov_exponents(packed(preset, 1), np.array([2.2]), np.zeros((1, 4)), **option)
+        exponents_of(packed(preset, 1), np.array([2.2]), np.zeros((1, 4)), **option)
     with pytest.raises(ValueError, match="1, 2 and 1 rows"):
-        lyapunov_exponents(packed(preset, 1), np.array([2.2, 2.3]), np.zeros((1, 4)))
+        exponents_of(packed(preset, 1), np.array([2.2, 2.3]), np.zeros((1, 4)))
 
 
 @pytest.mark.slow
@@ -162,7 +166,7 @@ def test_lyapunov__of_a_stiff_rest(preset):
     exact = np.sort(np.linalg.eigvals(jacobian(0.0, state[0], still, 1.0)).real)[::-1]
     options = {"n_transient": 10, "n_periods": 16, "n_blocks": 2}
     for n in (1, 4):
-        found = lyapunov_exponents(packed(still, 1), np.ones(1), state, n_exponents=n, **options)
+        found = exponents_of(packed(still, 1), np.ones(1), state, n_exponents=n, **options)
         # the pendulum creeps on, and the exponents with it
         assert found.exponents[0, :3] == pytest.approx(exact[: min(n, 3)], rel=1e-3)
     assert exact[3] < -1000.0

@@ -35,7 +35,9 @@ def packed(reference):
 @pytest.mark.parametrize("guessed_period", [1, 2])
 def test_polish_orbits__reference(reference, packed, guessed_period):
     points, frequency, multipliers = reference
-    found = polish_orbits(packed, frequency, points + 1e-3, np.full(len(points), guessed_period))
+    found = polish_orbits(
+        packed, frequency, points + 1e-3, np.full(len(points), guessed_period), system=PENDULUM_FITTED
+    )
     assert found.converged.all()
     assert found.is_stable.all()
     assert (found.orbit_period == 1).all()
@@ -48,24 +50,31 @@ def test_polish_orbits__reference(reference, packed, guessed_period):
 
 
 def test_polish_orbits__far_from_any(packed):
-    found = polish_orbits(packed[:1], np.array([2.03]), [[2.0, -2.0, 15.0, -20.0]], np.array([1]), max_iterations=3)
+    found = polish_orbits(
+        packed[:1],
+        np.array([2.03]),
+        [[2.0, -2.0, 15.0, -20.0]],
+        np.array([1]),
+        max_iterations=3,
+        system=PENDULUM_FITTED,
+    )
     assert not found.converged[0]
     assert np.isnan(found.multipliers).all()
-    wrapped = wrap_angles(np.array([np.pi, -np.pi, 7.0, -7.0]))
+    wrapped = wrap_angles(np.array([np.pi, -np.pi, 7.0, -7.0]), PENDULUM_FITTED)
     np.testing.assert_allclose(wrapped, [np.pi, np.pi, 7.0, -7.0])
-    assert scaled_distance([np.pi - 1e-3, 0, 0, 0], [-np.pi + 1e-3, 0, 0, 0]) == pytest.approx(2e-3)
+    assert scaled_distance([np.pi - 1e-3, 0, 0, 0], [-np.pi + 1e-3, 0, 0, 0], PENDULUM_FITTED) == pytest.approx(2e-3)
 
 
 @pytest.mark.parametrize(("periods", "message"), [([0], "1 or more"), ([1.5], "whole numbers"), ([1, 1], "must agree")])
 def test_polish_orbits__bad_input(packed, periods, message):
     with pytest.raises(ValueError, match=message):
-        polish_orbits(packed[:1], np.array([2.2]), np.zeros((1, 4)), np.array(periods))
+        polish_orbits(packed[:1], np.array([2.2]), np.zeros((1, 4)), np.array(periods), system=PENDULUM_FITTED)
 
 
 def test_stroboscopic_map__derivatives(packed, reference):
     """Against central differences of sections of the plain system."""
     points, frequency, _ = reference
-    _, derivatives = stroboscopic_map(packed[:1], frequency[:1], points[:1], 1)
+    _, derivatives = stroboscopic_map(packed[:1], frequency[:1], points[:1], 1, system=PENDULUM_FITTED)
     step = 1e-6 * np.array([1.0, 1.0, 10.0, 10.0])
     shifted = np.concatenate([points[0] + np.diag(step), points[0] - np.diag(step)])
     plain = run_cells(PENDULUM_FITTED, packed[0], frequency[0], shifted, rtol=1e-12).section[:, 0, 0]
@@ -78,10 +87,10 @@ def test_section_map__a_number_of_periods_for_each_row(packed, reference):
     """Rows of one call have the bits that each has alone, and nothing beyond their own periods."""
     points, frequency, _ = reference
     periods = np.array([1, 3, 2])
-    found = section_map(packed[:3], frequency[:3], points[:3] + 0.01, periods, rtol=1e-9)
+    found = section_map(packed[:3], frequency[:3], points[:3] + 0.01, periods, rtol=1e-9, system=PENDULUM_FITTED)
     for row, n in enumerate(periods):
         one = slice(row, row + 1)
-        alone = section_map(packed[one], frequency[one], points[one] + 0.01, int(n), rtol=1e-9)
+        alone = section_map(packed[one], frequency[one], points[one] + 0.01, int(n), rtol=1e-9, system=PENDULUM_FITTED)
         assert (found.images[row, :n] == alone.images[0]).all()
         assert np.isnan(found.images[row, n:]).all()
         assert (found.derivatives[row] == alone.derivatives[0]).all()
@@ -93,12 +102,17 @@ def test_polish_orbits__points_and_derivative(packed, reference):
     points, frequency, _ = reference
     settled = run_cells(PENDULUM_FITTED, packed[0], 2.48, [[0.05, 0.1, 0.0, 0.0]], n_transient=600, rtol=1e-9)
     guesses, drives = np.vstack([settled.section[0, 0], points[:2]]), np.array([2.48, *frequency[:2]])
-    found = polish_orbits(packed[:1].repeat(3, 0), drives, guesses, np.array([2, 1, 3]))
+    found = polish_orbits(packed[:1].repeat(3, 0), drives, guesses, np.array([2, 1, 3]), system=PENDULUM_FITTED)
     assert found.orbit_period.tolist() == [2, 1, 1]
     for row, n in enumerate(found.orbit_period):
         one = slice(row, row + 1)
         images, derivatives = stroboscopic_map(packed[:1], drives[one], found.section[one], int(n))
-        assert scaled_distance(found.points[row, :n], np.vstack([found.section[one], images[0, :-1]])).max() < 1e-9
+        assert (
+            scaled_distance(
+                found.points[row, :n], np.vstack([found.section[one], images[0, :-1]]), PENDULUM_FITTED
+            ).max()
+            < 1e-9
+        )
         assert np.isnan(found.points[row, n:]).all()
         assert np.abs(found.derivative[row] - derivatives[0]).max() < 1e-6
 

@@ -52,7 +52,7 @@ def test_sample__ends_at_the_end_of_the_drive_in_any_unit_of_time(unit):
     )
     assert found.status[0] == Status.BOUNDED
     np.testing.assert_allclose(found.states[0, :, 0], known, atol=2e-9)
-    with pytest.raises(ValueError, match="covers .* of a piece"):
+    with pytest.raises(ValueError, match=r"covers .* of a piece"):
         sample(DUFFING.system, linear.pack()[None], [[0.5, 0.0]], [times * (1.0 + 1e-9)], drives=[drive], **asked)
 
 

@@ -15,6 +15,7 @@ from magpend_core import (
     torques,
     trajectory,
 )
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.pointwise import drive_level
 from magpend_core.status import Status
 
@@ -35,7 +36,7 @@ CALLS = {
     "sections": (sections, {"frequency_hz": [2.2], "initial_states": START, "n_transient": 0, "n_keep": 1}),
     "branches": (
         lambda p, parameters, frequency_hz: run_branches(
-            parameters, frequency_hz, START, n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8
+            parameters, frequency_hz, START, n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8, system=PENDULUM_FITTED
         ),
         {"parameters": PACKED, "frequency_hz": [[2.2]]},
     ),

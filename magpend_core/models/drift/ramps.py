@@ -82,7 +82,7 @@ def ramp_parameters(ramp: Ramp, unit: str) -> tuple[Parameter, ...]:
 
 
 @dataclass(frozen=True)
-class Motion:
+class RampOfCells:
     """A ramp with its numbers, for many cells.
 
     Attributes
@@ -105,10 +105,10 @@ class Motion:
         """Time after which the parameter stays where it is, shape (cell,) [s]."""
         return np.asarray(self.start_s + self.duration_s)
 
-    def take(self, cells: Any) -> Motion:
+    def take(self, cells: Any) -> RampOfCells:
         """Return the motion of some of the cells."""
         parts = (self.begin, self.end, self.start_s, self.duration_s)
-        return Motion(self.ramp, *(part[cells] for part in parts))
+        return RampOfCells(self.ramp, *(part[cells] for part in parts))
 
     def share(self, cell: int, times: np.ndarray) -> np.ndarray:
         """Return how far the ramp of a cell has come at given times, from 0 to 1."""
@@ -151,7 +151,7 @@ def value_at(ramp: Ramp, begin: Any, end: Any, share: Any) -> Any:
     return begin * (1.0 - share) + end * share
 
 
-def motion_of(ramp: Ramp, value_of: Callable[[str], np.ndarray], frequency_hz: np.ndarray) -> Motion:
+def motion_of(ramp: Ramp, value_of: Callable[[str], np.ndarray], frequency_hz: np.ndarray) -> RampOfCells:
     """Return a ramp with its numbers for many cells.
 
     Parameters
@@ -173,7 +173,7 @@ def motion_of(ramp: Ramp, value_of: Callable[[str], np.ndarray], frequency_hz: n
     start = given.get("start_s", zero) + zero
     if ramp.shape == TABLE:
         first, last = ramp.values[0], ramp.values[-1]
-        return Motion(ramp, zero + first, zero + last, start, zero + ramp.times_s[-1])
+        return RampOfCells(ramp, zero + first, zero + last, start, zero + ramp.times_s[-1])
     begin = given["from"] if "from" in given else np.asarray(value_of(ramp.parameter))
     with np.errstate(divide="ignore", invalid="ignore"):
         if "to" not in given:
@@ -182,12 +182,12 @@ def motion_of(ramp: Ramp, value_of: Callable[[str], np.ndarray], frequency_hz: n
         else:
             end = given["to"]
             duration = given["duration_s"] if "duration_s" in given else (end - begin) / given["rate_per_s"]
-    return Motion(ramp, begin + zero, end + zero, start, duration + zero)
+    return RampOfCells(ramp, begin + zero, end + zero, start, duration + zero)
 
 
 def motions_of(
     ramps: Sequence[Ramp], names: Sequence[str], packed: np.ndarray, frequency_hz: np.ndarray
-) -> tuple[Motion, ...]:
+) -> tuple[RampOfCells, ...]:
     """Return the motions of all ramps for cells with packed parameters.
 
     Parameters

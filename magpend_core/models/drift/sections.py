@@ -11,7 +11,7 @@ from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import RECORD, Settings, window_of
 from magpend_core.engine.system import System
 from magpend_core.extension import orbit_periods
-from magpend_core.models.drift.ramps import STEEPNESS, Motion, Ramp, motions_of
+from magpend_core.models.drift.ramps import STEEPNESS, Ramp, RampOfCells, motions_of
 from magpend_core.models.drift.structure import moving_of, pieces_of
 from magpend_core.models.drift.system import NEAR, Moving, with_moving_constants
 from magpend_core.sections import Sections
@@ -121,7 +121,9 @@ def drifting_sections(
 class _Timeline:
     """The intervals of one cell: its drive periods, divided at the corners of its ramps."""
 
-    def __init__(self, motions: Sequence[Motion], pieces: Sequence[int], cell: int, hz: float, n_periods: int) -> None:
+    def __init__(
+        self, motions: Sequence[RampOfCells], pieces: Sequence[int], cell: int, hz: float, n_periods: int
+    ) -> None:
         cuts = np.concatenate([m.corners(cell, n) for m, n in zip(motions, pieces, strict=True)])
         cuts = np.unique(cuts[(cuts > 0.0) & (cuts * hz < n_periods)])
         near = np.abs(cuts * hz - np.round(cuts * hz)) <= NEAR * np.maximum(1.0, cuts * hz)

@@ -13,7 +13,7 @@ import numpy as np
 
 from magpend_core.engine.plain_python import plain
 from magpend_core.engine.system import System
-from magpend_core.models.drift.ramps import TABLE, Motion, value_at
+from magpend_core.models.drift.ramps import TABLE, RampOfCells, value_at
 from magpend_core.models.drift.system import AFFINE, DEGREE, Moving, coefficients_of, nodes_of
 
 N_VALUES = 9
@@ -46,7 +46,7 @@ class DriftError(ValueError):
 class _Probe:
     """A system's constants, edges and surfaces as functions of its parameters, in plain Python."""
 
-    def __init__(self, system: System, motions: Sequence[Motion], packed: np.ndarray, hz: np.ndarray) -> None:
+    def __init__(self, system: System, motions: Sequence[RampOfCells], packed: np.ndarray, hz: np.ndarray) -> None:
         self.system, self.motions, self.hz = system, motions, hz
         self.places = tuple(system.parameter_names.index(m.ramp.parameter) for m in motions)
         self.packed = np.ascontiguousarray(packed[:, : len(system.parameter_names)])
@@ -101,7 +101,7 @@ class _Probe:
         return [[float(v) if i == which else x for i, x in enumerate(first)] for v in moved]
 
 
-def moving_of(system: System, motions: Sequence[Motion], packed: np.ndarray, frequency_hz: np.ndarray) -> Moving:
+def moving_of(system: System, motions: Sequence[RampOfCells], packed: np.ndarray, frequency_hz: np.ndarray) -> Moving:
     """Return what moves in a system.
 
     Parameters
@@ -139,7 +139,9 @@ def moving_of(system: System, motions: Sequence[Motion], packed: np.ndarray, fre
     return Moving(probe.places, smooth, constants, AFFINE if affine else DEGREE)
 
 
-def pieces_of(system: System, moving: Moving, motions: Sequence[Motion], packed: np.ndarray) -> list[tuple[int, ...]]:
+def pieces_of(
+    system: System, moving: Moving, motions: Sequence[RampOfCells], packed: np.ndarray
+) -> list[tuple[int, ...]]:
     """Return for each cell the number of equal parts into which each of its ramps must be divided.
 
     It depends on the cell's parameters alone. See `Motion.corners`.

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, once, parameters_of, told_by
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
-from pipeline.plots.trajectory import Motion, draw_path, draw_portrait, equalise, fixed_handles
+from pipeline.plots.trajectory import DrawnMotion, draw_path, draw_portrait, equalise, fixed_handles
 from pipeline.products.product import FigureOptions
 from pipeline.results.outcomes import left_out
 from pipeline.results.ragged import dense, dims_of, isel
@@ -154,7 +154,7 @@ def _draw_one(
 ) -> set[str]:
     model, number = model_of(one), int(one["attractor"])
     title, cast = named
-    motion = Motion(
+    motion = DrawnMotion(
         {name: one["orbit"].sel(state=name).values for name in model.state_names},
         {name: one["attractor_points"].sel(state=name).values for name in model.state_names},
         palette.GREY_OF.get(int(one["stability"]), cast.colours[number]),

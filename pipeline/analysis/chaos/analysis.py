@@ -17,7 +17,7 @@ import xarray as xr
 
 from pipeline.analysis.chaos.declaration import ChaosOptions, DimensionOptions
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
-from pipeline.analysis.chaos.lyapunov import Motion, is_closed, motion_attrs, summarise
+from pipeline.analysis.chaos.lyapunov import CellMotion, is_closed, motion_attrs, summarise
 from pipeline.analysis.chaos.per_attractor import Nature, chaos_per_attractor, pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
 from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
@@ -361,8 +361,8 @@ def _of_exponents(ds: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
 
 def _without_exponents(ds: xr.Dataset) -> xr.Dataset:
     closed = is_closed(ds)
-    motion = xr.full_like(closed, Motion.UNKNOWN, dtype=np.int8)
-    motion = motion.where(~closed, np.int8(Motion.REGULAR)).assign_attrs(motion_attrs())
+    motion = xr.full_like(closed, CellMotion.UNKNOWN, dtype=np.int8)
+    motion = motion.where(~closed, np.int8(CellMotion.REGULAR)).assign_attrs(motion_attrs())
     return xr.Dataset(
         {
             "motion": motion,

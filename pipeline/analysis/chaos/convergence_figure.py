@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.chaos.declaration import ConvergenceOptions
-from pipeline.analysis.chaos.lyapunov import GOOD, Motion, period_seconds, pooled_mean, summarise
+from pipeline.analysis.chaos.lyapunov import GOOD, CellMotion, period_seconds, pooled_mean, summarise
 from pipeline.analysis.chaos.lyapunov_figure import UNITS, left_out
 from pipeline.layout.vocabulary import model_of, period_of, periods_of, split_dims, time_unit
 from pipeline.plots import labels, style
@@ -26,16 +26,16 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Of the bands: the outer two, the inner two, and the median."""
 
 _COLOURS = {
-    Motion.REGULAR: style.BLUE,
-    Motion.CHAOTIC: style.VERMILLION,
-    Motion.HYPERCHAOTIC: style.PURPLE,
-    Motion.UNDECIDED: style.GREY,
+    CellMotion.REGULAR: style.BLUE,
+    CellMotion.CHAOTIC: style.VERMILLION,
+    CellMotion.HYPERCHAOTIC: style.PURPLE,
+    CellMotion.UNDECIDED: style.GREY,
 }
-_DASHES: dict[Motion, Any] = {
-    Motion.REGULAR: "-",
-    Motion.UNDECIDED: (0, (1, 1)),
-    Motion.CHAOTIC: "-",
-    Motion.HYPERCHAOTIC: (0, (5, 1.5)),
+_DASHES: dict[CellMotion, Any] = {
+    CellMotion.REGULAR: "-",
+    CellMotion.UNDECIDED: (0, (1, 1)),
+    CellMotion.CHAOTIC: "-",
+    CellMotion.HYPERCHAOTIC: (0, (5, 1.5)),
 }
 
 
@@ -137,7 +137,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
     )
 
 
-def _own(data: xr.Dataset, kind: Motion) -> np.ndarray:
+def _own(data: xr.Dataset, kind: CellMotion) -> np.ndarray:
     return np.flatnonzero((data["motion"].values == kind) & np.isfinite(data["exponent_value"].values))
 
 
@@ -209,7 +209,7 @@ def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray
             )
 
 
-def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour: str) -> None:
+def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: CellMotion, colour: str) -> None:
     """Draw the exponents of the cells of one class of motion over time, as lines or as bands of quantiles."""
     own = _own(data, kind)
     if not own.size:

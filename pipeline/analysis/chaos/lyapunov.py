@@ -27,7 +27,7 @@ FEWEST_BLOCKS = 12
 """Fewest blocks for detecting a transient: three in each quarter, so that quarters have errors."""
 
 
-class Motion(IntEnum):
+class CellMotion(IntEnum):
     """Classes of a cell's motion, decided by its Lyapunov exponents."""
 
     UNKNOWN = 0
@@ -136,15 +136,15 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
     first = sign.isel(exponent=0, drop=True)
     closed = is_closed(ds)
     known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
-    motion = xr.full_like(ds["lyapunov_flag"], Motion.UNDECIDED)
-    motion = motion.where(~((first < 0) | (closed & (first <= 0))), np.int8(Motion.REGULAR))
-    motion = motion.where(~((first > 0) & ~closed), np.int8(Motion.CHAOTIC))
+    motion = xr.full_like(ds["lyapunov_flag"], CellMotion.UNDECIDED)
+    motion = motion.where(~((first < 0) | (closed & (first <= 0))), np.int8(CellMotion.REGULAR))
+    motion = motion.where(~((first > 0) & ~closed), np.int8(CellMotion.CHAOTIC))
     if ds.sizes["exponent"] > 1:
         second = sign.isel(exponent=1, drop=True)
         resolved = ds["lyapunov_flag"] != LyapunovFlag.UNRESOLVED
         hyper = (first > 0) & (second > 0) & resolved & ~closed
-        motion = motion.where(~hyper, np.int8(Motion.HYPERCHAOTIC))
-    motion = motion.where(known, np.int8(Motion.UNKNOWN))
+        motion = motion.where(~hyper, np.int8(CellMotion.HYPERCHAOTIC))
+    motion = motion.where(known, np.int8(CellMotion.UNKNOWN))
     contradicts = (known & closed & (first > 0)).astype(np.int8)
     return {
         "motion": motion.assign_attrs(motion_attrs()),
@@ -157,7 +157,7 @@ def motion_attrs() -> dict[str, Any]:
     return {
         "units": "1",
         "long_name": "kind of motion by its exponents",
-        **code_flags([motion.name.lower() for motion in Motion]),
+        **code_flags([motion.name.lower() for motion in CellMotion]),
     }
 
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from pipeline.explorer import RequestError
+from pipeline.products.product import STRICT
 
 MOST_BYTES = 65_536
 """Longest message [bytes]."""
@@ -33,7 +34,7 @@ Pair = tuple[float, float]
 class Message(BaseModel):
     """Base of all messages of the page: strict types, no unknown keys, no NaN, no infinity."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = STRICT
 
 
 class Job(Message):

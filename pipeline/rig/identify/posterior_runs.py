@@ -16,6 +16,7 @@ from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.layout.writing import write_atomically
 from pipeline.products.product import Table
+from pipeline.products.reporting import silent
 from pipeline.results.draws import LEVELS
 from pipeline.results.ragged import dense
 from pipeline.results.tabular import FEW_POINTS, points_of, words_of
@@ -74,12 +75,8 @@ def run_posterior(
         given = tables.get("parameters", {})
         overrides = {**given.get("overrides", {}), **changed}
         whole = {**tables, "parameters": {**given, "overrides": overrides}}
-        run(whole, folder / place, workers=workers, smoke=smoke, echo=_silent)
+        run(whole, folder / place, workers=workers, smoke=smoke, echo=silent)
     return folder
-
-
-def _silent(line: str) -> None:
-    """Ignore a line of text: the output function of a silent run."""
 
 
 def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[str], names: list[str]) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 import magpend_core
 from magpend_core import Status, load_model, load_preset, run_branches
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from tests.core import test_noisy
 
 
@@ -28,7 +29,7 @@ def many(n=96):
 
 
 def run_many(packed, frequency, starts, **options):
-    settings = {"n_transient": 7, "n_keep": 3, "rtol": 1e-7, "atol": 1e-7, **options}
+    settings = {"n_transient": 7, "n_keep": 3, "rtol": 1e-7, "atol": 1e-7, "system": PENDULUM_FITTED, **options}
     return run_branches(packed, frequency, starts, **settings)
 
 
@@ -105,7 +106,8 @@ def digest(found):
     return hashlib.sha256(found.section.tobytes() + found.n_steps.tobytes()).hexdigest()
 inputs = np.load("inputs.npz")
 packed, frequency, starts = (inputs[k] for k in ("packed", "frequency", "starts"))
-print(digest(run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rtol=1e-7, atol=1e-7)))
+settings = {"n_transient": 7, "n_keep": 3, "rtol": 1e-7, "atol": 1e-7, "system": PENDULUM_FITTED}
+print(digest(run_branches(packed, frequency, starts, **settings)))
 packed, frequency, starts = (inputs["struck_" + k] for k in ("packed", "frequency", "starts"))
 settings = {"n_transient": 0, "n_keep": 9, "rtol": 1e-7, "atol": 1e-7, "system": load_model("impact").system}
 print(digest(run_branches(packed, frequency, starts, **settings)))
@@ -196,7 +198,7 @@ def test_run_branches__each_point_starts_where_the_last_ended():
 
 def test_run_branches__first_step_may_be_given():
     packed, frequency, starts = many(4)
-    settings = {"n_transient": 0, "n_keep": 2, "rtol": 1e-9, "atol": 1e-9}
+    settings = {"n_transient": 0, "n_keep": 2, "rtol": 1e-9, "atol": 1e-9, "system": PENDULUM_FITTED}
     own = run_branches(packed, frequency, starts, **settings)
     zero = run_branches(packed, frequency, starts, step_size=np.zeros(4), **settings)
     given = run_branches(packed, frequency, starts, step_size=np.full(4, 1e-6), **settings)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from magpend_core import LyapunovExponents, Status, load_preset, lyapunov_exponents, polish_orbits
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from pipeline import open_run
 from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
@@ -55,6 +56,7 @@ def test_lyapunov__is_what_the_core_gives_from_the_last_section(cube):
             n_periods=160,
             n_blocks=4,
             max_steps_per_period=400,
+            system=PENDULUM_FITTED,
         )
         assert (one.lyapunov.values[rows] == found.exponents).all()
         assert (one.lyapunov_stderr.values[rows] == found.stderr).all()
@@ -68,7 +70,11 @@ def test_lyapunov__of_a_closed_orbit_is_that_of_its_multipliers(cube):
     closed = cube.sel(frequency=2.2).isel(initial_condition=0)
     assert closed.status == Status.PERIODIC
     orbit = polish_orbits(
-        load_preset().pack()[None], np.array([2.2]), closed.section.values[-1:], closed.orbit_period.values[None]
+        load_preset().pack()[None],
+        np.array([2.2]),
+        closed.section.values[-1:],
+        closed.orbit_period.values[None],
+        system=PENDULUM_FITTED,
     )
     expected = np.log(np.abs(orbit.multipliers[0])) * 2.2
     # 160 periods: the weighted average is at 1e-4 with the default of 400

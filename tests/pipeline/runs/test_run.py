@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from magpend_core import load_preset, run_branches
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from pipeline import open_run
 from pipeline.cli.console import Exit
 from pipeline.compute import task
@@ -83,7 +84,7 @@ def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
     starts = np.column_stack([ds[f"{s}_0"] for s in ("psi1", "psi2", "psi1_dot", "psi2_dot")])
     frequency = np.array([path] * 5 + [path[::-1]] * 5)
     packed = np.broadcast_to(load_preset().pack(), (10, 6, len(load_preset().names)))
-    expected = run_branches(packed, frequency, starts, **spec.integration.model_dump())
+    expected = run_branches(packed, frequency, starts, system=PENDULUM_FITTED, **spec.integration.model_dump())
     for name in ("section", "turns", "status", "orbit_period", "n_steps"):
         found = ds[name].transpose("branch", "frequency", ...).values
         wanted = getattr(expected, name).copy()

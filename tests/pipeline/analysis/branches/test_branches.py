@@ -583,7 +583,7 @@ def test_explore__brute_force_agrees(right_family):
     assert result.orbit_period[:, 0].tolist() == [branches[i].family.period for i, _ in chosen]
     for orbit, sections in zip(orbits, result.section[:, 0], strict=True):
         for section in sections:
-            assert scaled_distance(orbit, section).min() < 1e-6
+            assert scaled_distance(orbit, section, PENDULUM_FITTED).min() < 1e-6
     assert {i for i, _ in chosen} == {0, 1}
     assert n > 15
     assert set(np.unique(ds["side"].values[:, 0])) == {Side.RIGHT}

@@ -12,7 +12,7 @@ from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.chaos.analysis import chaos_of, chaos_table, chaotic_cells, dimension_table, section_dimension
 from pipeline.analysis.chaos.convergence_figure import plot_convergence
 from pipeline.analysis.chaos.dimension_figure import plot_dimension
-from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean
+from pipeline.analysis.chaos.lyapunov import CellMotion, pooled_mean
 from pipeline.analysis.chaos.per_attractor import Nature
 from pipeline.cli.console import Exit
 from pipeline.layout.vocabulary import (
@@ -119,7 +119,7 @@ def test_chaos__of_closed_cells():
     cube["status"][:] = 1
     cube["orbit_period"][:] = 3
     cells = chaotic_cells(cube)
-    assert cells.motion.values.tolist() == [[Motion.UNDECIDED, Motion.REGULAR, Motion.REGULAR]]
+    assert cells.motion.values.tolist() == [[CellMotion.UNDECIDED, CellMotion.REGULAR, CellMotion.REGULAR]]
     assert cells.contradicts.values.tolist() == [[1, 0, 0]]
     table = chaos_table(chaos_of(cube, attractors_of(cube, [0, 0, 0], [PERIODIC_ORBIT])))
     assert table.rows[0]["n_contradicting"] == 1
@@ -191,7 +191,7 @@ def test_chaos__zero_one_needs_sections():
     cube["orbit_period"][0, 1] = 2
     found = chaos_of(cube, attractors_of(cube, [0, 1], [BOUNDED_SET, PERIODIC_ORBIT]))
     assert "run it with [products] lyapunov" in found.attrs["not_computed"]
-    assert found.motion.values.tolist() == [[Motion.UNKNOWN, Motion.REGULAR]]
+    assert found.motion.values.tolist() == [[CellMotion.UNKNOWN, CellMotion.REGULAR]]
     # K near 1 alone tells, and says what it rests on
     assert found.nature.values.tolist() == [Nature.CHAOTIC_BY_TEST, Nature.REGULAR]
     assert "chaotic (by the 0-1 test)" in "\n".join(chaos_table(found).lines)

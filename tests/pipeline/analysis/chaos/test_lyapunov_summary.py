@@ -5,7 +5,8 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from magpend_core import Status, load_preset, lyapunov_exponents
-from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+from pipeline.analysis.chaos.lyapunov import CellMotion, spectrum_of_jacobians, summarise
 from pipeline.analysis.chaos.lyapunov_figure import plot_lyapunov, plot_lyapunov_map
 from tests.core.cells import stroboscopic_map
 from tests.pipeline.analysis.cubes import artists, exponents_cube
@@ -51,13 +52,13 @@ def test_summarise__motion(cube):
     # cell that closed with a positive exponent is not
     assert summary.contradicts.values.tolist() == [[0, 0], [0, 0], [0, 1]]
     assert found.tolist() == [
-        [Motion.HYPERCHAOTIC, Motion.UNKNOWN],
-        [Motion.REGULAR, Motion.REGULAR],
-        [Motion.HYPERCHAOTIC, Motion.UNDECIDED],
+        [CellMotion.HYPERCHAOTIC, CellMotion.UNKNOWN],
+        [CellMotion.REGULAR, CellMotion.REGULAR],
+        [CellMotion.HYPERCHAOTIC, CellMotion.UNDECIDED],
     ]
-    assert summarise(cube.isel(exponent=slice(1))).motion.values[0, 0] == Motion.CHAOTIC
+    assert summarise(cube.isel(exponent=slice(1))).motion.values[0, 0] == CellMotion.CHAOTIC
     cube["lyapunov_flag"][0, 0] = 3  # only the first exponent is resolved
-    assert summarise(cube).motion.values[0, 0] == Motion.CHAOTIC
+    assert summarise(cube).motion.values[0, 0] == CellMotion.CHAOTIC
 
 
 @pytest.mark.slow
@@ -112,7 +113,9 @@ def test_spectrum_of_jacobians__is_the_spectrum_of_the_engine():
         jacobians.append(derivative[0])
         point = image[:, -1]
     expected = spectrum_of_jacobians(jacobians, n_blocks=4, n_transient=10)
-    found = lyapunov_exponents(one, frequency, start, n_transient=10, n_periods=16, rtol=1e-11, atol=1e-11, n_blocks=4)
+    found = lyapunov_exponents(
+        one, frequency, start, n_transient=10, n_periods=16, rtol=1e-11, atol=1e-11, n_blocks=4, system=PENDULUM_FITTED
+    )
     assert found.exponents[0] == pytest.approx(expected.exponents * 2.4, abs=1e-4)
     assert found.blocks[0] == pytest.approx(expected.blocks * 2.4, abs=1e-4)
     assert found.stderr[0] == pytest.approx(expected.stderr * 2.4, abs=1e-4)
