@@ -1,5 +1,7 @@
 """Stroboscopic sections against independent integrations; early stops; messages."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,8 @@ from magpend_core import Status, run_branches, sections
 from magpend_core.engine.lanes import engine_of
 from magpend_core.engine.observers import RECORD
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+
+run_pendulum = partial(run_branches, system=PENDULUM_FITTED)
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-11}
 
@@ -108,9 +112,9 @@ def test_sections__one_frequency_serves_all(preset):
     packed, start = preset.pack()[None, None], np.zeros((1, 4))
     frequency = np.array([[2.2]])
     settings = {"n_transient": 0, "n_keep": 1, "rtol": 1e-5, "atol": 1e-5}
-    found = run_branches(packed, frequency, start, **settings)
+    found = run_pendulum(packed, frequency, start, **settings)
     for array in (packed, frequency, start):
         array.flags.writeable = False
-    frozen = run_branches(packed, frequency, start, **settings)
+    frozen = run_pendulum(packed, frequency, start, **settings)
     assert frozen.section.tobytes() == found.section.tobytes()
     assert len(engine_of(PENDULUM_FITTED, RECORD).__wrapped__.signatures) == 1

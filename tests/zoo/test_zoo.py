@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 if str(ROOT) not in sys.path:  # tests are no package; the zoo's modules are found from the checkout
     sys.path.append(str(ROOT))
 
+from pipeline.layout.own_words import with_plain_names  # noqa: E402
 from pipeline.runs.derive import derive  # noqa: E402
 from pipeline.runs.run import run  # noqa: E402
 from tests.zoo import answers, variants  # noqa: E402
@@ -79,7 +80,7 @@ def test_zoo__a_twin_has_the_same_bifurcations(tmp_path):
         if setting in UNITS:
             data, _ = rescaled(data, UNITS[setting])
         run(data, tmp_path / setting, workers=0, echo=lambda _: None)
-        ds = derive(tmp_path / setting, "branches")
+        ds = with_plain_names(derive(tmp_path / setting, "branches"))
         found.append((ds["kind"].values.tolist(), ds["value"].values, ds.sizes["branch"]))
     (kinds, values, n_branches), twin = found
     assert len(kinds) > 0

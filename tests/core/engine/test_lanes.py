@@ -1,6 +1,7 @@
 """The engine: its tableau, order, steps and statuses."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from magpend_core.engine.lanes import engine_bindings, rows_of
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, store
 from magpend_core.engine.tableau import DENSE, ERROR, N_STAGES, NODES, STAGES
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from tests.core.cells import scipy_end
+
+run_pendulum = partial(run_branches, system=PENDULUM_FITTED)
 
 # row 6 of the tableau holds the weights of the solution of order 5
 WEIGHTS = np.append(STAGES[6], 0.0)
@@ -228,15 +232,15 @@ def test_run_branches__step_limit(preset):
     packed = np.tile(preset.pack(), (1, 2, 1))
     settings = {"n_transient": 0, "n_keep": 2, "rtol": 1e-8, "atol": 1e-8}
     start = [[0.2, 0.2, 0.0, 0.0]]
-    found = run_branches(packed, [[2.2, 2.2]], start, max_steps_per_period=20, **settings)
+    found = run_pendulum(packed, [[2.2, 2.2]], start, max_steps_per_period=20, **settings)
     assert found.status.tolist() == [[Status.STEP_LIMIT, Status.UNREACHED]]
     assert np.isnan(found.section).all()
     assert found.n_periods.tolist() == [[0, 0]]
     assert found.n_steps[0, 0] + found.n_rejected[0, 0] == 21
     # the limit is on each period, not on their sum
-    free = run_branches(packed, [[2.2, 2.2]], start, **settings)
+    free = run_pendulum(packed, [[2.2, 2.2]], start, **settings)
     most = int(np.max(free.n_steps + free.n_rejected))
-    found = run_branches(packed, [[2.2, 2.2]], start, max_steps_per_period=most - 20, **settings)
+    found = run_pendulum(packed, [[2.2, 2.2]], start, max_steps_per_period=most - 20, **settings)
     assert (found.status < Status.DIVERGED).all()
 
 
@@ -248,6 +252,6 @@ def test_run_branches__counts_periods_and_keeps_the_last(preset):
         assert found.n_periods[0] == n_transient + n_keep
         assert (found.section[0] == every.section[0, n_transient:]).all()
     nothing = np.zeros((0, 2, 34)), np.zeros((0, 2)), np.zeros((0, 4))
-    found = run_branches(*nothing, n_transient=1, n_keep=3, rtol=1e-6, atol=1e-6)
+    found = run_pendulum(*nothing, n_transient=1, n_keep=3, rtol=1e-6, atol=1e-6)
     assert found.section.shape == (0, 2, 3, 4)
     assert found.status.shape == (0, 2)

@@ -1,6 +1,7 @@
 """Extremes and means per period: against closed forms, dense output, and themselves in other company."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from magpend_core.engine.watching import HIGHEST, LOWEST, MEAN
 from magpend_core.models.duffing.system import DUFFING
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from tests.core.cells import OF_THE_MOTION, OF_THE_PENDULUM, run_cells
+
+run_pendulum = partial(run_branches, system=PENDULUM_FITTED)
 
 # an engine is compiled for each choice of quantities: two choices do
 NAMES = ("energy", "power_in", "power_dissipated", "drive", "v")
@@ -96,12 +99,12 @@ def many(n):
 
 def test_watching__changes_no_section_and_depends_on_no_neighbour():
     arguments, settings = many(37), {"rtol": 1e-6, "atol": 1e-6, "n_transient": 2, "n_keep": 2}
-    plain = run_branches(*arguments, **settings)
+    plain = run_pendulum(*arguments, **settings)
     assert plain.extremes is None
     names = OF_THE_PENDULUM
-    watched = run_branches(*arguments, quantities=names, **settings)
-    alone = run_branches(*(a[5:6] for a in arguments), quantities=names, n_lanes=1, **settings)
-    few = run_branches(*arguments, quantities=names, n_lanes=13, **settings)
+    watched = run_pendulum(*arguments, quantities=names, **settings)
+    alone = run_pendulum(*(a[5:6] for a in arguments), quantities=names, n_lanes=1, **settings)
+    few = run_pendulum(*arguments, quantities=names, n_lanes=13, **settings)
     for name in (f.name for f in dataclasses.fields(plain) if f.name not in ("extremes", "return_time")):
         assert getattr(plain, name).tobytes() == getattr(watched, name).tobytes(), name
     assert np.isfinite(watched.extremes).all()
@@ -129,7 +132,7 @@ def test_extremes__of_failed_cells_are_nan():
     packed, frequency, starts = many(3)
     starts[1] = [0.0, 0.0, 9e3, -9e3]
     options = {"n_transient": 0, "n_keep": 2, "rtol": 1e-6, "atol": 1e-6, "max_steps_per_period": 2000}
-    found = run_branches(packed, frequency, starts, quantities=OF_THE_PENDULUM, **options)
+    found = run_pendulum(packed, frequency, starts, quantities=OF_THE_PENDULUM, **options)
     assert (found.status[1] > found.status[0]).all()
     assert np.isnan(found.extremes[1]).all()
     assert np.isfinite(found.extremes[[0, 2]]).all()

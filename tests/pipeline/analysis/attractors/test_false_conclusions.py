@@ -22,10 +22,9 @@ from pipeline.layout.vocabulary import (
     TRANSIENT,
     UNSTABLE,
 )
-from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.results.ragged import dense
-from pipeline.runs.derive import derive
+from pipeline.runs.derive import derive, shown_table
 from pipeline.specification.problems import SpecError
 from tests.core.flows import table
 from tests.pipeline.analysis.cubes import flow_cube, sweep
@@ -294,7 +293,7 @@ def test_derive__every_analysis_of_a_corner_case(name, tmp_path):
         except SpecError:  # a sentence: the analysis needs an option, or another kind of run
             continue
         if ANALYSES[analysis].table:
-            assert function_of(ANALYSES[analysis].table)(found).lines, analysis
+            assert shown_table(analysis, found).lines, analysis
             shown.append(analysis)
     assert {"attractors", "basins", "settling", "chaos"} <= set(shown)
 

@@ -162,7 +162,7 @@ def test_curves__spring_from_a_bogdanov_takens_point(tmp_path):
     run = magpend.run(spec.with_integration(n_transient=100, n_keep=4), tmp_path / "run", workers=0)
     found = run.curves(low=-0.12, high=0.02, stable=True, second="b2", second_low=-0.02, second_high=0.22)
     kinds = [words_of(found["kind"])[code] for code in found["kind"].values]
-    rows = {kind: np.array([found[name].values[k] for name in ("first", "second")]) for k, kind in enumerate(kinds)}
+    rows = {kind: np.array([found[name].values[k] for name in ("b1", "b2")]) for k, kind in enumerate(kinds)}
     hopf, homoclinic = (row[:, np.isfinite(row[0])] for row in (rows["hopf"], rows["homoclinic"]))
     np.testing.assert_allclose(hopf[0], -(hopf[1] ** 2), atol=1e-9)
     assert np.abs(homoclinic[:, 0]).max() < 1e-9
