@@ -1,4 +1,4 @@
-"""Declare the figures of cells and the film: options and functions."""
+"""Declare the figures that draw cells alone, and the options of films and of measured points."""
 
 from __future__ import annotations
 

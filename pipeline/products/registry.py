@@ -6,6 +6,7 @@ A line names the module that declares an analysis, its figure, or both: ``NAME``
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -114,9 +115,15 @@ Products in the group without a title are not listed.
 def _of_other_packages() -> dict[str, Line]:
     found: dict[str, Line] = {}
     for entry in entry_points(group="magpend.analyses"):
+        told = f"the analysis {entry.name} of another package ({entry.value}) is left out"
         if entry.name in found or entry.name in OWN:
-            raise ValueError(f"entry point {entry.name} = {entry.value}: magpend has this name; rename the analysis.")
-        module = entry.load()
+            warnings.warn(f"{told}: its name is taken; rename it.", stacklevel=2)
+            continue
+        try:
+            module = entry.load()
+        except Exception as error:  # whatever is wrong with it, magpend goes on
+            warnings.warn(f"{told}: it cannot be imported ({type(error).__name__}: {error}).", stacklevel=2)
+            continue
         kinds = {kind: "" for kind, end in _ENDS.items() if hasattr(module, entry.name.upper() + end)}
         found[entry.name] = Line(entry.value, **kinds)
     return found

@@ -1,1 +1,1 @@
-"""What the results of all analyses are made of: rows, tables, selections, labels, measured points, tolerances."""
+"""Parts that the rooms of analysis share: rows and tables of results, selections, measured points, tolerances."""

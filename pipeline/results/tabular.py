@@ -56,9 +56,9 @@ def values(one: xr.Dataset, *names: str) -> Row:
 
 
 def plain_table(ds: xr.Dataset) -> Table:
-    """Return the table of a result without one of its own: a row for each place, with coordinates, variables, units.
+    """Return a table of any result: its variables in columns, and a row for each combination of the coordinates.
 
-    The dims are those of the variable with the most; variables without some of them are repeated along these.
+    The coordinates are those of the variable with the most dims. A variable without some of them is repeated.
     """
     like = max(ds.data_vars.values(), key=lambda variable: variable.ndim)
     names = [*(str(d) for d in like.dims if d in ds.coords), *(str(n) for n in ds.data_vars if ds[n].ndim <= like.ndim)]

@@ -59,13 +59,12 @@ def __getattr__(name: str) -> Any:
 
         return metadata.version("magpend")
     if name.startswith("_") or name not in _homes():
-        from pipeline.products.registry import ANALYSES
+        if not name.startswith("_"):
+            from magpend._methods import ANALYSES, analysis
 
-        if name.startswith("_") or name not in ANALYSES.listed:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from magpend._methods import analysis
-
-        return analysis(name)  # of another package
+            if name in ANALYSES.listed:  # of another package
+                return analysis(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = _naming_arguments(resolve_name(_homes()[name]), _homes()[name])
     return value
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import tomllib
 from pathlib import Path
 
@@ -79,7 +78,17 @@ def test_analysis_of_another_package__is_like_our_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_analysis_of_another_package__may_not_take_a_name_of_ours(tmp_path: Path) -> None:
-    with pytest.raises(subprocess.CalledProcessError) as caught:
-        told(package(tmp_path / "site", "basins"), "import magpend; magpend.Run.basins")
-    assert "entry point basins = extents.declaration: magpend has this name; rename" in caught.value.stderr
+def test_analysis_of_another_package__that_cannot_be_used_is_left_out_with_a_reason(tmp_path: Path) -> None:
+    used = """
+import warnings
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    import magpend
+    print(magpend.Run.basins.__name__, hasattr(magpend, "extent"), *(str(one.message) for one in said))
+"""
+    found = told(package(tmp_path / "taken", "basins"), used)
+    reason = "its name is taken; rename it."
+    assert found == f"basins False the analysis basins of another package (extents.declaration) is left out: {reason}\n"
+    site = package(tmp_path / "broken")
+    (site / "extents/declaration.py").write_text("import nowhere\n", "utf-8")
+    assert "is left out: it cannot be imported (ModuleNotFoundError: No module named 'nowhere')" in told(site, used)

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from pipeline.products.product import Table
-from pipeline.results.tabular import Row, header_of, points_of, shown
+from pipeline.results.tabular import Row, header_of, plain_table, points_of, shown
 from pipeline.runs.derive import derive, shown_table
 from pipeline.runs.run import run
 
@@ -95,3 +95,19 @@ def test_tables__of_a_map_whose_parameters_have_the_names_of_columns(first, tmp_
             )
         if name == "curves":
             assert {f"parameter_{second}", second} & set(header)
+
+
+def test_plain_table__has_a_row_for_each_combination_of_the_coordinates():
+    flags = {"flag_values": [0, 1], "flag_meanings": "rests moves"}
+    ds = xr.Dataset(
+        {"low": (("F", "state"), [[1.0, 2.0], [3.0, np.nan]], {"units": "m"}), "kind": ("F", [1, 0], flags)},
+        {"F": ("F", [0.5, 1.5], {"units": "N"}), "state": ["x", "v"]},
+    )
+    table = plain_table(ds)
+    assert [list(row.values())[:2] for row in table.rows] == [[0.5, "x"], [0.5, "v"], [1.5, "x"], [1.5, "v"]]
+    assert [row["low"] for row in table.rows[:3]] == [1.0, 2.0, 3.0]
+    assert [row["kind"] for row in table.rows] == ["moves", "moves", "rests", "rests"]
+    assert table.lines[0].split() == ["F", "[N]", "state", "low", "[m]", "kind"]
+    assert table.lines[-1].split() == ["1.5", "v", "-", "rests"]
+    long = plain_table(xr.Dataset({"n": ("F", np.arange(40))}, {"F": np.arange(40.0)}))
+    assert (len(long.rows), long.lines[-1]) == (40, "and 10 more rows; all are in --csv and --json")
