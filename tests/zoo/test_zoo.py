@@ -43,6 +43,7 @@ TWINS = [
     ("repeller", "degrees"),
     ("belt-stick", "small and slow"),
     ("lorenz-pair", "hundreds, far from zero"),
+    ("held-amplitude", "far from zero"),
 ]
 
 

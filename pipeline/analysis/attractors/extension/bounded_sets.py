@@ -187,12 +187,11 @@ def _dimension(growth: Growth | None, kind: int, point: Point) -> int:
 
 def _is_in_family(points: np.ndarray, dimension: int, point: Point, settings: Settings) -> bool:
     """Return whether the flow has more zero exponents than one trajectory with these section points fills."""
-    if dimension < 2 or not (dimension > 2 or point.can_rest):
-        return False
-    if dimension > 2 or point.n_neutral:
+    if dimension > 2 or (dimension == 2 and point.n_neutral):
         return True
-    # at crossings a torus shows as a curve, and an orbit as a few points
-    return len(np.unique(settings.geometry.boxes(points, 10.0 * settings.closure), axis=0)) <= 2 * settings.longest
+    # on a section a torus shows as a curve, and an orbit as a few points
+    boxes = np.unique(settings.geometry.boxes(points, 10.0 * settings.closure), axis=0)
+    return dimension == 2 and len(boxes) <= 2 * settings.longest
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:

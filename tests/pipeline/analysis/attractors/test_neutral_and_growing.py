@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.analysis.attractors.extension.bounded_sets import _is_in_family
 from pipeline.analysis.attractors.extension.conservative import _split, conservative_sets
 from pipeline.analysis.attractors.extension.courses import GROWS
 from pipeline.analysis.attractors.extension.growth import Escape
@@ -133,3 +134,15 @@ def test_preserves_volume__not_asked_of_a_flow_with_one_state():
     with pytest.raises(StopIteration) as found:
         next(_preserves_volume(SimpleNamespace(can_rest=True, n_states=1), None))
     assert found.value.value is False
+
+
+@pytest.mark.parametrize("can_rest", [False, True])
+def test_is_in_family__an_orbit_with_a_zero_exponent_is_no_torus(can_rest):
+    """Rounding scatters section points about an orbit beside which a parameter that is a state is neutral."""
+    settings = SimpleNamespace(geometry=PLANE, closure=1e-5, longest=32)
+    point = SimpleNamespace(n_neutral=0, can_rest=can_rest)
+    scattered = 1e-7 * np.random.default_rng(0).normal(size=(500, 2))
+    turns = TWO_PI * GOLDEN * np.arange(500)
+    assert _is_in_family(scattered, 2, point, settings)
+    assert not _is_in_family(np.stack([np.cos(turns), np.sin(turns)], axis=1), 2, point, settings)
+    assert not _is_in_family(scattered, 0, point, settings)
