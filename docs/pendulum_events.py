@@ -1,9 +1,9 @@
 """Tabulate the events of the pendulum's attractors: ``python docs/pendulum_events.py [--runs FOLDER] [NAME...]``.
 
 A name is that of a workflow. Its run is computed (a complete one is taken as it is), its events are named as by
-``magpend analyse events RUN --stable --period N``, and the tables of the tutorial are written anew, between the
-marks ``<!-- events: NAME -->`` and ``<!-- end -->``; without names all that have marks. Beside the tutorial lie the
-figure and a CSV file with all columns.
+``magpend analyse branches RUN --stable --period N`` and ``magpend analyse events RUN``, and the tables of the tutorial
+are written anew, between the marks ``<!-- events: NAME -->`` and ``<!-- end -->``; without names all that have marks.
+Beside the tutorial lie the figure and a CSV file with all columns.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ SMALL = 1e-8
 
 Row = dict[str, Any]
 
-OPTIONS: dict[str, dict[str, Any]] = {
-    "events_2_3hz": {"stable": True, "max_period": 24},
-    "events_0p1_2hz": {"stable": True, "max_period": 28, "orbits": True},
-}
-"""Options of the analysis by run."""
+LONGEST = {"events_2_3hz": 24, "events_0p1_2hz": 28}
+"""Longest period of the branches by run."""
+
+OPTIONS: dict[str, dict[str, Any]] = {"events_2_3hz": {}, "events_0p1_2hz": {"orbits": True}}
+"""Options of the events by run."""
 
 SIDES = {
     "on one side": ("left", "right"),
@@ -171,12 +171,11 @@ def main() -> None:
     given = words.parse_args()
     for name in given.names:
         run, options = magpend.run(name, given.runs / name), OPTIONS[name]
+        run.branches(stable=True, max_period=LONGEST[name])
         rows = rows_of(run, options)
         rows.to_csv(PAGE.parent / f"{name}.csv", index=False)
         run.plot.genealogy(**options).figure.savefig(PAGE.parent / f"{name}.png", dpi=120)
-        PAGE.write_text(
-            written(PAGE.read_text("utf-8"), name, tables_of(rows, options["max_period"], twins_of(run))), "utf-8"
-        )
+        PAGE.write_text(written(PAGE.read_text("utf-8"), name, tables_of(rows, LONGEST[name], twins_of(run))), "utf-8")
 
 
 if __name__ == "__main__":

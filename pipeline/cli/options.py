@@ -95,6 +95,7 @@ def taking(model: type[Options], command: Command) -> Command:
     """
 
     def run(*args: Any, **given: Any) -> None:
+        from pipeline.products.product import flag_of
         from pipeline.specification.problems import SpecError, validated
 
         wanted, problems = {}, []
@@ -123,12 +124,6 @@ def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
     return complete
 
 
-def flag_of(model: type[Options], name: str) -> str:
-    """Return the command-line flag of a field, such as ``--max-period``."""
-    extra: Any = model.model_fields[name].json_schema_extra or {}
-    return str(extra.get("flag") or f"--{name.replace('_', '-')}")
-
-
 def help_of(info: FieldInfo) -> str:
     """Return the help text of a field: its description, its unit and its bounds."""
     from pipeline.products.product import bounds_of
@@ -149,7 +144,7 @@ def kind_of(info: FieldInfo) -> Any:
 
 
 def _parameter(model: type[Options], name: str) -> inspect.Parameter:
-    from pipeline.products.product import default_of
+    from pipeline.products.product import default_of, flag_of
 
     info, flag = model.model_fields[name], flag_of(model, name)
     kind, default = kind_of(info), default_of(model, name)

@@ -53,7 +53,7 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     if options.out:
         check_figure_path(_target_of(options), FIGURES, [read_run(directory).digest])
     run, wanted = ready(directory, name, options, console.note)
-    target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, in_own_words(run, wanted))
+    target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, in_own_words(wanted, run.spec.rate))
     if not wanted.out and run.info.files.local is None:  # runs of other buckets may have the same name
         for file in (target, target.with_suffix(".nc")):
             check_file(file, digests=[run.info.digest])

@@ -13,6 +13,7 @@ import io
 import json
 import math
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,6 +133,32 @@ def default_of(model: type[Options], name: str) -> Any:
     if value is PydanticUndefined:
         return None
     return list(value) if isinstance(value, tuple) else value
+
+
+def flag_of(model: type[Options], name: str) -> str:
+    """Return the command-line flag of a field, such as ``--max-period``."""
+    extra: Any = model.model_fields[name].json_schema_extra or {}
+    return str(extra.get("flag") or f"--{name.replace('_', '-')}")
+
+
+def as_flags(model: type[Options], options: Mapping[str, Any]) -> list[str]:
+    """Return options as words of a shell command, such as ``--period 4``."""
+    words = []
+    for name, value in options.items():
+        flag = flag_of(model, name)
+        if isinstance(value, bool):
+            words.append(flag if value else flag.replace("--", "--no-", 1))
+        elif isinstance(value, Mapping):
+            words += [f"{flag} {key}={_text(one, ':')}" for key, one in value.items()]
+        else:
+            words.append(f"{flag} {shlex.quote(_text(value))}")
+    return words
+
+
+def _text(value: Any, between: str = " ") -> str:
+    if isinstance(value, list | tuple):
+        return between.join(map(_text, value))
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
 def bounds_of(info: FieldInfo) -> str:

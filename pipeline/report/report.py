@@ -21,15 +21,15 @@ from pipeline.analysis.spectrum.declaration import SpectrumOptions
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.vocabulary import axis_name, is_grid_dim, letter, parameter_name, split_dims
+from pipeline.products.product import as_flags
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.report.page import Block, Facts, Grid, Note, Page, Part, Source, grid_of, picture_of
 from pipeline.results.outcomes import sentence
 from pipeline.results.tabular import axis_ranges, counted, distinct, leading, number
-from pipeline.runs.derive import AnalysedRun, shown_table
+from pipeline.runs.derive import AnalysedRun, changed_options, is_current, shown_table
 from pipeline.runs.drawing import figure
 from pipeline.runs.naming import in_own_words as options_in_own_words
 from pipeline.runs.status import state
-from pipeline.runs.versions import current
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.tables import RATES
 from pipeline.store.errors import DamagedError
@@ -42,14 +42,17 @@ if TYPE_CHECKING:
 
 
 def stored_options(run: RunDirectory, name: str) -> list[dict[str, Any]]:
-    """Return the options, as far as they differ from the defaults, of each valid stored result; the fewest first."""
-    found, wanted = [], current(run, name)
+    """Return the options, as far as they differ from the defaults, of each valid stored result; the fewest first.
+
+    Branches are those on which other results rest, one set for each parameter.
+    """
+    found = []
     for place in products_in(run.info.files.below(DERIVED)):
         try:
             attrs = read_product_attrs(place)
         except (DamagedError, FileNotFoundError):
             continue
-        if all(attrs.get(key) == value for key, value in wanted.items()):
+        if is_current(run, name, attrs) and (name != "branches" or not changed_options(run, name, attrs)):
             found.append(settled_options(name, attrs))
     return sorted(found, key=lambda options: (len(options), json.dumps(options, sort_keys=True)))
 
@@ -59,15 +62,7 @@ def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
 
     Options that were left open are filled in, such as a range that defaults to the axis'.
     """
-    given = json.loads(str(attrs["derived_options"]))
-    found: dict[str, Any] = ANALYSES[name].options.model_validate(_tuples(given)).changed()
-    return found
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _tuples(part) for name, part in value.items()}
-    return tuple(_tuples(part) for part in value) if isinstance(value, list) else value
+    return ANALYSES[name].options.model_validate_json(attrs["derived_options"]).changed()
 
 
 CHEAP = ("attractors", "hysteresis", "basins")
@@ -323,7 +318,7 @@ def _spectra(shown: Shown) -> Iterator[Block]:
     except SpecError as error:
         yield Note(str(error))
     for options in stored_options(shown.run, "spectrum"):
-        at: dict[str, float] = options_in_own_words(shown.run, SpectrumOptions(**options)).at
+        at: dict[str, float] = options_in_own_words(SpectrumOptions(**options), shown.run.spec.rate).at
         along = [d for d in _long_axes(shown) if d not in at]
         if not along or "cell" in options:
             place = ", ".join(f"{name} = {value:g}" for name, value in at.items())
@@ -360,7 +355,8 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
     if drawn and drawn not in ("attractors", "lyapunov"):
         at = {d: float(shown.cube[d].values[0]) for d in shown.axes} if drawn == "basins" else {}
         where = " at the first values of the axes" if any(shown.cube.sizes[d] > 1 for d in at) else ""
-        yield from _drawn(shown, drawn, f"{SHOWN[name][1]}{where}", **options, **({"at": at} if at else {}))
+        own = {key: value for key, value in options.items() if key in FIGURES[drawn].options.model_fields}
+        yield from _drawn(shown, drawn, f"{SHOWN[name][1]}{where}", **own, **({"at": at} if at else {}))
 
 
 _OF_ATTRACTORS = {
@@ -435,22 +431,7 @@ def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
     """Return the shell command for an analysis or a figure with given options."""
     verb, _, name = words.partition(" ")
     model = (ANALYSES if verb == "analyse" else FIGURES)[name].options
-    parts = []
-    for key, value in options.items():
-        extra: Any = model.model_fields[key].json_schema_extra
-        flag = (extra or {}).get("flag") or f"--{key.replace('_', '-')}"
-        if isinstance(value, bool):
-            parts.append(flag if value else flag.replace("--", "--no-", 1))
-        elif isinstance(value, Mapping):
-            parts += [f"{flag} {k}={v:.10g}" for k, v in value.items()]
-        else:
-            parts.append(f"{flag} {shlex.quote(text_of_option(value))}")
-    return " ".join(["magpend", words, place, *parts])
-
-
-def text_of_option(value: Any) -> str:
-    """Format the value of an option for a shell command."""
-    return " ".join(f"{part:.15g}" for part in value) if isinstance(value, list | tuple) else str(value)
+    return " ".join(["magpend", words, place, *as_flags(model, options)])
 
 
 Echo = Callable[[str], None]

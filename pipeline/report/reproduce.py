@@ -19,6 +19,7 @@ from pipeline.report.measures import MEASURES
 from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, picture_of, write
 from pipeline.report.report import command_of, made_by, provenance_of
 from pipeline.report.study import ClaimTable, FigureTable, PictureTable, Results, Study
+from pipeline.runs.derive import derive
 from pipeline.runs.drawing import figure
 from pipeline.runs.stopping import stoppable
 from pipeline.specification.problems import SpecError, unknown_name
@@ -44,7 +45,10 @@ def picture(results: Results, table: PictureTable) -> Block:
 
 
 def _plot(results: Results, table: PictureTable) -> DataFigure:
-    return figure(results.run(table.of), table.figure, table.options)
+    run = results.run(table.of)
+    if table.branches:
+        derive(run, "branches", table.branches)
+    return figure(run, table.figure, table.options)
 
 
 def _quantities(results: Results, table: PictureTable) -> DataFigure:
@@ -77,7 +81,8 @@ _DRAW = {"plot": _plot, "quantities": _quantities, "recording": _recording, "ser
 def _command_of_picture(results: Results, table: PictureTable) -> str:
     if table.kind == "plot":
         place = shlex.quote(str(results.folder / "runs" / table.of))
-        return command_of(f"plot {table.figure}", table.options, place)
+        found = [command_of("analyse branches", table.branches, place)] if table.branches else []
+        return "\n".join([*found, command_of(f"plot {table.figure}", table.options, place)])
     if table.kind == "recording":
         file = results.folder / "recordings" / f"{table.of}.csv"
         mapping, out = file.with_suffix(".toml"), file.with_suffix(".png")

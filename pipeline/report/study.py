@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from pipeline.layout.writing import write_atomically
-from pipeline.products.registry import FIGURES
+from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.specification.files import STUDY, find_spec, read_toml, shipped_files
@@ -56,6 +56,7 @@ class PictureTable(Table):
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(None, description="Drive frequency [Hz].")
     caption: str = Field(description="Sentence below the picture.")
     options: dict[str, Any] = Field({}, description="Options of the figure, as its command has them.")
+    branches: dict[str, Any] = Field({}, description="Options with which the run's branches are found before.")
 
 
 class ClaimTable(Table):
@@ -202,11 +203,13 @@ def _problems(table: StudyTable) -> list[str]:
 def _plot_problems(at: str, picture: PictureTable) -> list[str]:
     if picture.figure not in FIGURES:
         return [f"{at}.figure: {unknown_name('figure', picture.figure, FIGURES)}"]
-    try:
-        validated(FIGURES[picture.figure].options, picture.options, f"{at}.options")
-    except SpecError as error:
-        return error.problems
-    return []
+    problems = []
+    for product, table in ((FIGURES[picture.figure], "options"), (ANALYSES["branches"], "branches")):
+        try:
+            validated(product.options, getattr(picture, table), f"{at}.{table}")
+        except SpecError as error:
+            problems += error.problems
+    return problems
 
 
 Echo = Callable[[str], None]

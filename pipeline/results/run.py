@@ -43,6 +43,9 @@ class OpenRun(Protocol):
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of another analysis of this run, computed now or read if it is stored."""
 
+    def branch_options(self, parameter: str) -> Any:
+        """Return the options of the run's branches along a parameter: those last given, or the defaults."""
+
     def with_values(self, values: Sequence[float]) -> OpenRun:
         """Return the run beside this one that has further values of the one swept parameter; compute what it lacks.
 

@@ -124,7 +124,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
         run.derive(other)
     where = replace(_in_processes(run.where or Where()), place=run.info.files.place)
     clients.reach(where)
-    key = key_of(current(run, analysis.name), analysis, options)
+    key = key_of(current(run, analysis.name, options.plain()), analysis, options)
     task = partial(
         compute_block, type(run).of, run.info.files.place, run.digest, options, key, blocks, origin=origin(run.model)
     )
@@ -165,7 +165,7 @@ def compute_block(
         import_model(*origin)
     run, known = _opened(opened, directory, digest)
     analysis = ANALYSES[key["derived_product"]]
-    if key_of(current(run, analysis.name), analysis, options) != key:
+    if key_of(current(run, analysis.name, options.plain()), analysis, options) != key:
         raise RefusedError(
             f"{directory}: this worker's magpend would not compute the same {analysis.name}; install the same version "
             "everywhere."

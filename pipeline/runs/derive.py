@@ -10,9 +10,9 @@ The attribute ``derived_options`` holds the options as JSON. Labels (``state``, 
 the attribute ``words``. If two processes derive the same result at once, both compute it, and one of the equal
 results stays.
 
-A run has one set of attractors, on which its other analyses and its figures rest. The options with which they were
-last sought are in ``derived/attractors.json`` (`pipeline.runs.versions.attractor_options`); results that rest on
-others are stale.
+A run has one set of attractors, and one set of branches along each parameter. Its other analyses and its figures
+rest on them. `pipeline.runs.choices` keeps the options with which they were last found; results that rest on others
+are stale.
 
 docs/adding.md tells how to add an analysis.
 """
@@ -23,22 +23,23 @@ import contextlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.precision import Precision
 from pipeline.layout.columns import described
 from pipeline.layout.conventions import conventional
-from pipeline.layout.own_words import in_own_words, rate_attribute, with_own_names, with_plain_names
-from pipeline.layout.vocabulary import model_attribute, overrides_attribute
+from pipeline.layout.own_words import in_own_words, rate_attribute, rate_of, with_own_names, with_plain_names
+from pipeline.layout.vocabulary import axis_name, model_attribute, overrides_attribute, parameter_name
 from pipeline.products.product import Analysis, Options, Table, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import silent
+from pipeline.runs.choices import Choices, branches_in_words, changed_branches, chosen_options, is_choice
 from pipeline.runs.extend import refine
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
-from pipeline.runs.versions import OF_ATTRACTORS, attractor_options, current, key_of
+from pipeline.runs.versions import current, key_of
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED, Files
@@ -58,6 +59,7 @@ from pipeline.store.run import RunDirectory
 if TYPE_CHECKING:
     import xarray as xr
 
+    from pipeline.analysis.branches.declaration import BranchOptions
     from pipeline.compute.clients import Where
 
 Echo = Callable[[str], None]
@@ -85,19 +87,26 @@ class AnalysedRun(RunDirectory):
         return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)}, echo=echo or silent, **places)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of an analysis of this run with plain names, computed now or read if it is stored."""
-        return with_plain_names(derive(self, name, options))
+        """Return the result of an analysis of this run with plain names, computed now or read if it is stored.
+
+        Options of attractors or branches that differ from those of the run do not hold for the run.
+        """
+        return with_plain_names(_derived(self, name, _validated(name, options)))
+
+    def branch_options(self, parameter: str) -> BranchOptions:
+        """Return the options of the run's branches along a parameter: those last given, or the defaults."""
+        return Choices.of(self).along(parameter_name(parameter))
 
     def with_values(self, values: Sequence[float]) -> AnalysedRun:
         """Return the run beside this one that has further values of the swept parameter, see `extend.refine`; its
-        attractors are sought with the same options.
+        attractors and branches are found with the same options.
         """
         beside = refine(self, values, workers=self.workers, where=self.where, echo=self.echo)
         if beside is self:
             return self
         found = AnalysedRun.of(beside, self.echo, workers=self.workers, where=self.where)
-        if attractor_options(found) != attractor_options(self):
-            _keep(found, attractor_options(self))
+        if (chosen := Choices.of(self)) != Choices.of(found):
+            chosen.keep(found)
         return found
 
 
@@ -143,10 +152,7 @@ def derive(
     DamagedError
         If a chunk of the cube is damaged.
     """
-    if name not in ANALYSES:
-        raise SpecError(unknown_name("analysis", name, ANALYSES))
-    analysis = ANALYSES[name]
-    wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
+    wanted = options if isinstance(options, Options) else _validated(name, options or {})
     places: dict[str, Any] = {"workers": workers} if workers is not None else {}
     if scheduler is not None:
         from pipeline.compute.clients import Where
@@ -154,21 +160,33 @@ def derive(
         places["where"] = Where.of(scheduler)
         places["where"].resolved()
     run = AnalysedRun.of(source, echo, **places)
+    result = _derived(run, name, wanted)
+    if is_choice(wanted):
+        Choices.of(run).having(named(run, wanted)).keep(run)
+    return result
+
+
+def _validated(name: str, options: Mapping[str, Any]) -> Options:
+    if name not in ANALYSES:
+        raise SpecError(unknown_name("analysis", name, ANALYSES))
+    return validated(ANALYSES[name].options, options)
+
+
+def _derived(run: AnalysedRun, name: str, wanted: Options) -> xr.Dataset:
+    analysis = ANALYSES[name]
     if reason := run.spec.motion.unsuited(analysis):
         raise SpecError(f"{run.name}: {reason}")
-    is_chosen = name == "attractors" and bool(wanted.model_fields_set)
-    if name == "attractors" and not is_chosen:
-        wanted = attractor_options(run)
-    wanted = prepared(run, analysis, wanted)
-    key = key_of(current(run, name), analysis, wanted)
+    is_given, wanted = is_choice(wanted), prepared(run, analysis, wanted)
+    if name == "branches" and not is_given:
+        for line in branches_in_words(changed_branches(run, wanted.plain()["parameter"]), run.spec.rate):
+            run.echo(line)
+    key = key_of(current(run, name, wanted.plain()), analysis, wanted)
     told = {**overrides_attribute(run.spec.parameters.overrides), **rate_attribute(run.spec.rate)}
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
         ds = open_product(place)
         if all(ds.attrs.get(part) == value for part, value in key.items()):
             run.echo(f"{name}: taken from {place.name}")
-            if is_chosen:
-                _keep(run, wanted)
             return _placed(ds.assign_attrs(told), place)
     except FileNotFoundError:
         pass
@@ -182,10 +200,7 @@ def derive(
         others = {k: value for k, value in computed.attrs.items() if k not in key}
         others.setdefault("model", model_attribute(run.model))
         complete = computed.drop_attrs(deep=False).assign_attrs({**others, **key, **told})
-        result = _kept(run, place, with_own_names(complete, analysis.columns))
-    if is_chosen:
-        _keep(run, wanted)
-    return result
+        return _kept(run, place, with_own_names(complete, analysis.columns))
 
 
 def shown_table(name: str, ds: xr.Dataset) -> Table:
@@ -194,7 +209,9 @@ def shown_table(name: str, ds: xr.Dataset) -> Table:
 
     analysis, plain = ANALYSES[name], in_own_words(ds)
     order = [column.name for column in analysis.columns if column.name in plain.data_vars]
-    return shown(plain[[*order, *(n for n in plain.data_vars if n not in order)]], function_of(analysis.table))
+    table = shown(plain[[*order, *(n for n in plain.data_vars if n not in order)]], function_of(analysis.table))
+    basis = [f"on {line}" for line in branches_in_words(ds.attrs.get("branch_options", "{}"), rate_of(ds))]
+    return replace(table, lines=[*table.lines, *(["", *basis] if basis else [])])
 
 
 def analyses_in(text: str) -> list[str]:
@@ -227,7 +244,8 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
     -------
     Dataset or None
         Result in memory; None if there is none. Among several sound results of these cells and this version
-        of the code it is the one with the fewest options other than the defaults, then the first by name.
+        of the code it is the one with the fewest options other than the defaults, or than those of the run's
+        attractors and branches; then the first by name. Branches along an axis of the run come first.
     """
     return next(stored_each(source, name), None)
 
@@ -250,14 +268,16 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
     places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
     if not places:
         return
-    wanted = current(run, name)
     found = []
     for place in places:
         with contextlib.suppress(DamagedError, FileNotFoundError):
             attrs = read_product_attrs(place)
-            if all(attrs.get(key) == value for key, value in wanted.items()):
-                found.append((_changed_options(run, name, attrs), place.name, place))
-    for _, _, place in sorted(found, key=lambda entry: entry[:2]):
+            if is_current(run, name, attrs):
+                along = axis_name(options_of(attrs).get("parameter", ""))
+                is_beside = along not in ("", *map(axis_name, run.spec.axes))
+                order = changed_options(run, name, attrs), is_beside, place.name
+                found.append((*order, place))
+    for *_, place in sorted(found, key=lambda entry: entry[:3]):
         try:
             result = _placed(open_product(place, lazy=lazy), place)
         except (DamagedError, FileNotFoundError):
@@ -265,13 +285,22 @@ def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr
         yield result
 
 
-def _changed_options(run: RunDirectory, name: str, attrs: Mapping[str, Any]) -> int:
+def is_current(run: RunDirectory, name: str, attrs: Mapping[str, Any]) -> bool:
+    """Return whether the attributes are those of a result of an analysis that holds for a run as it is."""
+    return all(attrs.get(key) == value for key, value in current(run, name, options_of(attrs)).items())
+
+
+def changed_options(run: RunDirectory, name: str, attrs: Mapping[str, Any]) -> int:
+    """Return the number of options of a stored result that differ from the defaults, or from those of the run's
+    attractors, or branches along the same parameter.
+    """
+    given = options_of(attrs)
+    along = {"parameter": given["parameter"]} if name == "branches" else {}
     try:
-        defaults = attractor_options(run) if name == "attractors" else validated(ANALYSES[name].options, {})
-        options = prepared(AnalysedRun.of(run), ANALYSES[name], defaults).plain()
+        options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, along)).plain()
     except SpecError:  # the run does not suit the defaults
         options = {}
-    return sum(options.get(key) != value for key, value in options_of(attrs).items())
+    return sum(options.get(key) != value for key, value in given.items())
 
 
 def options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
@@ -286,7 +315,8 @@ def options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Complete the options of an analysis or figure from the run: full names, and missing values.
+    """Complete the options of an analysis or figure from the run: full names, missing values, and the run's choice of
+    attractors and branches.
 
     Raises
     ------
@@ -294,17 +324,12 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
         If the run does not suit the product; the message names the directory.
     """
     with refused(run.name):
-        options = named(run, options)
+        options = chosen_options(run, named(run, options))
         if product.needs:
             function_of(product.needs)(run, options)
         settle = getattr(product, "settle", "")
         options = function_of(settle)(run, options) if settle else options
     return options
-
-
-def _keep(run: RunDirectory, options: Options) -> None:
-    with contextlib.suppress(OSError):  # a folder that is read alone keeps its attractors
-        run.info.files.below(DERIVED).write(OF_ATTRACTORS, json.dumps(options.plain()).encode())
 
 
 @contextlib.contextmanager
@@ -378,7 +403,7 @@ def _stale(run: RunDirectory) -> list[Files]:
         try:
             attrs = read_product_attrs(place)
             name = str(attrs.get("derived_product"))
-            return name not in ANALYSES or any(attrs.get(k) != value for k, value in current(run, name).items())
+            return name not in ANALYSES or not is_current(run, name, attrs)
         except DamagedError:
             return True
 

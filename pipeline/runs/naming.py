@@ -114,10 +114,9 @@ def _bounds(role: str, given: Mapping[str, Any], rate: Rate, convert: Callable[[
     return found
 
 
-def in_own_words(run: RunDirectory, options: Some) -> Some:
-    """Return options from `named` with the drive's rate, where it occurs, in the word of the run."""
-    word, fields = run.spec.rate, type(options).model_fields
-    rate, changes = RATES[word], dict[str, Any]()
+def in_own_words(options: Some, word: str) -> Some:
+    """Return options from `named` with the drive's rate, where it occurs, in a word for it."""
+    rate, fields, changes = RATES[word], type(options).model_fields, dict[str, Any]()
     if at := getattr(options, "at", None):
         changes["at"] = {
             word if name == FREQUENCY_DIM else name: rate.given(value) if name == FREQUENCY_DIM else value

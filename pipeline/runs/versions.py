@@ -1,20 +1,17 @@
-"""Tell which stored results of analyses hold: the versions that decide them, and the attractors that they rest on."""
+"""Tell which stored results of analyses hold: by the versions that decide them, and what they rest on."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Mapping
+from typing import Any
 
 from magpend_core.versions import ENGINE
-from pipeline.analysis.attractors.declaration import AttractorOptions
 from pipeline.products.product import Analysis, Options
 from pipeline.products.registry import ANALYSES
-from pipeline.store.errors import DamagedError
-from pipeline.store.files import DERIVED
+from pipeline.runs.choices import Choices, changed_branches
 from pipeline.store.run import RunDirectory
-
-OF_ATTRACTORS = "attractors.json"
 
 
 def version_of(name: str) -> str:
@@ -27,27 +24,29 @@ def _parts(name: str) -> set[str]:
     return {name}.union(*(_parts(other) for other in ANALYSES[name].builds_on))
 
 
-def attractor_options(run: RunDirectory) -> AttractorOptions:
-    """Return the options of the run's attractors: those last given, or the defaults."""
-    try:
-        return AttractorOptions.model_validate_json(run.info.files.below(DERIVED).read(OF_ATTRACTORS))
-    except FileNotFoundError:
-        return AttractorOptions()
-    except ValueError:
-        raise DamagedError(f"{run.name}: {DERIVED}/{OF_ATTRACTORS} is damaged; remove it.") from None
+def current(run: RunDirectory, name: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Return the attributes of those results of an analysis that hold for the present cells, attractors and branches of
+    a run.
 
-
-def current(run: RunDirectory, name: str) -> dict[str, str]:
-    """Return the attributes of those results of an analysis that hold for the present cells and attractors of a run."""
-    rests = rests_on_attractors(name)
-    options = json.dumps(attractor_options(run).changed(), sort_keys=True) if rests else ""
+    Parameters
+    ----------
+    run
+        The run.
+    name
+        The analysis.
+    options
+        Options of the result. They name the parameter of the branches on which it rests; without, all count.
+    """
     found = {"derived_product": name, "cube_digest": run.digest, "analysis_version": version_of(name)}
-    return {**found, "attractor_options": options}
+    is_on_sets, is_on_branches = (rests_on(name, one) for one in ("attractors", "branches"))
+    attractors = json.dumps(Choices.of(run).attractors.changed(), sort_keys=True) if is_on_sets else ""
+    branches = {"branch_options": changed_branches(run, options.get("parameter"))} if is_on_branches else {}
+    return {**found, "attractor_options": attractors, **branches}
 
 
-def rests_on_attractors(name: str) -> bool:
-    """Return whether an analysis takes the run's attractors as they are."""
-    return any(one == "attractors" or rests_on_attractors(one) for one in ANALYSES[name].builds_on)
+def rests_on(name: str, chosen: str) -> bool:
+    """Return whether an analysis takes the run's attractors, or branches, as they are."""
+    return any(one == chosen or rests_on(one, chosen) for one in ANALYSES[name].builds_on)
 
 
 def key_of(current: Mapping[str, str], analysis: Analysis, options: Options) -> dict[str, str]:
@@ -56,7 +55,7 @@ def key_of(current: Mapping[str, str], analysis: Analysis, options: Options) -> 
     Parameters
     ----------
     current
-        What holds for the present cells and attractors of the run, see `current`.
+        What holds for the present state of the run, see `current`.
     analysis, options
         The analysis with its options.
     """

@@ -12,6 +12,14 @@ import xarray as xr
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.completeness import counted_lines, searched_lines
 from pipeline.analysis.branches.declaration import COEFFICIENTS, BranchOptions, CurveOptions
+from pipeline.analysis.branches.intervals import (
+    in_words,
+    interval_along,
+    interval_of,
+    refuse_frequency_of_flow,
+    settle_along,
+    swept_axis,
+)
 from pipeline.analysis.branches.kinds import (
     BRANCH_POINTS,
     BRANCHING,
@@ -23,12 +31,12 @@ from pipeline.analysis.branches.kinds import (
     LIMITS,
     PITCHFORK,
 )
-from pipeline.layout.own_words import RATE, axis_in_own_words, dims_in_own_words
+from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.product import Table
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values
-from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import FREQUENCY
 
 LEAST_PERIOD = 4
@@ -46,19 +54,10 @@ def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
     """Fill in the parameter interval of the branches from the run's swept axis; raise SpecError if it is empty."""
     from pipeline.analysis.branches.asked import check_asked
 
-    parameter = options.parameter
-    _refuse_frequency_of_flow(run, parameter)
-    low, high = interval_of(run, parameter, options.low, options.high)
+    refuse_frequency_of_flow(run, options.parameter)
+    low, high = interval_of(run, options.parameter, options.low, options.high)
     check_asked(run, options, (low, high))
-    return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
-
-
-def _refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
-    """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
-    if axis_name(parameter) == FREQUENCY_DIM and run.model.clock_hz is not None:
-        swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
-        known = ", ".join(swept or run.model.parameter_names)
-        raise SpecError(f"{run.model.name} has no drive frequency to follow; give --parameter: {known}.")
+    return options.model_copy(update={"low": low, "high": high})
 
 
 def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
@@ -71,7 +70,7 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     from pipeline.analysis.branches.starting_orbits import attracting, recurrent
 
     cube, parameter = run.cube(), axis_name(options.parameter)
-    interval = low, high = _ends(options)
+    interval = low, high = interval_of(run, parameter, options.low, options.high)
     base = parameters_of(cube)
     given, missed = given_starts(run, options, interval)
     counted = count_equilibria(run, options, interval)
@@ -98,23 +97,14 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     )
 
 
-def _ends(options: BranchOptions) -> tuple[float, float]:
-    assert options.low is not None
-    assert options.high is not None
-    return options.low, options.high
-
-
 def settle_curves(run: OpenRun, options: CurveOptions) -> CurveOptions:
-    """Fill in the parameter interval of the branches; raise SpecError unless the second parameter differs from the
-    first.
-    """
-    settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
-    second = options.second
+    """Return the options; raise SpecError unless the second parameter differs from that of the run's branches."""
+    settled, second = settle_along(run, options), options.second
     if axis_name(second) == axis_name(settled.parameter):
-        raise SpecError(f"{_in_words(run, second)} is the branches' own parameter; give another one.")
+        raise SpecError(f"{in_words(run, second)} is the branches' own parameter; give another one.")
     if swept_axis(run, second) is not None:
         raise SpecError(
-            f"the run sweeps {_in_words(run, second)}, so that its branches lie at several values; use a run that does "
+            f"the run sweeps {in_words(run, second)}, so that its branches lie at several values; use a run that does "
             "not."
         )
     interval_of(run, second, options.second_low, options.second_high)
@@ -125,8 +115,8 @@ def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     """Continue the bifurcations on the branches in the plane of the branches' parameter and a second one."""
     from pipeline.analysis.branches.curves import curves_dataset, curves_from, not_followed
 
-    located = run.derive("branches", **options.part(BranchOptions))
-    bounds = (_ends(options), (options.second_low, options.second_high))
+    located = run.derive("branches", parameter=options.parameter)
+    bounds = (interval_along(run, options.parameter), (options.second_low, options.second_high))
     second = axis_name(options.second)
     base = parameters_of(run.cube())
     left_out: dict[int, str] = {}
@@ -141,43 +131,6 @@ def _place_of(ds: xr.Dataset, k: int) -> str:
     kind, period = KINDS[int(ds["kind"][k])], int(ds["orbit_period"][int(ds["of_branch"][k])])
     name = parameter_name(str(ds.attrs["parameter"]))
     return f"{kind}, {period_words(period)}, at {name} = {float(ds['value'][k]):.7g}"
-
-
-def swept_axis(run: OpenRun, parameter: str) -> xr.DataArray | None:
-    """Return the axis of a parameter in the run's result cube; None if the run does not sweep it."""
-    axis = run.cube().coords.get(axis_name(parameter))
-    return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
-
-
-def interval_of(run: OpenRun, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
-    """Return the parameter interval of the branches; its default is the range that the run sweeps."""
-    base = parameters_of(run.cube())
-    is_frequency = axis_name(parameter) == FREQUENCY_DIM
-    if not is_frequency and parameter not in base.names:
-        raise SpecError(unknown_name("parameter", parameter, (*base.names, run.spec.rate)))
-    axis = swept_axis(run, parameter)
-    if axis is not None:
-        ends = float(axis.min()), float(axis.max())
-    elif low is None or high is None:
-        raise SpecError(f"the run does not sweep {_in_words(run, parameter)}; give the interval with --from and --to.")
-    else:
-        ends = low, high
-    chosen = (ends[0] if low is None else float(low), ends[1] if high is None else float(high))
-    if is_frequency and min(chosen) <= 0.0:
-        least = axis_in_own_words(parameter, run.spec.rate)[1](min(chosen))
-        raise SpecError(f"--from, --to: {_in_words(run, parameter)} = {least:g} must be greater than 0.")
-    if not chosen[0] < chosen[1]:
-        name, given = axis_in_own_words(parameter, run.spec.rate)
-        first, last = sorted(map(float, map(given, chosen)), reverse=True)
-        raise SpecError(f"the interval {first:g} to {last:g} of {name} is empty; --from must be less than --to.")
-    for value in () if is_frequency else chosen:
-        base.replace(**{parameter: value})
-    return chosen
-
-
-def _in_words(run: OpenRun, parameter: str) -> str:
-    """Return the name of a parameter in the run's specification."""
-    return axis_in_own_words(parameter, run.spec.rate)[0]
 
 
 def branches_table(ds: xr.Dataset) -> Table:

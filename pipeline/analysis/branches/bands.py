@@ -16,7 +16,6 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Parameters
-from pipeline.analysis.branches.analysis import settle_branches
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.carrying import (
     ORBIT,
@@ -30,7 +29,8 @@ from pipeline.analysis.branches.carrying import (
     settled,
     solve,
 )
-from pipeline.analysis.branches.declaration import BandOptions, BranchOptions
+from pipeline.analysis.branches.declaration import BandOptions
+from pipeline.analysis.branches.intervals import interval_along, settle_along
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, TORUS
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
@@ -153,10 +153,8 @@ def place_variables(data: list[Datum], places: list[Place], share: np.ndarray) -
 
 
 def settle_bands(run: OpenRun, options: BandOptions) -> BandOptions:
-    """Complete the interval of the branches, and the digest of the draws; raise SpecError if there are none."""
-    digest = digest_of_draws(options.posterior)
-    settled = settle_branches(run, options)
-    return options.model_copy(update={**settled.part(BranchOptions), "digest": digest})
+    """Complete the digest of the draws; raise SpecError if there are none, or no branches."""
+    return settle_along(run, options.model_copy(update={"digest": digest_of_draws(options.posterior)}))
 
 
 def digest_of_draws(posterior: str) -> str:
@@ -197,9 +195,9 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
             f"--posterior {options.posterior}: {options.parameter} alone was identified, and the branches run along "
             "it: nothing differs between the draws. Give --parameter another one."
         )
-    located = run.derive("branches", **options.part(BranchOptions))
+    located = run.derive("branches", parameter=options.parameter)
     base = parameters_of(run.cube())
-    along = _along(options, base, located)
+    along = _along(options, interval_along(run, options.parameter), base, located)
     points, states, chosen = bifurcation_data(located)
     orbits, guesses, places = orbit_data(along, located)
     data = [*points, *orbits]
@@ -245,7 +243,7 @@ def moving_of(drawn: xr.Dataset, parameter: str) -> list[str]:
     return [name for name in moving if name != parameter_name(parameter)]
 
 
-def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along:
+def _along(options: BandOptions, interval: tuple[float, float], base: Parameters, located: xr.Dataset) -> Along:
     told = [str(v.attrs.get("long_name", "")) for v in located.coords.values() if v.dims == ("branch",)]
     varying = [text.removeprefix("value of ") for text in told if text.startswith("value of ")]
     frequency = np.nan if base.model.clock_hz is None else base.model.clock_hz
@@ -257,9 +255,7 @@ def _along(options: BandOptions, base: Parameters, located: xr.Dataset) -> Along
         raise SpecError(
             [f"the run sweeps {' and '.join(varying)} besides {options.parameter}; bands need a run along one axis."]
         )
-    assert options.low is not None
-    assert options.high is not None
-    return Along(base.model, axis_name(options.parameter), options.low, options.high, frequency)
+    return Along(base.model, axis_name(options.parameter), *interval, frequency)
 
 
 def _packed(base: Parameters, drawn: xr.Dataset, parameter: str) -> np.ndarray:

@@ -12,15 +12,20 @@ _ROOM = "pipeline.analysis.branches.analysis"
 
 
 class AlongOptions(Options):
-    """Options for an interval of one parameter."""
+    """Options for one parameter, along which branches run."""
 
     parameter: str = option("", "Parameter to follow, or frequency_hz, omega or period; by default the swept one.")
+
+
+class IntervalOptions(AlongOptions):
+    """Options for an interval of one parameter."""
+
     low: float | None = option(None, "Least value; by default the run's.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default the run's.", unit="SI", flag="--to")
 
 
-class PlaneOptions(AlongOptions):
-    """Options for a plane of two parameters."""
+class SecondOptions(Options):
+    """Options for an interval of a second parameter."""
 
     second: str = option(..., "Second parameter: its name, such as q, or frequency_hz, omega or period.")
     second_low: float = option(..., "Least value of the second parameter.", unit="SI", flag="--second-from")
@@ -43,7 +48,7 @@ class StartOptions(Options):
     )
 
 
-class BranchOptions(AlongOptions, StartOptions):
+class BranchOptions(IntervalOptions, StartOptions):
     """Options for continuing branches of periodic orbits."""
 
     max_period: int = option(
@@ -78,7 +83,7 @@ class BranchOptions(AlongOptions, StartOptions):
     )
 
 
-class CurveOptions(BranchOptions, PlaneOptions):
+class CurveOptions(AlongOptions, SecondOptions):
     """Options for continuing bifurcations as curves in a plane of two parameters."""
 
     curve_period: int = option(
@@ -86,7 +91,7 @@ class CurveOptions(BranchOptions, PlaneOptions):
     )
 
 
-class BandOptions(BranchOptions):
+class BandOptions(AlongOptions):
     """Options for carrying draws of the parameters through branches."""
 
     posterior: str = option(..., "Directory of magpend identify posterior, or a file of its draws.")
@@ -94,7 +99,7 @@ class BandOptions(BranchOptions):
     digest: str = option("", "Digest of the file of draws; found by itself.")
 
 
-class SensitivityOptions(BranchOptions):
+class SensitivityOptions(AlongOptions):
     """Options for derivatives of bifurcations by the parameters."""
 
     deviation: dict[str, float] = option(
@@ -195,7 +200,8 @@ BRANCHES = Analysis(
     """Follow periodic orbits and equilibria along a parameter, stable or not; locate and name their bifurcations.
 
     Starts from the closed orbits and equilibria on which cells of the run end. Those left out are listed, with
-    the option that includes them.""",
+    the option that includes them. Options that are given hold for the run from then on: all other analyses and figures
+    rest on these branches along the parameter.""",
     BranchOptions,
     compute=f"{_ROOM}:branches",
     columns=BRANCH_COLUMNS,
@@ -363,7 +369,7 @@ ORBITS = Analysis(
 _ROOM = "pipeline.analysis.branches.tongues"
 
 
-class TongueOptions(PlaneOptions):
+class TongueOptions(IntervalOptions, SecondOptions):
     """Options for finding Arnold tongues and following their edges."""
 
     max_denominator: int = option(5, "Largest q of the tongues p/q.", ge=1, le=64, flag="--denominator")
@@ -406,7 +412,7 @@ TONGUES = Analysis(
 )
 
 
-class BranchFigureOptions(BranchOptions, PointOptions, StateOptions):
+class BranchFigureOptions(AlongOptions, PointOptions, StateOptions):
     """Options of a figure of branches of periodic orbits over a bifurcation diagram."""
 
     over: str = option("", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR.")
@@ -414,7 +420,7 @@ class BranchFigureOptions(BranchOptions, PointOptions, StateOptions):
     shown: int | None = option(None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1)
 
 
-class MultiplierOptions(BranchOptions, FigureOptions):
+class MultiplierOptions(AlongOptions, FigureOptions):
     """Options of a figure of Floquet multipliers along a branch."""
 
     branch: int = option(0, "Index of the branch, as in the table.", ge=0)

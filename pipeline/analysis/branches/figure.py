@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of, limits_of
 from pipeline.analysis.branches.completeness import cut_words
-from pipeline.analysis.branches.declaration import BranchFigureOptions, BranchOptions, MultiplierOptions
+from pipeline.analysis.branches.declaration import BranchFigureOptions, MultiplierOptions
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
 from pipeline.analysis.branches.levels import at_levels, refuse_at
 from pipeline.layout.vocabulary import axis_name
@@ -369,12 +369,12 @@ def draw_branches(run: OpenRun, options: BranchFigureOptions) -> style.DataFigur
     at, notes = values_of(other, options)
     columns = columns_of(labels.state_measure(run.cube(), options.state))
     points = points_of(run, options.points, options.parameter, **columns)
-    found = at_levels(run.derive("branches", **options.part(BranchOptions)), at)
+    found = at_levels(run.derive("branches", parameter=options.parameter), at)
     cube = other.cube()
     below = cube if axis_name(options.parameter) in cube.dims else None
     bands = None
     if options.posterior:
-        bands = run.derive("bands", posterior=options.posterior, **options.part(BranchOptions))
+        bands = run.derive("bands", posterior=options.posterior, parameter=options.parameter)
     figure = plot_branches(
         found,
         below,
@@ -574,5 +574,5 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
 def draw_multipliers(run: OpenRun, options: MultiplierOptions) -> style.DataFigure:
     """Draw the figure ``multipliers`` of a run."""
     refuse_at(options.at, "the figure multipliers", "--branch chooses the branch and with it the values")
-    found = run.derive("branches", **options.part(BranchOptions))
+    found = run.derive("branches", parameter=options.parameter)
     return plot_multipliers(found, options.branch, frame=frame_of(options))

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from magpend_core.models.model import Model, Parameters
 from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.sizes import LEVEL
-from pipeline.analysis.branches.analysis import fixed_of, settle_branches
+from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.branches.bands import digest_of_draws, draws_of, moving_of
-from pipeline.analysis.branches.declaration import BranchOptions, SensitivityOptions
+from pipeline.analysis.branches.declaration import SensitivityOptions
+from pipeline.analysis.branches.intervals import settle_along
 from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, LABELS
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test
@@ -222,11 +223,9 @@ def located_in(branches: xr.Dataset, base: Parameters) -> list[Located]:
 
 
 def settle_sensitivities(run: OpenRun, options: SensitivityOptions) -> SensitivityOptions:
-    """Complete the interval of the branches, and the digest of the draws; raise SpecError if a deviation is of no
-    parameter, or not above 0.
-    """
-    settled = settle_branches(run, options)
-    known = [parameter_name(name) for name in _moving(run.model, axis_name(settled.parameter))]
+    """Complete the digest of the draws; raise SpecError if a deviation is of no parameter, or not above 0."""
+    settle_along(run, options)
+    known = [parameter_name(name) for name in _moving(run.model, axis_name(options.parameter))]
     problems = []
     for name, value in options.deviation.items():
         if parameter_name(name) not in known:
@@ -236,7 +235,7 @@ def settle_sensitivities(run: OpenRun, options: SensitivityOptions) -> Sensitivi
     if problems:
         raise SpecError(problems)
     digest = digest_of_draws(options.posterior) if options.posterior else ""
-    return options.model_copy(update={**settled.part(BranchOptions), "digest": digest})
+    return options.model_copy(update={"digest": digest})
 
 
 def sensitivities(run: OpenRun, options: SensitivityOptions) -> xr.Dataset:
@@ -252,7 +251,7 @@ def sensitivities(run: OpenRun, options: SensitivityOptions) -> xr.Dataset:
         ``kind``, ``value``, ``orbit_period``, ``of_branch`` and ``deviation``, the standard deviation to first order,
         NaN without deviations of parameters. Over ``parameter``: ``unit`` and ``parameter_deviation``.
     """
-    branches, base = run.derive("branches", **options.part(BranchOptions)), parameters_of(run.cube())
+    branches, base = run.derive("branches", parameter=options.parameter), parameters_of(run.cube())
     names = _moving(run.model, axis_name(options.parameter))
     found = sensitivities_of(branches, base)
     covariance = _covariance(run, options, names)

@@ -16,13 +16,14 @@ from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
 from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.rotation import CLOSED_TURNS, TurningState, rotation_numbers
-from pipeline.analysis.branches.analysis import interval_of, swept_axis, windows_of
+from pipeline.analysis.branches.analysis import windows_of
 from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.declaration import TongueOptions
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.following import Branch, problem_of
+from pipeline.analysis.branches.intervals import interval_of, swept_axis
 from pipeline.analysis.branches.kinds import FOLD, KINDS
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together

@@ -10,8 +10,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.attractors.matching import geometry_of
-from pipeline.analysis.branches.analysis import settle_branches, swept_axis
-from pipeline.analysis.branches.declaration import BranchOptions
+from pipeline.analysis.branches.intervals import interval_along, settle_along, swept_axis
 from pipeline.analysis.branches.kinds import FOLD, KINDS, SNIC
 from pipeline.analysis.events.breakups import Breakups
 from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
@@ -61,20 +60,20 @@ _AT_EVEN_TIMES = "a limit cycle seen at even times has no branch; see it at cros
 
 
 def settle_events(run: OpenRun, options: EventOptions) -> EventOptions:
-    """Fill in the parameter interval; raise SpecError unless the run sweeps the parameter."""
+    """Return the options; raise SpecError unless the run sweeps the parameter, and has branches along it."""
     from pipeline.specification.problems import SpecError
 
-    settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
-    axis = swept_axis(run, settled.parameter)
+    parameter, axis = options.parameter, swept_axis(run, options.parameter)
     if axis is None:
-        raise SpecError(f"events lie along a swept parameter, and the run does not sweep {settled.parameter}.")
-    assert settled.low is not None
-    assert settled.high is not None
-    if int(((axis.values >= settled.low) & (axis.values <= settled.high)).sum()) < 2:
+        raise SpecError(f"events lie along a swept parameter, and the run does not sweep {parameter}.")
+    settle_along(run, options)
+    low, high = interval_along(run, parameter)
+    if int(((axis.values >= low) & (axis.values <= high)).sum()) < 2:
         raise SpecError(
-            f"--from {settled.low} --to {settled.high}: the run has fewer than two values of {settled.parameter} there."
+            f"the branches are those from {low} to {high}, and the run has fewer than two values of {parameter} there; "
+            "find them in a wider interval: magpend analyse branches DIR, --from and --to."
         )
-    return settled
+    return options
 
 
 def needs_one_axis(run: OpenRun, options: EventOptions) -> None:
@@ -89,9 +88,10 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     if options.refine:
         return refined(run, options)
     found, axis = run.derive("attractors"), axis_name(options.parameter)
-    located = run.derive("branches", **options.part(BranchOptions))
+    located = run.derive("branches", parameter=options.parameter)
     part = choose(found, options.at, (axis, *start_dims(found)), f"events lie along {parameter_name(axis)}")
-    inside = (part[axis].values >= options.low) & (part[axis].values <= options.high)
+    low, high = interval_along(run, options.parameter)
+    inside = (part[axis].values >= low) & (part[axis].values <= high)
     part = isel(part, {axis: np.flatnonzero(inside)})
     base, geometry = parameters_of(run.cube()), geometry_of(found)
     others = base.as_dict() | {parameter_name(str(k)): float(v) for k, v in part.coords.items() if not v.ndim}

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pipeline.analysis.branches.declaration import BranchOptions
+from pipeline.analysis.branches.declaration import AlongOptions
 from pipeline.products.column import Columns, over, swept, with_parts
 from pipeline.products.product import Analysis, Figure, FigureOptions, option
 
 _ROOM = "pipeline.analysis.events.analysis"
 
 
-class EventOptions(BranchOptions):
+class EventOptions(AlongOptions):
     """Options for naming the events of attractors."""
 
     at: dict[str, float] = option({}, "Value of a further axis of the run.")

@@ -15,7 +15,7 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches.analysis import cut_of, fixed_of, isolas_of, listed
 from pipeline.analysis.branches.completeness import searched_lines
-from pipeline.analysis.branches.declaration import BranchOptions
+from pipeline.analysis.branches.intervals import interval_along
 from pipeline.analysis.branches.kinds import LABELS
 from pipeline.analysis.response.declaration import ResponseOptions
 from pipeline.analysis.response.orbits import Orbit, lags_of, measures_of
@@ -67,7 +67,7 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
         [rad], the lag behind the drive. The same at the located points, under names that begin with
         ``bifurcation_``. Over ``jump`` the ends of stable orbits, see `_jumps`.
     """
-    located = run.derive("branches", **options.part(BranchOptions))
+    located = run.derive("branches", parameter=options.parameter)
     base = parameters_of(run.cube())
     places = [(i, j) for i in range(located.sizes["branch"]) for j in range(int(located["n_points"][i]))]
     run.echo(f"response: {len(places)} orbits")
@@ -78,7 +78,8 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     events = [_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
     there = measured(events, flow, options.harmonics)
     variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
-    variables |= _jumps(located, base, events, options)
+    low, high = interval_along(run, options.parameter)
+    variables |= _jumps(located, base, events, BEYOND * (high - low))
     kept = located.drop_vars([name for name in map(str, located.variables) if name.startswith((*_LEFT_OUT, "state"))])
     kept = kept.rename({name: _own_name(name) for name in base.names if name in kept and name in variables})
     return kept.assign(variables).assign_coords(channel_coordinates(flow, options.harmonics))
@@ -152,19 +153,14 @@ def _orbit(
     return Orbit(base.replace(**own), state, seconds, period)
 
 
-def _jumps(
-    located: xr.Dataset, base: Parameters, events: Sequence[Orbit], options: ResponseOptions
-) -> dict[str, Variable]:
-    """Integrate trajectories from where stable orbits end, with the parameter a little beyond, until they close.
+def _jumps(located: xr.Dataset, base: Parameters, events: Sequence[Orbit], step: float) -> dict[str, Variable]:
+    """Integrate trajectories from where stable orbits end, with the parameter a step beyond, until they close.
 
     Returns, over ``jump``: ``jump_bifurcation`` (index of the end), ``jump_rises`` (whether the parameter rises),
     ``jump_beyond`` (its value where the trajectory is integrated), ``jump_landing`` (a code of `LANDINGS`),
     ``jump_period`` and ``jump_amplitude`` (channel) of the orbit on which it lands; NaN if it does not close.
     """
-    assert options.low is not None
-    assert options.high is not None
     ends = [(k, way) for k in range(len(events)) if events[k].period for way in _ways(located, k)]
-    step = BEYOND * (options.high - options.low)
     name = str(located.attrs["parameter"])
     beyond = [float(located["value"].values[k]) + way * step for k, way in ends]
     starts = [

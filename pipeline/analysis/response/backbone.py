@@ -14,8 +14,10 @@ from magpend_core.models.parameters import ParameterError
 from magpend_core.models.sectioned import of_flow
 from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.pointwise import rates
-from pipeline.analysis.branches.analysis import fixed_of, interval_of, swept_axis
+from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.branches.curves import lies_on
+from pipeline.analysis.branches.declaration import BranchOptions
+from pipeline.analysis.branches.intervals import interval_of, swept_axis
 from pipeline.analysis.branches.lockstep import run_alone, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.response.analysis import channel_coordinates, channel_rows, measured_along
@@ -72,7 +74,9 @@ def settle_backbone(run: OpenRun, options: BackboneOptions) -> BackboneOptions:
         raise SpecError(unknown_name("parameter", unknown[0], model.parameter_names))
     found: dict[str, Any] = {"channel": channel}
     if not model.autonomous:
-        found["low"], found["high"] = interval_of(run, FREQUENCY, options.low, options.high)
+        ends: BranchOptions = run.branch_options(FREQUENCY)
+        bounds = ((ends.low, options.low), (ends.high, options.high))
+        found["low"], found["high"] = interval_of(run, FREQUENCY, *(a if b is None else b for a, b in bounds))
     elif (options.low or 0.0) >= (options.high or np.inf):
         raise SpecError(f"--from {options.low:g}: must be less than --to {options.high:g}.")
     driven = not model.autonomous and _swing(base, found["high"]).any()
@@ -188,8 +192,7 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
 
 def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[ResonanceProblem, Array]]:
     """Yield the equations and a guess for each step of a branch on which the cosine of the lag changes its sign."""
-    asked = {"parameter": NAME, "low": options.low, "high": options.high}
-    located, response = (run.derive(name, **asked) for name in ("branches", "response"))
+    located, response = (run.derive(name, parameter=NAME) for name in ("branches", "response"))
     base = parameters_of(run.cube())
     system, force = base.model.system, options.drive
     assert options.drive_low is not None

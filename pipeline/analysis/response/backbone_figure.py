@@ -113,6 +113,5 @@ def draw_backbone(run: OpenRun, options: BackboneFigureOptions) -> style.DataFig
         refuse_at(at, "the figure backbone", "normal modes of the free motion have no level of a force")
     response = None
     if found.attrs["force"]:
-        asked = {"parameter": parameter_name(FREQUENCY_DIM), "low": options.low, "high": options.high}
-        response = at_levels(run.derive("response", **asked), at)
+        response = at_levels(run.derive("response", parameter=parameter_name(FREQUENCY_DIM)), at)
     return noted(plot_backbone(found, response, degrees=options.degrees, frame=frame_of(options)), notes)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pipeline.analysis.branches.declaration import BRANCH_COLUMNS, BranchOptions
+from pipeline.analysis.branches.declaration import BRANCH_COLUMNS, AlongOptions
 from pipeline.products.column import STATES, UNITS, Columns, in_parts, only, over, swept
 from pipeline.products.diagrams import PointOptions
 from pipeline.products.product import Analysis, Figure, FigureOptions, Options, option
 
 
-class ResponseOptions(BranchOptions):
+class ResponseOptions(AlongOptions):
     """Options of a frequency response."""
 
     harmonics: int = option(5, "Number of harmonics of the drive, or of the orbit of a flow.", ge=1, le=100)
@@ -72,7 +72,7 @@ RESPONSE = Analysis(
     compute="pipeline.analysis.response.analysis:response",
     columns=RESPONSE_COLUMNS,
     table="pipeline.analysis.response.analysis:response_table",
-    settle="pipeline.analysis.branches.analysis:settle_branches",
+    settle="pipeline.analysis.branches.intervals:settle_along",
     builds_on=("branches",),
     figure="response",
     version=2,

@@ -11,7 +11,6 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
-from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.analysis.branches.figure import NAMES
 from pipeline.analysis.branches.kinds import KINDS
 from pipeline.analysis.events.names import RANGE_END, UNDECIDED
@@ -120,8 +119,7 @@ def event_orbit(run: RunDirectory, x: str, at: Mapping[str, int], event: int) ->
         raise RequestError(f"event = {event}: no orbit is located there.")
     found = _kept(explored, x, explored.place(at, but=x))
     assert found is not None
-    options = {name: value for name, value in options_of(found.attrs).items() if name in BranchOptions.model_fields}
-    located = AnalysedRun.of(run).derive("branches", **options)
+    located = AnalysedRun.of(run).derive("branches", parameter=parameter_name(x))
     k = int(found["bifurcation"].values[event])
     branch = int(located["of_branch"].values[k])
     values = {parameter_name(x): float(located["value"].values[k])}

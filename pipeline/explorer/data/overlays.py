@@ -150,7 +150,8 @@ def branches(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> dict[s
     explored = ExploredRun.of(run)
     place, upwards = explored.place(at, but=x), vertical(explored, y)
     explored.axis(x)
-    found = explored.kept("branches")
+    kept = explored.kept_each("branches")
+    found = next((one for one in kept if str(one.attrs["parameter"]) == x), kept[0] if kept else None)
     nothing: dict[str, Any] = {"branches": [], "points": []}
     if found is None:
         return {**nothing, "note": "not computed: magpend analyse branches DIR"}

@@ -325,7 +325,7 @@ def test_analyse__incomplete_run_and_prune(main, made):
     assert len(re.findall("stale: .*(attractors|identified)-", out)) == 2
     assert main("analyse", "prune", directory, "--dry-run")[1] == out
     assert main("analyse", "prune", directory)[1] == out.replace("stale", "removed")
-    assert [path.name for path in (directory / "derived").iterdir()] == ["attractors.json"]
+    assert [path.name for path in (directory / "derived").iterdir()] == ["chosen.json"]
 
 
 @pytest.mark.slow

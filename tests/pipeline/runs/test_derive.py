@@ -238,6 +238,6 @@ def test_attractors__options_hold_for_the_run(whole):
 
 def test_attractors__options_that_cannot_be_read(whole):
     (whole.info.directory / "derived").mkdir(exist_ok=True)
-    (whole.info.directory / "derived" / "attractors.json").write_text('{"budget": "much"}')
-    with pytest.raises(DamagedError, match=r"attractors\.json is damaged; remove it"):
+    (whole.info.directory / "derived" / "chosen.json").write_text('{"attractors": {"budget": "much"}}')
+    with pytest.raises(DamagedError, match=r"chosen\.json is damaged; remove it"):
         derive(whole.info.directory, "settling")

@@ -160,7 +160,8 @@ def test_curves__spring_from_a_bogdanov_takens_point(tmp_path):
     spec = magpend.Spec("sweep", model).with_section(of="y", value=0.0, longest=60.0)
     spec = spec.with_axis("b1", values=[-0.12, -0.1]).with_start_random(n=1, x=(-0.4, -0.3), y=(0.0, 0.05), seed=0)
     run = magpend.run(spec.with_integration(n_transient=100, n_keep=4), tmp_path / "run", workers=0)
-    found = run.curves(low=-0.12, high=0.02, stable=True, second="b2", second_low=-0.02, second_high=0.22)
+    run.branches(low=-0.12, high=0.02, stable=True)
+    found = run.curves(second="b2", second_low=-0.02, second_high=0.22)
     kinds = [words_of(found["kind"])[code] for code in found["kind"].values]
     rows = {kind: np.array([found[name].values[k] for name in ("b1", "b2")]) for k, kind in enumerate(kinds)}
     hopf, homoclinic = (row[:, np.isfinite(row[0])] for row in (rows["hopf"], rows["homoclinic"]))

@@ -157,8 +157,9 @@ def test_cut_isola__is_detached_within_the_interval(run, found):
 @pytest.mark.slow
 def test_fold_curve__holds_the_isola_from_its_birth_on(run):
     """The curve of its folds in the plane of frequency and force has its least force where the isola is born."""
+    run.branches(**SEARCHED)
     plane = {"second": "A", "second_low": 0.55, "second_high": 0.8}
-    curves = run.curves(**plane, **SEARCHED)
+    curves = run.curves(**plane)
     balance = Balance(np.arange(8))
     nearest = min(range(curves.sizes["curve"]), key=lambda i: float(np.nanmin(curves["frequency"][i])))
     f, force = (curves[name].values[nearest] for name in ("frequency", "A"))
@@ -197,11 +198,12 @@ def test_deflation__needs_fewer_starts(run, monkeypatch):
 
 @pytest.mark.slow
 def test_response__names_the_isola(run):
-    response = run.response(**SEARCHED)
+    run.branches(**SEARCHED)
+    response = run.response()
     table = shown_table("response", response)
     assert [line for line in table.lines if line.endswith("isola")]
     assert {row["isola"] for row in table.rows} == {False, True}
-    upper, _ = run.plot.response(**SEARCHED)
+    upper, _ = run.plot.response()
     assert [text.get_text() for text in upper.texts].count("isola") == 1
 
 

@@ -165,7 +165,8 @@ def test_doubling_with_the_drive(tmp_path):
     """Along the amplitude the drive's frequency is a parameter: 2 = damping + 2 linear + 2 cubic + frequency."""
     given = {"preset": "twin-well", "omega": 1.2, "overrides": {"damping": 0.3}}
     run = swept("duffing", tmp_path / "run", [(1.2, 0.0)], (300, 8), parameters=given, amplitude=[0.25, 0.275])
-    found = run.sensitivities(low=0.24, high=0.29, max_period=2, deviation={"frequency_hz": 1e-3})
+    run.branches(low=0.24, high=0.29, max_period=2)
+    found = run.sensitivities(deviation={"frequency_hz": 1e-3})
     found = with_plain_names(found)
     by = {str(n): found["elasticity"].sel(parameter=n).values for n in found["parameter"].values}
     assert "period_doubling" in [found["kind"].attrs["flag_meanings"].split()[k] for k in found["kind"].values]
@@ -186,7 +187,8 @@ def test_pitchfork_of_orbits(tmp_path):
     """Along the amplitude of the symmetric oscillator: the same sums."""
     given = {"preset": "hardening", "omega": 1.0, "overrides": {"damping": 0.1}}
     run = swept("duffing", tmp_path / "run", [(0.0, 0.0)], (300, 4), parameters=given, amplitude=[3.3, 3.4])
-    found = run.sensitivities(low=3.3, high=3.6, max_period=1)
+    run.branches(low=3.3, high=3.6, max_period=1)
+    found = run.sensitivities()
     at = found["kind"].values.tolist().index(found["kind"].attrs["flag_meanings"].split().index("pitchfork"))
     by = {str(n): float(found["elasticity"].sel(parameter=n)[at]) for n in found["parameter"].values}
     assert by["cubic"] == pytest.approx(-0.5, rel=1e-7)

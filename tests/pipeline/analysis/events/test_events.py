@@ -470,8 +470,9 @@ def test_events__both_folds_of_duffing_in_one_bracket(tmp_path):
     assert (np.abs(values - known) <= errors).all()
     assert "fold (LP), it meets the unstable orbit of branch" in table["sentence"].str.cat()
     with pytest.raises(SpecError, match="does not sweep"):
-        run.events(parameter="c", low=0.1, high=0.2)
-    with pytest.raises(SpecError, match="fewer than two values"):
-        run.events(parameter="omega", at={"F": 0.1}, low=1.05, high=1.2)
+        run.events(parameter="c")
     with pytest.raises(SpecError, match="also has F"):
         run.events(parameter="omega")
+    run.branches(parameter="omega", low=1.05, high=1.2)
+    with pytest.raises(SpecError, match="fewer than two values"):
+        run.events(parameter="omega", at={"F": 0.1})

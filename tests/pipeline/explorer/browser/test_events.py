@@ -25,7 +25,8 @@ pytestmark = pytest.mark.slow
 def line(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A continuation of a hardening oscillator both ways, whose two folds are located."""
     directory = finished(tmp_path_factory.mktemp("line") / "line", LINE)
-    derive(directory, "events", {"max_period": 1})
+    derive(directory, "branches", {"max_period": 1})
+    derive(directory, "events")
     return directory
 
 
@@ -35,7 +36,7 @@ def folds_of(line: Path) -> list[dict[str, Any]]:
 
 def test_events__lead_to_cells_on_the_orbits(line: Path) -> None:
     run = RunDirectory.open(line)
-    rows = {row["event"]: row for row in shown_table("events", derive(line, "events", {"max_period": 1})).rows}
+    rows = {row["event"]: row for row in shown_table("events", derive(line, "events")).rows}
     cube = run.cube().load()
     folds = folds_of(line)
     assert len(folds) == 2
