@@ -39,13 +39,6 @@ from pipeline.results.tabular import Row, Words, aligned, counted, header_of, pl
 from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import FREQUENCY
 
-LEAST_PERIOD = 4
-"""Least limit for the periods of followed branches, however short the orbits of the run are."""
-
-NO_LENGTH = 1e-9
-"""Length of a stable segment, as a share of its branch, that is nothing but rounding."""
-
-
 BEYOND = 20
 """Points of a branch beyond its stable part that are followed with ``--stable``: they show what crosses there."""
 
@@ -62,6 +55,7 @@ def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
 
 def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
+    least_period = 4  # least limit for the periods of followed branches, however short the orbits of the run are
     from pipeline.analysis.branches.arclength import Settings
     from pipeline.analysis.branches.asked import count_equilibria, counted_variables, given_starts
     from pipeline.analysis.branches.dataset import dataset_of
@@ -76,13 +70,13 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     counted = count_equilibria(run, options, interval)
     starts, left_out = attracting(run.derive("attractors"), base, parameter, interval, options.max_period)
     starts = [*given, *starts, *(start for one in counted for start in one.starts)]
-    longest = options.max_period or max([LEAST_PERIOD, *(s.family.period for s in starts)])
+    longest = options.max_period or max([least_period, *(s.family.period for s in starts)])
     if options.recurrences:
         found = recurrent(cube, base, parameter, high - low, min(options.recurrences, longest))
         starts += [s for s in found if low <= s.value <= high]
     searched = places_of(cube, base, parameter, interval, options.isolas)
     own = max([1, *(s.family.period for s in starts)])
-    periods = np.arange(1, 1 + (options.max_period or min(own, LEAST_PERIOD)))
+    periods = np.arange(1, 1 + (options.max_period or min(own, least_period)))
     for place in searched:
         place.search(periods)
         starts += place.starts()
@@ -445,6 +439,7 @@ def _detached(ds: xr.Dataset) -> list[str]:
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
     """Return the stable segments of all branches, with the parameter values and the names of their bounds."""
+    no_length = 1e-9  # length of a stable segment, as a share of its branch, that is nothing but rounding
     found = []
     for i in range(ds.sizes["branch"]):
         n, closed = int(ds["n_points"][i]), _ends_of(ds, i)[0] == "closed"
@@ -452,7 +447,7 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
         runs = _stable_runs(ds["n_unstable"].values[i, :n] == 0, closed)
         for first, last in [piece for run in runs for piece in _straight(line, *run)]:
             ends = sorted([_bound(ds, i, first, 0), _bound(ds, i, last, 1)])
-            if not ends[1][0] - ends[0][0] > NO_LENGTH * np.ptp(line):
+            if not ends[1][0] - ends[0][0] > no_length * np.ptp(line):
                 continue
             middle = (first + (last - first) % n // 2) % n
             found.append(

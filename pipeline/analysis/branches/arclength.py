@@ -23,7 +23,7 @@ from pipeline.analysis.branches.problems import Problem, Value
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Settings of pseudo-arclength continuation: step lengths, tolerance and limits."""
+    """Settings of a continuation: step lengths, tolerance and limits, also for bifurcations and what starts there."""
 
     # arclengths; a trace ends if it needs a step below the shortest
     first_step: float = 1e-3
@@ -35,6 +35,19 @@ class Settings:
     max_iterations: int = 6  # Newton steps before a step is halved
     largest_turn: float = 0.25  # largest angle between neighbouring tangents [rad]
     beyond: int = 0  # points after which a branch without stability ends; 0: never
+    # bifurcations
+    bracket: float = 1e-8  # width to which one is located [arclength]; in its scale, the parameter changes by less
+    # shifts of a guess that may be a branch point itself, where no tangent is unique, in units of `bracket`
+    shifts: tuple[float, ...] = (0.0, 1e-3, 0.3)
+    # first steps from a branch point onto its second branch, in units of `first_step`, tried in turn: more find
+    # branches that bend more; and the largest distance of the first orbit from the point, in units of the step
+    crossing_steps: tuple[float, ...] = (1.0, 5.0, 25.0, 0.2, 0.04, 0.008)
+    near_crossing: float = 5.0
+    # scaled distances from an equilibrium, or another point, at which the first orbit of a branch or curve is looked
+    # for, tried in turn
+    amplitudes: tuple[float, ...] = (0.02, 0.05, 0.1)
+    # step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step
+    across: float = 100.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,8 +44,6 @@ from pipeline.specification.problems import SpecError
 GRID = 41
 """Values of the parameter at which bands are computed."""
 
-DRAWS = 16
-"""Draws that are carried in one call of the engine."""
 
 FOLLOWED = (FOLD, DOUBLING, TORUS, HOPF)
 """Kinds of bifurcations that get an interval."""
@@ -134,9 +132,10 @@ def solvable(table: OrbitData) -> tuple[OrbitData, list[int]]:
 
 def carried(table: OrbitData, packed: Array) -> Iterator[tuple[Array, list[list[Point | None]]]]:
     """Yield some rows of packed parameters with the orbits and bifurcations carried to them, until all are done."""
-    for first in range(0, len(packed), DRAWS):
+    at_once = 16  # draws that are carried in one call of the engine
+    for first in range(0, len(packed), at_once):
         report("draws", first, len(packed))
-        own = packed[first : first + DRAWS]
+        own = packed[first : first + at_once]
         yield own, solve(table, own)
 
 

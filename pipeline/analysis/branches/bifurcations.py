@@ -18,27 +18,10 @@ from pipeline.analysis.branches.problems import FollowedProblem, Problem, doubli
 CONTRADICTORY = "contradictory"
 """Criticality of a period doubling or pitchfork whose coefficient and whose other branch disagree."""
 
-WIDTH = 1e-8
-"""Width to which a bifurcation is bracketed [arclength]; in its scale, the parameter changes by less."""
-
-SHORT = 1e-4
-"""Length of a step that is not made shorter where a test function nearly vanishes [arclength]."""
-
-HIDDEN = 1e-8
-"""Least change of the parameter between two folds in one step for which the step is made shorter, in its scale: less is
-rounding.
-"""
-
-CERTAIN = 1e-4
-"""Distance of all multipliers from the unit circle, or of all scaled eigenvalues from the imaginary axis, above which
-their number outside is certain: where two meet, each errs by the root of the error of the matrix."""
 
 SAME_PLACE = 1e-4
 """Largest scaled distance between two locations of one branch point: there Newton's method is as exact as the root of
 its residual."""
-
-SHIFTS = (0.0, 1e-3, 0.3)
-"""Shifts, in units of `WIDTH`, of a guess that may be a branch point itself, where no tangent is unique."""
 
 Test = Callable[[Point], float]
 
@@ -155,6 +138,7 @@ class Watch:
         """Locate the bifurcations between two successive points. Return False if the change of stability needs a
         shorter step.
         """
+        short = 1e-4  # length of a step that is not made shorter where a test function nearly vanishes [arclength]
         if self.skip_first and self.n_steps == 0:
             self.n_steps += 1
             return True
@@ -165,7 +149,7 @@ class Watch:
             return False
         if long and turns_twice(a, b):
             return False
-        if step > SHORT and BRANCHING not in kinds and self._turned_back(a, b, step):
+        if step > short and BRANCHING not in kinds and self._turned_back(a, b, step):
             return False
         located = []
         for kind in kinds:
@@ -173,7 +157,7 @@ class Watch:
             if one is None and long:
                 return False
             if one is None:
-                one = yield from locate(self.problem, a, b, kind, self.settings, SHIFTS)
+                one = yield from locate(self.problem, a, b, kind, self.settings, self.settings.shifts)
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
@@ -198,6 +182,9 @@ def turns_twice(a: Point, b: Point) -> bool:
     """Return whether the parameter turns back and forth between two points, by the cubic through both: two folds, at
     whose far sides all test functions have the same signs.
     """
+    # least change of the parameter between two folds in one step for which the step is made shorter, in its scale: less
+    # is rounding
+    hidden = 1e-8
     d = b.u - a.u
     chord, (first, last) = float(d[-1]), float(np.linalg.norm(d)) * np.array([a.tangent[-1], b.tangent[-1]])
     bend = first + last - 2.0 * chord  # the slope is a parabola, with this curvature
@@ -206,7 +193,7 @@ def turns_twice(a: Point, b: Point) -> bool:
     lowest = (2.0 * first + last - 3.0 * chord) / (3.0 * bend)
     slope = first - 3.0 * bend * lowest**2
     half_width = np.sqrt(max(-slope / (3.0 * bend), 0.0))
-    return bool(0.0 < lowest < 1.0 and 4.0 * abs(bend) * half_width**3 > HIDDEN)
+    return bool(0.0 < lowest < 1.0 and 4.0 * abs(bend) * half_width**3 > hidden)
 
 
 def _explains(kinds: list[str], change: int) -> bool:
@@ -255,13 +242,13 @@ def find_root(
     settings: Settings,
     shifts: Sequence[float] = (0.0,),
 ) -> Steps[tuple[Tested, Tested] | None]:
-    """Bracket a zero of a test function between two points of a curve within `WIDTH`; None if Newton's method fails."""
+    """Bracket a zero of a test function between two points of a curve; None if Newton's method fails."""
     (first, at_first), (last_point, at_last) = a, b
     chord = last_point.u - first.u
     length = float(np.linalg.norm(chord))
     low, high = (0.0, first, at_first), (1.0, last_point, at_last)
     known = [low[::2], high[::2]]
-    least, last = WIDTH / length, np.inf
+    least, last = settings.bracket / length, np.inf
     for trial in range(60):
         if high[0] - low[0] <= least:
             break
@@ -317,12 +304,15 @@ def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int
     the nearest points before and after it, up to the next bifurcation, that are certain, if these agree. Where none is,
     as at the end of a branch just beyond a bifurcation, the number follows from that on the bifurcation's other side.
     """
+    # distance of all multipliers from the unit circle, or of all scaled eigenvalues from the imaginary axis, above
+    # which their number outside is certain: where two meet, each errs by the root of the error of the matrix
+    certain = 1e-4
     counts, margins = [n_unstable(point) for point in points], np.array([_margin(point) for point in points])
     places = sorted({0, len(points), *(one.after + 1 for one in found)})
     unsure = []
     for first, last in pairwise(places):
-        sure = first + np.flatnonzero(margins[first:last] > CERTAIN)
-        for i in first + np.flatnonzero(margins[first:last] <= CERTAIN) if len(sure) else ():
+        sure = first + np.flatnonzero(margins[first:last] > certain)
+        for i in first + np.flatnonzero(margins[first:last] <= certain) if len(sure) else ():
             numbers = {counts[k] for k in (*sure[sure < i][-1:], *sure[sure > i][:1])}
             if len(numbers) == 1:  # else another branch crosses here, which lists the bifurcation
                 (counts[i],) = numbers

@@ -23,32 +23,25 @@ from magpend_core.engine.system import System
 from magpend_core.equilibria import find_equilibria, newton_steps
 from magpend_core.models.text.intervals import Rates
 from magpend_core.orbits import scaled_distance, wrap_angles
-from pipeline.analysis.branches.deflation import ITERATIONS, LONGEST_STEP, ROUNDS, FoundOrbit, stretch
+from pipeline.analysis.branches.deflation import DeflationSettings, FoundOrbit, stretch
 from pipeline.results.tolerances import SAME_ON_BRANCH
 
-BATCH, MOST_BOXES = 2048, 300_000
-"""Boxes that are looked at together, and in all; what is left then is not decided."""
 
-SMALLEST = 1e-8
-"""Size of a box, as a share of the whole, that is not divided any more."""
+@dataclass(frozen=True)
+class BoxSettings:
+    """Numbers of the search for all equilibria in a box."""
 
-MARGIN = 0.1
-"""Width by which a box is widened on either side before the test, as a share of its own."""
-
-CUT = 0.4871
-"""Share at which a box is divided: not in its middle, where equilibria of symmetric models lie."""
-
-ROUNDING = 1e-12
-"""Relative error that bounds the rounding of products of matrices, by a factor of 1000 at least."""
-
-TURN = 0.01
-"""Angle by which two copies of a full turn overlap [rad], so that it has no border."""
-
-TINY_ANGLE = 1e-14
-"""Error of an angle that is moved by a full turn [rad]."""
-
-STARTS = 400
-"""Starts of Newton's method for a count that is not proved."""
+    batch: int = 2048  # boxes looked at together; more are faster, and take memory
+    most_boxes: int = 300_000  # boxes looked at in all; what is left then is not decided
+    # size of a box, as a share of the whole, that is not divided any more; smaller ones prove more, and cost more boxes
+    smallest: float = 1e-8
+    # width by which a box is widened on either side before the test, in its own width: a wider one owns its
+    # neighbourhood, but fails the test more often
+    margin: float = 0.1
+    cut: float = 0.4871  # share at which a box is divided: not in its middle, where equilibria of symmetric models lie
+    overlap: float = 0.01  # angle by which two copies of a full turn overlap [rad], so that it has no border
+    starts: int = 400  # starts of Newton's method for a count that is not proved; more find more, and take longer
+    newton: DeflationSettings = DeflationSettings()  # of their iterations
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,20 +78,20 @@ class Enclosed:
         return np.asarray(0.5 * (np.array(self.low) + np.array(self.high)))
 
 
-def enclose_equilibria(rates: Rates, box: Box) -> Enclosed:
+def enclose_equilibria(rates: Rates, box: Box, settings: BoxSettings = BoxSettings()) -> Enclosed:
     """Enclose all equilibria of a box; parts in which they touch, or nearly do, stay undecided.
 
     The enclosures of rates and Jacobian have no obstacle.
     """
-    search = _Search(rates, box)
-    turn = np.where(box.is_full, TURN, 0.0)
+    search = _Search(rates, box, settings=settings)
+    turn = np.where(box.is_full, settings.overlap, 0.0)
     pending = [((box.low - turn)[None], (box.high + turn)[None])]
     n_seen = 0
-    while pending and n_seen < MOST_BOXES:
+    while pending and n_seen < settings.most_boxes:
         low, high = pending.pop()
-        if len(low) > BATCH:
-            pending.append((low[BATCH:], high[BATCH:]))
-            low, high = low[:BATCH], high[:BATCH]
+        if len(low) > settings.batch:
+            pending.append((low[settings.batch :], high[settings.batch :]))
+            low, high = low[: settings.batch], high[: settings.batch]
         n_seen += len(low)
         parts = search.look_at(low, high)
         if len(parts[0]):
@@ -111,7 +104,8 @@ def enclose_equilibria(rates: Rates, box: Box) -> Enclosed:
 class _Search:
     """State of a search: the equilibria found, and the regions that are known to have exactly one each."""
 
-    def __init__(self, rates: Rates, box: Box) -> None:
+    def __init__(self, rates: Rates, box: Box, settings: BoxSettings) -> None:
+        self.settings = settings
         self.rates, self.box, self.found = rates, box, Enclosed()
         n = len(box.low)
         self.regions = np.empty((0, n)), np.empty((0, n))
@@ -131,7 +125,7 @@ class _Search:
         low, high = low[may], high[may]
         if not len(low):
             return low, high
-        margin = MARGIN * (high - low)
+        margin = self.settings.margin * (high - low)
         wide = low - margin, high + margin
         first, last = krawczyk(self.rates, *wide)
         has_one = ((wide[0] < first) & (last < wide[1])).all(axis=1)
@@ -143,17 +137,18 @@ class _Search:
 
     def _halves(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         share = (high - low) / self.box.width
-        is_small = share.max(axis=1, initial=0.0) < SMALLEST
+        is_small = share.max(axis=1, initial=0.0) < self.settings.smallest
         self.small += list(zip(low[is_small], high[is_small], strict=True))
         low, high, share = low[~is_small], high[~is_small], share[~is_small]
         rows, widest = np.arange(len(low)), share.argmax(axis=1) if len(low) else np.zeros(0, int)
-        cut = low[rows, widest] + CUT * (high[rows, widest] - low[rows, widest])
+        cut = low[rows, widest] + self.settings.cut * (high[rows, widest] - low[rows, widest])
         upper, lower = low.copy(), high.copy()
         upper[rows, widest] = lower[rows, widest] = cut
         return np.concatenate([low, upper]), np.concatenate([lower, high])
 
     def _record(self, wide_low: np.ndarray, wide_high: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
         """Record the equilibrium of a region, unless it is known."""
+        tiny = 1e-14  # error of an angle that is moved by a full turn [rad]
         self.regions = np.vstack([self.regions[0], wide_low]), np.vstack([self.regions[1], wide_high])
         for _ in range(20):
             first, last = krawczyk(self.rates, low[None], high[None])
@@ -162,7 +157,7 @@ class _Search:
                 break
             low, high = closer
         for shift, (a, b), (c, d) in self._known():
-            error = TINY_ANGLE * abs(np.sign(shift))
+            error = tiny * abs(np.sign(shift))
             moved = low + shift - error, high + shift + error
             if ((c <= moved[0]) & (moved[1] <= d)).all() or ((wide_low + shift <= a) & (b <= wide_high + shift)).all():
                 return
@@ -172,7 +167,9 @@ class _Search:
         if not (self.box.is_full | ((self.box.low <= low) & (high <= self.box.high))).all():
             beside = ~self.box.is_full & ((high < self.box.low) | (low > self.box.high))
             middle, others = 0.5 * (low + high), self.found.on_border
-            if not beside.any() and not any((np.abs(middle - one) < SMALLEST * self.box.width).all() for one in others):
+            if not beside.any() and not any(
+                (np.abs(middle - one) < self.settings.smallest * self.box.width).all() for one in others
+            ):
                 others.append(middle)
             return
         self.found.low.append(low)
@@ -192,6 +189,7 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
 
     The result is without bounds where the Jacobian has none, or is singular in the middle.
     """
+    relative = 1e-12  # bounds the rounding of products of matrices, by a factor of 1000 at least
     n = low.shape[1]
     first, last = rates.jacobian(low, high)
     with np.errstate(all="ignore"):
@@ -207,25 +205,27 @@ def krawczyk(rates: Rates, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
         value = 0.5 * (at[0] + at[1])
         spread = np.nextafter(np.maximum(at[1] - value, value - at[0]), np.inf)
         size = np.abs(inverse)
-        rounding = ROUNDING * (1.0 + size @ np.abs(middle))
+        rounding = relative * (1.0 + size @ np.abs(middle))
         slope = np.abs(np.eye(n) - inverse @ middle) + size @ radius + rounding
         step = (inverse @ value[..., None])[..., 0]
-        error = (size @ (spread + ROUNDING * np.abs(value))[..., None])[..., 0] + (slope @ reach[..., None])[..., 0]
-        error = error * (1.0 + ROUNDING) + 4.0 * np.spacing(np.abs(centre) + np.abs(step))
+        error = (size @ (spread + relative * np.abs(value))[..., None])[..., 0] + (slope @ reach[..., None])[..., 0]
+        error = error * (1.0 + relative) + 4.0 * np.spacing(np.abs(centre) + np.abs(step))
         found = centre - step - error, centre - step + error
         good &= np.isfinite(found[0]).all(axis=1) & np.isfinite(found[1]).all(axis=1)
     return np.where(good[:, None], found[0], -np.inf), np.where(good[:, None], found[1], np.inf)
 
 
-def search_equilibria(system: System, packed: np.ndarray, box: Box, known: np.ndarray) -> np.ndarray:
+def search_equilibria(
+    system: System, packed: np.ndarray, box: Box, known: np.ndarray, settings: BoxSettings = BoxSettings()
+) -> np.ndarray:
     """Search a box for equilibria by Newton's method from random starts; each one found is deflated.
 
     Return the known ones first, shape (n, n_states). The system is a flow without a drive.
     """
     generator, found = np.random.default_rng(0), list(known)
-    for _ in range(1 + ROUNDS):
-        starts = generator.uniform(box.low, box.high, (STARTS, len(box.low)))
-        ends = find_equilibria(system, _deflated(system, packed, starts, found), packed)
+    for _ in range(1 + settings.newton.rounds):
+        starts = generator.uniform(box.low, box.high, (settings.starts, len(box.low)))
+        ends = find_equilibria(system, _deflated(system, packed, starts, found, settings.newton), packed)
         n_before = len(found)
         for state in wrap_angles(ends.states[ends.converged], system):
             inside = (box.is_full | ((box.low <= state) & (state <= box.high))).all()
@@ -236,17 +236,19 @@ def search_equilibria(system: System, packed: np.ndarray, box: Box, known: np.nd
     return np.array(found).reshape(-1, system.n_states)
 
 
-def _deflated(system: System, packed: np.ndarray, starts: np.ndarray, found: list[np.ndarray]) -> np.ndarray:
+def _deflated(
+    system: System, packed: np.ndarray, starts: np.ndarray, found: list[np.ndarray], settings: DeflationSettings
+) -> np.ndarray:
     """Iterate Newton's method with deflation of known equilibria; return the last states."""
     state, scales = starts.copy(), np.asarray(system.scales)
     known = [FoundOrbit(one[None], np.eye(len(one)), 0, 0) for one in found]
     once = np.ones(len(state), np.int64)
-    for _ in range(ITERATIONS):
+    for _ in range(settings.iterations):
         good = np.isfinite(state).all(axis=1)
         steps = np.zeros(state.shape)
         steps[good] = newton_steps(system, state[good], packed)[0] / scales
         steps *= stretch(state, once, steps, known, system)[:, None]
         longest = np.abs(steps).max(axis=1, keepdims=True)
-        steps *= np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-9))
+        steps *= np.minimum(1.0, settings.longest_step / np.maximum(longest, 1e-9))
         state = wrap_angles(state + steps * scales, system)
     return state

@@ -30,8 +30,6 @@ ORBIT = "orbit"
 PARAMETER = "parameter"
 """Name of the quantity that is the parameter itself."""
 
-CUTS = (1, 2, 4, 8, 16)
-"""Numbers of steps, tried in turn, from the last accepted parameters to new ones."""
 
 NEWTON = Settings(tolerance=1e-10, max_iterations=10)
 LOCATED = Settings(tolerance=1e-8, max_iterations=12)
@@ -129,6 +127,7 @@ def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 
 def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
     """Carry one orbit from the known parameters to others, in one step or several; None if it is lost."""
+    cuts = (1, 2, 4, 8, 16)  # numbers of steps, tried in turn, from the last accepted parameters to new ones
     known, datum = table.known, table.data[k]
     if not np.isfinite(known.unknowns[k]).all():
         return None
@@ -137,7 +136,7 @@ def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
     slope = sum(
         (by[k] * change[names.index(name)] for name, by in known.slopes.items()), np.zeros(known.unknowns.shape[1])
     )
-    for n in CUTS:
+    for n in cuts:
         here, step, normal, point = known.unknowns[k], slope / n, known.tangents[k], None
         for i in range(1, n + 1):
             point = yield from _solved(table, datum, known.packed + change * (i / n), here + step, normal)

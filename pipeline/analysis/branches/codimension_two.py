@@ -63,12 +63,6 @@ TURN = "turn"
 OF_COEFFICIENT = {FOLD: CUSP, DOUBLING: GENERALISED, TORUS: CHENCINER}
 """The point at which the normal form coefficient of each bifurcation vanishes."""
 
-VANISHES = 1e-3
-"""A sign change is a zero if the test function falls below this share of its values on both sides; else it jumps."""
-
-ON_AXIS = 1e-6
-"""Largest distance of kappa from 1 or -1 where a pair passes that multiplier."""
-
 
 @dataclass(frozen=True, eq=False)
 class SpecialPoint:
@@ -145,6 +139,8 @@ class Detector:
         """Locate and store the point of codimension two where a test function vanishes between two points of a curve;
         count failures.
         """
+        # a sign change is a zero if the test function falls below this share of its values on both sides; else it jumps
+        vanishes = 1e-3
         ends = None
         for settings in self.settings:
             ends = yield from find_root(self.problem, a, b, partial(self._test, kind, frame), settings)
@@ -154,7 +150,7 @@ class Detector:
             self.n_missed += 1
             return
         (low, at_low), (high, at_high) = ends
-        if not min(abs(at_low), abs(at_high)) <= VANISHES * max(abs(a[1]), abs(b[1])):
+        if not min(abs(at_low), abs(at_high)) <= vanishes * max(abs(a[1]), abs(b[1])):
             return
         nearest = low if abs(at_low) <= abs(at_high) else high
         bracket = np.abs(self.problem.family.values(high.u) - self.problem.family.values(low.u))
@@ -172,10 +168,11 @@ class Detector:
 
     def _named(self, one: SpecialPoint) -> SpecialPoint | None:
         """Return a located zero of a test function with its final kind; None if it is no point of codimension two."""
+        on_axis = 1e-6  # largest distance of kappa from 1 or -1 where a pair passes that multiplier
         if one.kind != TURN:
             return one
         cosine = _cosine(np.linalg.eigvals(one.point.value.monodromy))
-        return replace(one, kind=R1 if cosine > 0.0 else R2) if abs(cosine) >= 1.0 - ON_AXIS else None
+        return replace(one, kind=R1 if cosine > 0.0 else R2) if abs(cosine) >= 1.0 - on_axis else None
 
 
 def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:
@@ -285,13 +282,11 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
 
 def _is_same_orbit(one: SpecialPoint, other: SpecialPoint) -> bool:
     """Return whether two located points of codimension two are the same orbit at the same parameter values."""
+    # largest distances of one point located on two curves: in the parameters, and in the state, which is steep at some
+    # of these points
+    same_point, same_state = 1e-5, 1e-2
     if one.family.period != other.family.period:
         return False
-    if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:
+    if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > same_point:
         return False
-    return any(np.abs(one.family.mismatch(one.point.u, x)).max() < SAME_STATE for x in other.point.value.images)
-
-
-SAME_POINT, SAME_STATE = 1e-5, 1e-2
-"""Largest distances of one point located on two curves: in the parameters, and in the state, which is steep at
-some of these points."""
+    return any(np.abs(one.family.mismatch(one.point.u, x)).max() < same_state for x in other.point.value.images)

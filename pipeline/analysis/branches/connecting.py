@@ -24,31 +24,10 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from magpend_core.ordering import canonical_order
-from pipeline.analysis.branches.sheets import ENDED, GOING, LONGEST, NEAR, OPEN, UNTRIED, Array, Grid, Orbits, Values
+from pipeline.analysis.branches.sheets import ENDED, GOING, OPEN, UNTRIED, Array, Grid, Orbits, SheetSettings, Values
 from pipeline.analysis.branches.strobe import other_side
 from pipeline.products.reporting import report
 from pipeline.results.tolerances import SAME_CONNECTED
-
-SHORTEST, LEAST_STEPS = 2.0**-13, 16
-"""Step at which following ends [ranges of the axis]; it is shorter where `LEAST_STEPS` of them exceed the way."""
-
-BEFORE_FIRST = 1.0 / 64.0
-"""How much shorter the first step may be: two orbits are needed to tell a fold."""
-
-COLLAPSED = 0.2
-"""A step is refused if it shrinks an orbit's distance from orbits of a part of its period to less than this share."""
-
-HALVED = 0.2
-"""Largest distance of the two halves of an orbit at a period doubling."""
-
-AGREED = 0.1
-"""Largest difference between two estimates of where a fold is, as a share of its distance."""
-
-TOGETHER = 8
-"""Newton steps of all orbits on their way before others are sent."""
-
-CORRECTIONS = 6
-"""Most Newton steps at one point."""
 
 _STEP, _SETTLE, _HALVE = range(3)
 
@@ -62,7 +41,7 @@ class Web:
     ways: Array  # int, (orbit, axis, 2): state of the way up and down each axis, of `UNTRIED` to `GOING`
 
 
-def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:
+def connect(grid: Grid, place: Array, orbits: list[Array], settings: SheetSettings = SheetSettings()) -> Web:
     """Link the orbits that lie on one branch or sheet.
 
     The grid has an axis or more. Each orbit has its parameter point, and section points (period, n_states) in the order
@@ -73,7 +52,7 @@ def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:
     scaled = [np.roll(x, -int(canonical_order(x)[0]), axis=0) for x in scaled]
     firsts = np.array([x[0] for x in scaled])
     order = canonical_order(np.column_stack([place, [len(x) for x in scaled], firsts]))
-    flood = _Flood(grid, place[order], [scaled[i] for i in order])
+    flood = _Flood(grid, place[order], [scaled[i] for i in order], settings=settings)
     flood.run()
     back = np.concatenate([order, np.arange(len(order), len(flood.nodes))])
     inverse = np.argsort(back)
@@ -84,8 +63,8 @@ def connect(grid: Grid, place: Array, orbits: list[Array]) -> Web:
 class _Flood(Orbits):
     """Orbits on a grid together with those that are on their way to another point (`walk`)."""
 
-    def __init__(self, grid: Grid, place: Array, orbits: list[Array]) -> None:
-        super().__init__(grid, place, orbits)
+    def __init__(self, grid: Grid, place: Array, orbits: list[Array], settings: SheetSettings) -> None:
+        super().__init__(grid, place, orbits, settings)
         n = grid.system.n_states
         numbers = "u end h shortest det det_before u_before gap sign limit reach end_at"
         walk: Any = [(k, "i8") for k in ("origin", "axis", "way", "period", "halvings", "stage", "tries")]
@@ -107,7 +86,7 @@ class _Flood(Orbits):
             self._start(active)
             if not len(self.walk):
                 return
-            for _ in range(TOGETHER):
+            for _ in range(self.settings.together):
                 self._advance()
 
     def _mark(self, walk: Any, state: int) -> None:
@@ -196,9 +175,9 @@ class _Flood(Orbits):
             on = np.flatnonzero(walk["axis"] == axis)
             walk["u"][on], walk["end"][on] = (self.grid.value(place[on], axis) for place in (nodes["place"], targets))
         whole = np.abs(walk["end"] - walk["u"])
-        reach = np.minimum(nodes["reach"][rows, walk["axis"]], _longest(walk["slope"]))
+        reach = np.minimum(nodes["reach"][rows, walk["axis"]], _longest(walk["slope"], self.settings))
         walk["h"] = np.minimum(whole, reach)
-        walk["shortest"] = np.minimum(SHORTEST, whole / LEAST_STEPS)
+        walk["shortest"] = np.minimum(self.settings.shortest, whole / self.settings.least_steps)
         self._mark(walk, GOING)
         self.walk = np.concatenate([self.walk, walk])
 
@@ -231,13 +210,13 @@ class _Flood(Orbits):
         with np.errstate(invalid="ignore", divide="ignore"):
             error = np.maximum(size, back) / length
         is_step, converged = w["stage"] == _STEP, size <= SAME_CONNECTED
-        good = np.isfinite(v.det) & np.isfinite(slope).all(axis=1) & (gap >= COLLAPSED * w["gap"])
-        passed = is_step & good & (error <= NEAR)
+        good = np.isfinite(v.det) & np.isfinite(slope).all(axis=1) & (gap >= self.settings.collapsed * w["gap"])
+        passed = is_step & good & (error <= self.settings.near)
         # after a doubling det(1 + M) of the orbit of half the period must change its sign before long
         same = passed & (w["sign"] == v.sign)
         lost = same & ((u - w["limit"]) * w["way"] >= 0.0)
         passed &= ~lost
-        fixed = ~is_step & np.isfinite(size) & (size < LONGEST) & (w["tries"] < CORRECTIONS)
+        fixed = ~is_step & np.isfinite(size) & (size < self.settings.longest) & (w["tries"] < self.settings.corrections)
         settled = fixed & (w["stage"] == _SETTLE) & good & converged
         arrived = settled & (w["u"] == w["end"])
         self._take(w, passed, u, v.det)
@@ -252,11 +231,11 @@ class _Flood(Orbits):
         w["is_ending"] = self._foresees_an_end(w, passed)
         w["is_rough"][passed], w["is_rough"][settled] = ~converged[passed], False
         w["stage"][settled], w["det"][settled] = _STEP, v.det[settled]
-        w["h"][passed] *= np.minimum(2.0, 0.7 * NEAR / np.maximum(error[passed], 1e-12))
-        w["h"][refused] *= np.clip(np.nan_to_num(0.7 * NEAR / error[refused], nan=0.25), 0.25, 0.5)
+        w["h"][passed] *= np.minimum(2.0, 0.7 * self.settings.near / np.maximum(error[passed], 1e-12))
+        w["h"][refused] *= np.clip(np.nan_to_num(0.7 * self.settings.near / error[refused], nan=0.25), 0.25, 0.5)
         self._begin_half(w, fixed & (w["stage"] == _HALVE) & converged, v)
         w["reach"][is_step] = w["h"][is_step]
-        w["h"] = np.minimum(w["h"], np.minimum(np.abs(w["end"] - w["u"]), _longest(w["slope"])))
+        w["h"] = np.minimum(w["h"], np.minimum(np.abs(w["end"] - w["u"]), _longest(w["slope"], self.settings)))
         self._finish(w, arrived, lost | (~is_step & ~fixed), refused, np.maximum(h, w["shortest"]), v)
 
     def _take(self, w: Any, passed: Array, u: Array, det: Array) -> None:
@@ -272,7 +251,7 @@ class _Flood(Orbits):
         w["end_at"][passed] = at[passed]
         near = (ahead > 0.0) & (ahead <= 4.0 * np.abs(w["u"] - w["u_before"]))
         with np.errstate(invalid="ignore"):  # both are infinite where the derivative stays constant
-            agrees = np.abs(at - before) <= AGREED * ahead
+            agrees = np.abs(at - before) <= self.settings.agreed * ahead
         return np.asarray(passed & near & ((w["end"] - at) * w["way"] > 0.0) & agrees)
 
     def _begin_half(self, w: Any, ready: Array, v: Values) -> None:
@@ -284,13 +263,20 @@ class _Flood(Orbits):
 
     def _finish(self, w: Any, arrived: Array, lost: Array, refused: Array, tried: Array, v: Values) -> None:
         """Take the orbits that arrived, halve those that reach a doubling, and end those that are stuck."""
-        short = np.minimum(w["shortest"] * np.where(w["has_moved"], 1.0, BEFORE_FIRST), np.abs(w["end"] - w["u"]))
+        short = np.minimum(
+            w["shortest"] * np.where(w["has_moved"], 1.0, self.settings.before_first), np.abs(w["end"] - w["u"])
+        )
         stuck = ~arrived & (w["stage"] == _STEP) & ((w["h"] < short) | (w["h"] <= 1e-12) | w["is_ending"])
         ahead = _distance_to_fold(w)
         fold = w["has_moved"] & (ahead > 0.0) & (ahead < 10.0 * tried)
         first = stuck & (w["halvings"] == 0)
         w["is_fold"][first] = fold[first]
-        halves = stuck & (w["sign"] == 0.0) & (w["period"] % 2 == 0) & (np.linalg.norm(w["half"], axis=1) < HALVED)
+        halves = (
+            stuck
+            & (w["sign"] == 0.0)
+            & (w["period"] % 2 == 0)
+            & (np.linalg.norm(w["half"], axis=1) < self.settings.halved)
+        )
         w["z"][halves] += 0.5 * w["half"][halves]
         w["period"][halves] //= 2
         w["gap"][halves] = 0.0
@@ -360,6 +346,6 @@ def _distance_to_fold(w: Any) -> Array:
         return np.asarray(np.abs(w["u"] - w["u_before"]) * w["det"] ** 2 / (w["det_before"] ** 2 - w["det"] ** 2))
 
 
-def _longest(slope: Array) -> Array:
+def _longest(slope: Array, settings: SheetSettings) -> Array:
     """Return the longest change of a parameter within the longest step."""
-    return np.asarray(0.999 * LONGEST / np.hypot(np.linalg.norm(slope, axis=1), 1.0))
+    return np.asarray(0.999 * settings.longest / np.hypot(np.linalg.norm(slope, axis=1), 1.0))

@@ -38,7 +38,6 @@ from pipeline.analysis.branches.codimension_two import (
 )
 from pipeline.analysis.branches.dataset import Columns, column, filled
 from pipeline.analysis.branches.equilibrium_curves import (
-    PERSISTS,
     EquilibriumCurve,
     EquilibriumDetector,
     frequencies_at,
@@ -78,8 +77,6 @@ CURVE_ENDS = (
     *(BT, "equilibrium", "tangent", NONCENTRAL, HETEROCLINIC),
 )
 
-GENERATIONS = 3
-"""Number of generations of curves that spring from points of codimension two."""
 
 LOST = "Newton's method finds no curve through it"
 UNFOLDED = "the second parameter unfolds it: the branches come apart, and a fold may remain; it has no curve"
@@ -111,21 +108,6 @@ OTHERS = {
 }
 """What springs from points of codimension two beside `SPRINGING`, and is never followed from there."""
 
-CLOSE = 0.05
-"""Largest distance of a curve from a point of codimension two from which it springs, in units of the ranges."""
-
-NO_FREQUENCY = 1e-6
-"""Square of the dimensionless frequency of a Hopf point below which it is a Bogdanov-Takens point."""
-
-SAME_PERIOD = 0.1
-"""Largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve."""
-
-BESIDE = (0.2, 0.02)
-"""Scaled distances from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins."""
-
-AMPLITUDES = (0.02, 0.05, 0.1)
-"""Scaled distances, tried in turn, of the first orbit of a curve from the point at which the curve begins."""
-
 
 @dataclass(frozen=True, eq=False)
 class Curve:
@@ -153,7 +135,7 @@ def curves_from(
     second: str,
     bounds: Bounds,
     max_period: int,
-    generations: int = GENERATIONS,
+    generations: int = 3,
     left_out: dict[int, str] | None = None,
 ) -> list[Curve]:
     """Continue the bifurcations located on branches as curves in the plane of the branches' parameter and a second one.
@@ -180,6 +162,8 @@ def curves_from(
     list of Curve
         Curves in the order of the located points they start from, none twice; then those of homoclinic orbits.
     """
+    # from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins [scaled]
+    distances = (0.2, 0.02)
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     left_out = {} if left_out is None else left_out
     starts = _starts(branches, parameters, second, bounds, longest, left_out)
@@ -187,7 +171,7 @@ def curves_from(
     starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
     found = continue_curves(starts, bounds, CURVE, longest, generations, left_out)
     takens = [p for p in merged({i: c.special for i, c in enumerate(found)}) if p.kind == BT]
-    beside = [loop_near(point, away) for point in takens for away in BESIDE]
+    beside = [loop_near(point, away) for point in takens for away in distances]
     loops = loops_of(branches, parameters, second, bounds, longest) + [loop for loop in beside if loop is not None]
     return found + [
         Curve(c.family, HOMOCLINIC, c.points, c.ends, -1, c.special, c.n_missed)
@@ -204,7 +188,7 @@ def continue_curves(
     bounds: Bounds,
     settings: Settings = CURVE,
     max_period: int = 0,
-    generations: int = GENERATIONS,
+    generations: int = 3,
     left_out: dict[int, str] | None = None,
 ) -> list[Curve]:
     """Follow each bifurcation in both directions in the parameter plane, until a bound, its own start or a resonance.
@@ -313,7 +297,7 @@ def _first_beside(
 ) -> Steps[tuple[CurveProblem, Point] | None]:
     """Find a first point of a curve at some small distance from unknowns, along a direction of the states."""
     normal = np.append(direction, np.zeros(len(u) - len(direction)))
-    for amplitude in AMPLITUDES:
+    for amplitude in CURVE.amplitudes:
         guess = u + amplitude * normal
         found = yield from correct(problem, guess, normal / np.linalg.norm(normal), _own(CURVE, problem))
         if found is not None and not (problem.family.period and end_of_crossings(problem.family, found)):
@@ -374,7 +358,8 @@ def _first(problem: CurveProblem, u: np.ndarray, settings: Settings) -> Steps[Po
 
 def _persists(problem: CurveProblem, point: Point) -> bool:
     """Return False at an imperfect branch point: one that a change of the second parameter has broken up."""
-    return problem.kind not in BRANCH_POINTS or abs(float(point.u[problem.family.system.n_states])) < PERSISTS
+    persists = 1e-7  # largest imperfection beta that counts as none
+    return problem.kind not in BRANCH_POINTS or abs(float(point.u[problem.family.system.n_states])) < persists
 
 
 def _follow(
@@ -431,9 +416,13 @@ def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:
 
     Two curves of Hopf points that cross at a double Hopf point differ in the period of their cycles.
     """
+    # square of the dimensionless frequency of a Hopf point below which it is a Bogdanov-Takens point
+    no_frequency = 1e-6
+    # largest relative difference of the periods of the small cycles of neighbouring Hopf points of one curve
+    same_period = 0.1
     family, points, seconds = problem.family, curve.points, start.value.seconds
-    if problem.kind == HOPF and start.u[family.system.n_states] > NO_FREQUENCY:
-        points = [point for point in points if abs(point.value.seconds / seconds - 1.0) < SAME_PERIOD]
+    if problem.kind == HOPF and start.u[family.system.n_states] > no_frequency:
+        points = [point for point in points if abs(point.value.seconds / seconds - 1.0) < same_period]
     is_alike = curve.kind == problem.kind and curve.family.period == family.period
     return is_alike and lies_on(points, family, start)
 
@@ -508,8 +497,9 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
 def not_followed(ds: xr.Dataset) -> list[str]:
     """Return a text line for each point of codimension two from which curves spring that were not followed.
 
-    A curve counts as followed if one of its kind and period comes within `CLOSE` of the point.
+    A curve counts as followed if one of its kind and period comes near the point.
     """
+    largest = 0.05  # distance of a curve from a point of codimension two from which it springs, in units of the ranges
     roles, lines = ("first", "second"), list[str]()
     if not ds.sizes["curve"]:
         return lines
@@ -519,7 +509,7 @@ def not_followed(ds: xr.Dataset) -> list[str]:
     for k in range(ds.sizes["special"]):
         kind, period = POINT_KINDS[int(ds["special_kind"][k])], int(ds["special_period"][k])
         at = [float(ds[f"special_{role}"][k]) for role in roles]
-        near = np.nanmin(np.linalg.norm(points - np.array(at) / ranges, axis=-1), axis=1) < CLOSE
+        near = np.nanmin(np.linalg.norm(points - np.array(at) / ranges, axis=-1), axis=1) < largest
         known = {
             (CURVE_KINDS[int(one)], int(n))
             for one, n in zip(ds["kind"].values[near], ds["orbit_period"].values[near], strict=True)

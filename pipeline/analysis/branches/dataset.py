@@ -35,10 +35,6 @@ from pipeline.results.tolerances import BRANCH_RTOL
 CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
 
 
-SAMPLES = 64
-"""Instants per drive period or return at which the side of an orbit is judged."""
-
-
 def dataset_of(
     branches: Sequence[Branch], parameter: str, parameters: Parameters | None = None, left_out: Sequence[str] = ()
 ) -> xr.Dataset:
@@ -273,13 +269,14 @@ def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
 
 
 def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
+    per_return = 64  # instants per drive period or return at which the side of an orbit is judged
     family = branch.family
     if not family.period or base.model.is_map:
         return _point_sides(branch, base, classifier)
     own = base.replace(**dict(zip(base.names, map(float, family.parameters), strict=True)))
     name, flow = family.free[0], of_flow(own).model.system
     angles = np.flatnonzero(family.system.is_angle)
-    n_samples = family.period * SAMPLES
+    n_samples = family.period * per_return
     parameters, times, drives = [], [], []
     for point in branch.points:
         value = float(family.values(point.u)[0])
@@ -287,7 +284,7 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
         parameters.append(own if name == FREQUENCY else own.replace(**{name: value}))
         if base.model.crossing is not None:
             frequency = family.period / point.value.seconds
-        times.append(np.arange(n_samples + 1) / (SAMPLES * frequency))
+        times.append(np.arange(n_samples + 1) / (per_return * frequency))
         drives.append(Drive(np.full(family.period, 1.0 / frequency)))
     packed = np.array([of_flow(one).pack() for one in parameters])
     starts = np.array([family.state(point.u) for point in branch.points])

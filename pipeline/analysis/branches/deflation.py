@@ -25,25 +25,21 @@ from magpend_core.pointwise import rates_at
 from pipeline.products.reporting import report
 from pipeline.results.tolerances import BRANCH_RTOL, SAME_EQUILIBRIUM, SAME_ON_BRANCH
 
-WIDER, WIDEST = 1.5, 10.0
-"""Sides of the least and the largest box of random starts, in units of that which the states seen span: orbits that no
-cell meets may be far from those that are seen."""
 
-ROUNDS = 6
-"""Most rounds of deflated iterations; the search ends earlier with a round that finds nothing."""
+@dataclass(frozen=True)
+class DeflationSettings:
+    """Numbers of the search for orbits by deflated Newton iterations."""
 
-ELSEWHERE = 0.3
-"""Standard deviation by which starts move from round to round, as a share of that of all starts."""
-
-ITERATIONS = 30
-"""Newton steps of one iteration."""
-
-LONGEST_STEP = 0.5
-"""Longest step [scaled], and in units of the distance from the middle of the starts, where this is more; a longer one
-is shortened to this."""
-
-CLOSE = 1e-9
-"""Scaled residual at which an iteration ends; the orbits found are polished further."""
+    rounds: int = 6  # most rounds of deflated iterations; the search ends earlier with a round that finds nothing
+    # standard deviation by which starts move from round to round, as a share of that of all starts; more looks further
+    # away, and loses more iterations
+    elsewhere: float = 0.3
+    # Newton steps of one iteration; more reach more orbits, and cost as much on starts that reach none
+    iterations: int = 30
+    # longest step [scaled], and in units of the distance from the middle of the starts, where this is more; a longer
+    # one is shortened to this
+    longest_step: float = 0.5
+    close: float = 1e-9  # scaled residual at which an iteration ends; the orbits found are polished further
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +79,8 @@ def search_orbits(
     packed: np.ndarray,
     system: System,
     *,
-    rounds: int = ROUNDS,
     what: str = "searching orbits",
+    settings: DeflationSettings = DeflationSettings(),
 ) -> list[FoundOrbit]:
     """Find the periodic orbits near many starts by plain and then by deflated Newton iterations, each orbit once.
 
@@ -100,10 +96,10 @@ def search_orbits(
         Packed parameters.
     system
         System of equations to integrate.
-    rounds
-        Largest number of rounds with deflation.
     what
         Name of the work in progress reports.
+    settings
+        Numbers to choose.
 
     Returns
     -------
@@ -112,11 +108,12 @@ def search_orbits(
         them; the search deflates them, too.
     """
     found: list[FoundOrbit] = []
-    generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)
+    generator, spread = np.random.default_rng(0), settings.elsewhere * starts.std(axis=0)
+    rounds = settings.rounds
     for number in range(1 + rounds):
         report(what, number, 1 + rounds)
         moved = starts + spread * generator.standard_normal(starts.shape) if number else starts
-        ends = _iterate(moved, periods, frequency_hz, packed, system, found)
+        ends = _iterate(moved, periods, frequency_hz, packed, system, found, settings)
         n_before = len(found)
         add_orbits(found, *ends, number, frequency_hz, packed, system)
         if len(found) == n_before:
@@ -128,7 +125,9 @@ def orbit_near(
     state: np.ndarray, period: int, frequency_hz: float, packed: np.ndarray, system: System
 ) -> FoundOrbit | None:
     """Return the orbit that Newton's method finds from a state, of a period or a part of it; None if it finds none."""
-    found = search_orbits(state[None], np.array([period]), frequency_hz, packed, system, rounds=0)
+    found = search_orbits(
+        state[None], np.array([period]), frequency_hz, packed, system, settings=DeflationSettings(rounds=0)
+    )
     return found[0] if found else None
 
 
@@ -151,6 +150,9 @@ def starts_around(
     reach
         Further states that the box spans, of the same shape.
     """
+    # sides of the least and the largest box, in units of that which the states seen span: orbits that no cell meets may
+    # be far from those that are seen
+    least, largest = 1.5, 10.0
     generator = np.random.default_rng(seed)
     if not len(section):
         section = np.zeros((1, system.n_states)) + np.asarray(system.scales) * [[-1.0], [1.0]]
@@ -159,7 +161,7 @@ def starts_around(
     middle, half = (low + high) / 2.0, np.maximum(high - low, np.asarray(system.scales)) / 2.0
     n_drawn = n // 2
     drawn = section[generator.integers(len(section), size=n_drawn)]
-    sides = np.geomspace(WIDER, WIDEST, n - n_drawn)[:, None] * half
+    sides = np.geomspace(least, largest, n - n_drawn)[:, None] * half
     middle, sides = np.where(system.is_angle, 0.0, middle), np.where(system.is_angle, np.pi, sides)
     return np.concatenate([drawn, middle + sides * generator.uniform(-1.0, 1.0, sides.shape)])
 
@@ -171,11 +173,12 @@ def _iterate(
     packed: np.ndarray,
     system: System,
     known: Sequence[FoundOrbit],
+    settings: DeflationSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Iterate Newton's method from all starts. Return the section points to which it converged, and their periods."""
     state, scales, middle = starts.astype(np.float64), np.asarray(system.scales), np.median(starts, axis=0)
     rows, done = np.arange(len(state)), []
-    for _ in range(ITERATIONS):
+    for _ in range(settings.iterations):
         ends = section_map(
             np.tile(packed, (len(rows), 1)),
             np.full(len(rows), frequency_hz),
@@ -187,7 +190,7 @@ def _iterate(
         image = ends.images[np.arange(len(rows)), periods[rows] - 1]
         mismatch = wrap_angles(image - state[rows], system) / scales
         is_finite = np.isfinite(mismatch).all(axis=1) & np.isfinite(ends.derivatives).all(axis=(1, 2))
-        has_converged = is_finite & (np.abs(mismatch).max(axis=1) < CLOSE)
+        has_converged = is_finite & (np.abs(mismatch).max(axis=1) < settings.close)
         done.append(rows[has_converged])
         going = is_finite & ~has_converged
         rows = rows[going]
@@ -197,7 +200,7 @@ def _iterate(
         steps = _newton(matrices, mismatch[going])
         steps *= stretch(state[rows], periods[rows], steps, known, system)[:, None]
         away = wrap_angles(state[rows] - middle, system) / scales
-        allowed = LONGEST_STEP * np.maximum(1.0, np.abs(away).max(axis=1, keepdims=True))
+        allowed = settings.longest_step * np.maximum(1.0, np.abs(away).max(axis=1, keepdims=True))
         longest = np.abs(steps).max(axis=1, keepdims=True)
         steps *= np.minimum(1.0, allowed / np.maximum(longest, allowed * 1e-9))
         state[rows] = wrap_angles(state[rows] + steps * scales, system)

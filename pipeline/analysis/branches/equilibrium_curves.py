@@ -58,18 +58,9 @@ from pipeline.analysis.branches.problems import (
     hopf_test,
 )
 
-INNER = 1e-3
-"""Step of the differences by the first parameter inside of the equations of a branch point, of fourth order."""
-
 SINGULAR = 1e-6
 """Largest singular value of the dimensionless equations of a fold at a branch point, and its quadratic term at a
 pitchfork."""
-
-NO_PRODUCT = 1e-5
-"""Product <p, q> below which a pitchfork is a double zero, where its cubic coefficient has a pole."""
-
-PERSISTS = 1e-7
-"""Largest imperfection beta of a branch point that counts as none."""
 
 
 @dataclass(eq=False)
@@ -148,6 +139,8 @@ class EquilibriumCurve(FamilyProblem):
 
     def _equations(self, u: np.ndarray, right: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Return the dimensionless equations at some unknowns, with given singular vectors."""
+        # step of the differences by the first parameter inside of the equations of a branch point, of fourth order
+        inner = 1e-3
         n, (rates, jacobian) = self.family.system.n_states, self._rates(u)
         rates, matrix = rates * self.unit, self.family.scaled(jacobian) * self.unit
         if self.kind == HOPF:
@@ -158,9 +151,9 @@ class EquilibriumCurve(FamilyProblem):
         if self.kind == FOLD:
             return np.append(rates, solution[-1])
         step = np.zeros(self.size)
-        step[n + 1] = INNER
+        step[n + 1] = inner
         far, near, after, beyond = (self._rates(u + k * step)[0] * self.unit for k in (-2, -1, 1, 2))
-        slope = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * INNER)
+        slope = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * inner)
         adjoint = solved(bordered.T, np.append(np.zeros(n), 1.0))[:-1]
         return np.concatenate([rates + u[n] * left, [solution[-1], adjoint @ slope]])
 
@@ -237,12 +230,13 @@ class EquilibriumDetector(Detector):
 
     def _named(self, one: SpecialPoint) -> SpecialPoint | None:
         """Return a located point with its coefficients; None if what meets is a neutral saddle."""
+        least = 1e-5  # product <p, q>: below it a pitchfork is a double zero, where its cubic coefficient has a pole
         point, rest, is_hopf = one.point, self._rest(one.point), self.problem.kind == HOPF
         if one.kind == CUSP:
             found = partial(center_manifold.cusp, rest)
         elif one.kind == DEGENERATE:
             right, left = null_vectors(rest.matrix)
-            if abs(left @ right) < NO_PRODUCT:
+            if abs(left @ right) < least:
                 return None
             found = partial(center_manifold.degenerate_pitchfork, rest)
         elif one.kind == BT:

@@ -20,7 +20,7 @@ from magpend_core.orbits import crossed_state, section_map
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import SAME_PLACE, SHIFTS, TESTS, Bifurcation, locate, settle_sides
+from pipeline.analysis.branches.bifurcations import SAME_PLACE, TESTS, Bifurcation, locate, settle_sides
 from pipeline.analysis.branches.following import (
     Branch,
     Half,
@@ -41,29 +41,10 @@ from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 from pipeline.results.tolerances import BRANCH_RTOL
 
-AT_HOPF = 0.05
-"""Largest scaled distance of the last cycle of a branch from the Hopf point at which it ends."""
-
-CLEAR = 2
-"""Points of a branch by which cycles are away from where they touch a section."""
-
-AMPLITUDES = (0.02, 0.05, 0.1)
-"""Amplitudes of the first cycle that are tried, in units of the scales."""
-
-CERTAIN_SIDE = 1e-8
-"""Least distance of a point from a bifurcation, by the parameter in its scale, that shows on which side it lies."""
-
-SAME_LEVEL = 1e-9
-"""Two sections this close are one [scales of the state that crosses]."""
-
-SAME_TIME = 1e-6
-"""Relative difference within which the times of some returns add up to the period of a cycle."""
-
-
 FOLLOWING = "following branches"
 """First words of the work's name in progress reports."""
 
-BESIDE = 3
+POINTS_BESIDE = 3
 """Points of a branch away from a bifurcation at which it is seen on which side of it the branch lies."""
 
 
@@ -223,9 +204,11 @@ def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies: at the
     first point that is certainly away, as it may soon turn.
     """
+    # least distance from the bifurcation, by the parameter in its scale, that shows on which side a point lies
+    certain = 1e-8
     near = child.points[:4] if end == 0 else child.points[:-5:-1]
     away = [point.u[-1] - at.point.u[-1] for point in near]
-    sure = [x for x in away if abs(x) > CERTAIN_SIDE] or away[-1:]
+    sure = [x for x in away if abs(x) > certain] or away[-1:]
     return _side_criticality(at, 1 if sure[0] > 0.0 else -1)
 
 
@@ -280,6 +263,7 @@ def _adopt_cycles(branches: Sequence[Branch]) -> None:
 
 
 def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
+    largest = 0.05  # scaled distance of the last cycle of a branch from the Hopf point at which it ends
     near = [
         (max(gap(cycles.family, end.u, one.point), abs(end.u[-1] - one.point.u[-1])), one)
         for other in branches
@@ -288,7 +272,7 @@ def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcat
         if one.kind == HOPF
     ]
     away, nearest = min(near, key=lambda pair: pair[0], default=(np.inf, None))
-    return nearest if away < AT_HOPF else None
+    return nearest if away < largest else None
 
 
 def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
@@ -316,13 +300,14 @@ def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: S
     Diagrams show the section of the run, `own`. So cycles that cross it are followed there, unless they have
     been, and are left out here.
     """
+    clear = 2  # points of a branch by which cycles are away from where they touch a section
     wanted = np.ones(len(cycles.points), bool)
     for section in _other_sections(cycles, own, branches):
         crossings = crossings_of(cycles, section, scope.max_period)
         starts = {}
         for first, last in _equal_runs(np.where(wanted, [period for _, period in crossings], 0)):
-            state, period = crossings[min(first + CLEAR, last)]
-            value = float(cycles.values[min(first + CLEAR, last)])
+            state, period = crossings[min(first + clear, last)]
+            value = float(cycles.values[min(first + clear, last)])
             starts[first, last] = Start(replace(section, period=period), state, value)
         if section is own:
             _follow_starts(list(starts.values()), branches, scope)
@@ -364,12 +349,13 @@ def cycle_family(equilibria: Family, at: Point, omega: float | None = None) -> F
 
     There is none if the system has no section by crossing, or if the crossing state does not oscillate.
     """
+    same = 1e-9  # two sections this close are one [scales of the state that crosses]
     crossed = crossed_state(equilibria.system)
     if crossed is None or cycle_direction(equilibria, at, omega) is None:
         return None
     level = equilibria.parameters.copy()
     at_rest = float(at.value.images[0, crossed])
-    if abs(at_rest - level[-1]) > SAME_LEVEL * equilibria.system.scales[crossed]:
+    if abs(at_rest - level[-1]) > same * equilibria.system.scales[crossed]:
         level[-1] = at_rest
     for name, value in zip(equilibria.free, equilibria.values(at.u), strict=True):
         level[equilibria.system.parameter_names.index(name)] = value
@@ -381,7 +367,7 @@ def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settin
     direction = cycle_direction(family, at.point)
     assert direction is not None
     normal = np.append(direction / np.linalg.norm(direction), 0.0)
-    for amplitude in AMPLITUDES:
+    for amplitude in settings.amplitudes:
         guess = at.point.u + amplitude * np.append(direction, 0.0)
         first = yield from correct(OrbitProblem(family), guess, normal, settings)
         if first is not None:
@@ -427,6 +413,7 @@ def crossings_of(cycles: Branch, section: Family, most: int) -> list[tuple[np.nd
     list of (ndarray, int)
         For each cycle a point on the section, and the number of crossings per period, 0 if there is none.
     """
+    rounding = 1e-6  # relative difference within which the times of some returns add up to the period of a cycle
     rows = section.rows(np.array([point.u for point in cycles.points]))
     first = run_branches(
         rows.parameters[:, None],
@@ -439,7 +426,7 @@ def crossings_of(cycles: Branch, section: Family, most: int) -> list[tuple[np.nd
     ).section[:, 0, 0]
     found = section_map(rows.parameters, rows.frequency_hz, first, most, rtol=BRANCH_RTOL, system=section.system)
     seconds = np.array([point.value.seconds for point in cycles.points])[:, None]
-    closes = np.abs(np.cumsum(found.times, axis=1) - seconds) < SAME_TIME * seconds
+    closes = np.abs(np.cumsum(found.times, axis=1) - seconds) < rounding * seconds
     periods = np.where(closes.any(axis=1), closes.argmax(axis=1) + 1, 0)
     return list(zip(first, map(int, periods), strict=True))
 
@@ -520,8 +507,8 @@ def _side(branch: Branch, at: Bifurcation) -> int:
     """
     after = _place(branch, at)
     before, beyond = (
-        branch.points[max(after - BESIDE + 1, 0)],
-        branch.points[min(after + BESIDE, len(branch.points) - 1)],
+        branch.points[max(after - POINTS_BESIDE + 1, 0)],
+        branch.points[min(after + POINTS_BESIDE, len(branch.points) - 1)],
     )
     sides = np.sign([p.u[-1] - at.point.u[-1] for p in (before, beyond)])
     return int(sides[0]) if sides[0] == sides[1] else 0
@@ -557,7 +544,7 @@ def _relocate(one: Bifurcation, branch: Branch, place: int) -> None:
         return
     before, after = branch.points[place - 1 : place + 1]
     if TESTS[BRANCHING](before) * TESTS[BRANCHING](after) < 0.0:
-        found = run_alone(locate(problem_of(branch.family), before, after, BRANCHING, Settings(), SHIFTS))
+        found = run_alone(locate(problem_of(branch.family), before, after, BRANCHING, Settings(), Settings.shifts))
         if found is not None:
             one.point, one.bracket = found.point, found.bracket
 

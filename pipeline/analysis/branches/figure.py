@@ -397,15 +397,13 @@ _ON_MAP[HOMOCLINIC] = (0, (2.5, 1))
 _STYLE_NAMES = dict(zip(DASHES, ("solid:", "dashed:", "dotted:", "dash-dotted:", "dash-dot-dotted:"), strict=True))
 _STYLE_NAMES[_ON_MAP[HOMOCLINIC]] = "short-dashed:"
 
-ROOM = (0.045, 0.045)
-"""Room that a short name takes, in units of the axes."""
-
 
 def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> bool:
     """Reserve the place of a short name on axes. Return False if it would overlap a name already placed."""
+    room = (0.045, 0.045)  # room that a short name takes, in units of the axes
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     here = np.array([(at[0] - left) / (right - left), (at[1] - bottom) / (top - bottom)])
-    if any((np.abs(here - other) < ROOM).all() for other in taken):
+    if any((np.abs(here - other) < room).all() for other in taken):
         return False
     taken.append(here)
     return True

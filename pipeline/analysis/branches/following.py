@@ -26,36 +26,9 @@ ENDS = (
 a branch on another section, ``homoclinic`` and ``snic`` where their period grows without bound, ``unstable`` beyond a
 stable part where no more is followed."""
 
-TANGENT = 0.01
-"""A branch of cycles ends where the crossing speed times the period is below this distance [scales of the state
-that crosses]."""
-
-CROSSING_STEPS, NEAR_CROSSING = (1.0, 5.0, 25.0, 0.2, 0.04, 0.008), 5.0
-"""First steps from a branch point onto its second branch, in units of `first_step`, tried in turn, and the largest
-distance of the first orbit from the point, in units of the step."""
-
-ACROSS = 100.0
-"""Step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step."""
-
-NEAR_HALF, PASSED = 0.2, 4.0
-"""Largest distance between an orbit's section points half a period apart, at two neighbouring points of a branch, at
-which the branch may pass through the orbit of half the period: scaled, and in units of the step between the two."""
 
 _MORE_CUTS = "more_cuts"
 """End of a part of a branch of cut orbits, where they need more cuts."""
-
-STEEPER = 6.0
-"""Natural logarithm of the factor by which the period's slope along the branch rises, if the period grows."""
-
-KEEPS_GROWING = 0.6
-"""Least growth of the period over the second half of this rise, in units of that over the first half.
-
-Towards a homoclinic orbit both are equal, since the period grows by the same time whenever the distance in the
-parameter halves. Towards an end with a finite period, as at a square root, the second is many times less.
-"""
-
-REST = 0.5
-"""At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""
 
 
 def problem_of(family: Family) -> OneParameter:
@@ -163,23 +136,29 @@ def end_of_crossings(family: Family, point: Point) -> str:
     """Return why a limit cycle cannot be followed on its Poincare section: ``tangent`` or ``equilibrium``; empty if it
     can be.
     """
+    # crossing speed times the period below which the branch ends [scales of the state that crosses]; there the cycle
+    # has shrunk to an equilibrium if this product is below `rest` for all states
+    touching, rest = 0.01, 0.5
     crossed = crossed_state(family.system)
     if crossed is None:
         return ""
     rows = family.rows(point.u[None])
     rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)[0]
     reach = np.abs(rates) * point.value.seconds / np.asarray(family.system.scales)
-    if reach[crossed] >= TANGENT:
+    if reach[crossed] >= touching:
         return ""
-    return "equilibrium" if reach.max() < REST else "tangent"
+    return "equilibrium" if reach.max() < rest else "tangent"
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
     """Return whether the last step of a branch passed an orbit of half the period."""
+    # largest distance between an orbit's section points half a period apart, at two neighbouring points of a branch, at
+    # which the branch may pass through the orbit of half the period: scaled, and in units of the step between the two
+    near_half, passed = 0.2, 4.0
     if not family.period or family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
-    near = max(NEAR_HALF, PASSED * float(np.linalg.norm(points[-1].u - points[-2].u)))
+    near = max(near_half, passed * float(np.linalg.norm(points[-1].u - points[-2].u)))
     return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < near)
 
 
@@ -293,8 +272,8 @@ def _nears_rest(points: list[Point]) -> bool:
 def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
     """Return whether the period grows towards the end of a branch as it does towards infinity.
 
-    The slope of the period along the branch must rise towards the end, by the factor exp(`STEEPER`) at least, and
-    the growth that this takes must not fade (`KEEPS_GROWING`).
+    The slope of the period along the branch must rise towards the end, by a large factor, and the growth
+    that this takes must not fade.
 
     Parameters
     ----------
@@ -303,6 +282,11 @@ def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
     seconds
         Period at the points, shape (point,) [s].
     """
+    # natural logarithm of the factor by which the period's slope along the branch rises, if the period grows without
+    # bound; and the least growth of the period over the second half of this rise, in units of that over the first half.
+    # Towards a homoclinic orbit both are equal, since the period grows by the same time whenever the distance in the
+    # parameter halves. Towards an end with a finite period, as at a square root, the second is many times less.
+    steeper, keeps_growing = 6.0, 0.6
     growth, middle = np.diff(seconds), 0.5 * (seconds[1:] + seconds[:-1])
     with np.errstate(divide="ignore", invalid="ignore"):
         steepness = np.log(growth / np.linalg.norm(np.diff(unknowns, axis=0), axis=1))
@@ -310,20 +294,20 @@ def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:
     rises[:-1] &= steepness[1:] > steepness[:-1]
     first = len(rises) - int(np.argmin(np.append(rises[::-1], False)))
     steepness, middle = steepness[first:], middle[first:]
-    far = np.flatnonzero(steepness[-1:] - steepness >= STEEPER)
+    far = np.flatnonzero(steepness[-1:] - steepness >= steeper)
     if len(steepness) < 3 or not len(far):
         return False
     begin = min(int(far[-1]), len(steepness) - 3)
     ends = np.array([steepness[begin], 0.5 * (steepness[begin] + steepness[-1]), steepness[-1]])
     first_half, second_half = np.diff(np.interp(ends, steepness, middle))
-    return bool(second_half >= KEEPS_GROWING * first_half)
+    return bool(second_half >= keeps_growing * first_half)
 
 
 def beyond_strobe(problem: OneParameter, here: Point, settings: Settings) -> Steps[tuple[Point, Point] | None]:
     """Return the last point of a branch and the next one, both on the other side of an impact that coincides with the
     strobe; None if there is no such impact.
     """
-    behind = here.u - ACROSS * settings.shortest_step * here.tangent
+    behind = here.u - settings.across * settings.shortest_step * here.tangent
     beyond = [_other_unknowns(problem.family, u) for u in (here.u, behind)]
     if beyond[0] is None or beyond[1] is None:
         return None
@@ -433,10 +417,10 @@ def crossing_half(
     level = kernel.T @ np.array([-kernel[1, -1], kernel[0, -1]])
     slanted = float(level @ normal)
     ways = ([level / slanted] if abs(slanted) > 0.1 * np.linalg.norm(level) else []) + [normal]
-    for step, direction in product(settings.first_step * np.array(CROSSING_STEPS), ways):
+    for step, direction in product(settings.first_step * np.array(settings.crossing_steps), ways):
         first = yield from correct(problem, at.point.u + step * direction, normal, settings)
         # far away the plane meets the known branch again
-        if first is not None and np.linalg.norm(first.u - at.point.u) < NEAR_CROSSING * step:
+        if first is not None and np.linalg.norm(first.u - at.point.u) < settings.near_crossing * step:
             found = yield from half_branch(family, first, low, high, settings)
             found.trace.points.insert(0, start)
             for one in found.bifurcations:

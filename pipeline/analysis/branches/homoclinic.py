@@ -35,23 +35,33 @@ from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Ro
 from pipeline.analysis.branches.steep_orbits import flown
 from pipeline.results.tolerances import BRANCH_RTOL
 
-SETTINGS = Settings(first_step=5e-3, longest_step=0.04, max_points=400, tolerance=1e-9, max_iterations=8)
-"""Settings of the continuation; Newton's method mostly ends far below the tolerance."""
 
-RADIUS = 1e-5
-"""Distance r from the saddle at which its manifolds are replaced by their tangents, in units of the orbit's size."""
+@dataclass(frozen=True, eq=False)
+class HomoclinicSettings(Settings):
+    """Settings of curves of homoclinic orbits: of their continuation, of the nodes of an orbit and of its first guess.
 
-STRETCH, LEAST_SEGMENTS, MOST_SEGMENTS = 1.0, 12, 120
-"""Logarithm of the growth on one segment of the orbit, and limits of the number of segments."""
+    Newton's method mostly ends far below the tolerance.
+    """
 
-PER_SEGMENT = 25
-"""Samples on each segment from which new nodes are laid."""
+    first_step: float = 5e-3
+    longest_step: float = 0.04
+    max_points: int = 400
+    tolerance: float = 1e-9
+    max_iterations: int = 8
+    at_once: int = 8  # points that are followed before the nodes are laid anew
+    # distance r from the saddle at which its manifolds are replaced by their tangents, in units of the orbit's size;
+    # less errs less, and makes longer orbits
+    radius: float = 1e-5
+    stretch: float = 1.0  # logarithm of the growth on one segment of the orbit; less converges further, and costs more
+    least_segments: int = 12
+    most_segments: int = 120
+    per_segment: int = 25  # samples on each segment from which new nodes are laid
+    # distances from the saddle, in units of the least one of the guess, within which its flow is taken as linear; tried
+    # in turn, the first one where nodes are laid anew
+    cuts: tuple[float, ...] = (3.0, 10.0, 30.0)
+    damped: int = 30  # most damped Newton steps from a rough guess, and the residual at which they end
+    near: float = 1e-4
 
-CUTS = (3.0, 10.0, 30.0)
-"""Distances from the saddle, in units of the least one of the guess, within which its flow is taken as linear."""
-
-DAMPED, NEAR = 30, 1e-4
-"""Most damped Newton steps from a rough guess, and the residual at which they end."""
 
 TIME_UNIT = 0.1
 """Share of ln T that counts as 1 in the arclength."""
@@ -239,7 +249,9 @@ def _turned(basis: np.ndarray, known: np.ndarray) -> np.ndarray:
 # ---- starting ----------------------------------------------------------------------------------
 
 
-def homoclinic_point(loop: Loop, settings: Settings = SETTINGS) -> Steps[tuple[HomoclinicProblem, Point] | None]:
+def homoclinic_point(
+    loop: Loop, settings: HomoclinicSettings = HomoclinicSettings()
+) -> Steps[tuple[HomoclinicProblem, Point] | None]:
     """Refine an approximate homoclinic orbit by Newton's method, at a fixed value of the second parameter.
 
     Parameters
@@ -248,7 +260,7 @@ def homoclinic_point(loop: Loop, settings: Settings = SETTINGS) -> Steps[tuple[H
         Approximate orbit, for example a cycle of long period, or a prediction from a Bogdanov-Takens point. It begins
         and ends where it is nearest to the saddle.
     settings
-        Tolerance and number of Newton steps.
+        Distances from the saddle, nodes, tolerance and number of Newton steps.
 
     Returns
     -------
@@ -256,14 +268,14 @@ def homoclinic_point(loop: Loop, settings: Settings = SETTINGS) -> Steps[tuple[H
         The equations with their nodes, and the orbit with a tangent along which the second parameter rises; None if
         Newton's method fails, or the equilibrium is no saddle.
     """
-    for cut in CUTS:
-        laid = lay_nodes(loop, cut)
+    for cut in settings.cuts:
+        laid = lay_nodes(loop, cut, settings)
         if laid is None:
             return None
         problem, u = laid
         normal = np.zeros(problem.size)
         normal[-1] = 1.0
-        near = yield from _damped(problem, u, normal)
+        near = yield from _damped(problem, u, normal, settings)
         found = yield from correct(problem, near, normal, settings)
         if found is not None:
             tangent = kernel_of(found.value)
@@ -271,15 +283,17 @@ def homoclinic_point(loop: Loop, settings: Settings = SETTINGS) -> Steps[tuple[H
     return None
 
 
-def _damped(problem: HomoclinicProblem, u: np.ndarray, normal: np.ndarray) -> Steps[np.ndarray]:
+def _damped(
+    problem: HomoclinicProblem, u: np.ndarray, normal: np.ndarray, settings: HomoclinicSettings
+) -> Steps[np.ndarray]:
     """Bring a rough guess near to the solution by Newton's method, with steps that shorten the next one.
 
     The residual itself may grow on the way: errors at the nodes grow with the flow (Deuflhard, Newton Methods for
     Nonlinear Problems, 2004, section 3.3).
     """
     value = yield Query(problem, u)
-    for _ in range(DAMPED):
-        if not value.is_finite or np.linalg.norm(value.residual) < NEAR:
+    for _ in range(settings.damped):
+        if not value.is_finite or np.linalg.norm(value.residual) < settings.near:
             break
         inverse = np.linalg.pinv(np.vstack([value.derivative, normal]))
         step = -inverse[:, :-1] @ value.residual
@@ -294,7 +308,7 @@ def _damped(problem: HomoclinicProblem, u: np.ndarray, normal: np.ndarray) -> St
     return u
 
 
-def lay_nodes(loop: Loop, cut: float) -> tuple[HomoclinicProblem, np.ndarray] | None:
+def lay_nodes(loop: Loop, cut: float, settings: HomoclinicSettings) -> tuple[HomoclinicProblem, np.ndarray] | None:
     """Lay nodes at equal intervals of time along an approximate homoclinic orbit; None if there is no saddle.
 
     Within `cut` times the least distance of the orbit from the saddle, the flow is replaced by its linear part: there
@@ -311,7 +325,7 @@ def lay_nodes(loop: Loop, cut: float) -> tuple[HomoclinicProblem, np.ndarray] | 
     away = wrap_angles(loop.states - rest.states[0], family.system) / scales
     distance = np.linalg.norm(away, axis=1)
     extent = float(distance.max())
-    radius = RADIUS * extent
+    radius = settings.radius * extent
     outside = np.flatnonzero(distance > max(cut * distance[[0, -1]].max(), radius))
     if not len(outside):
         return None
@@ -322,7 +336,9 @@ def lay_nodes(loop: Loop, cut: float) -> tuple[HomoclinicProblem, np.ndarray] | 
     inner = loop.times[last] - loop.times[first]
     seconds = before + inner + after
     fastest = float(np.abs(rest.eigenvalues[0].real).max())
-    n_segments = int(np.clip(np.ceil(fastest * seconds / STRETCH), LEAST_SEGMENTS, MOST_SEGMENTS))
+    n_segments = int(
+        np.clip(np.ceil(fastest * seconds / settings.stretch), settings.least_segments, settings.most_segments)
+    )
     nodes = np.empty((n_segments + 1, len(saddle)))
     for k, t in enumerate(np.linspace(0.0, seconds, n_segments + 1)):
         if t < before:
@@ -365,13 +381,13 @@ def _time_to(flow: Callable[[float], np.ndarray], radius: float) -> float:
     return float(brentq(excess, 0.0, longest))
 
 
-def loop_of(problem: HomoclinicProblem, u: np.ndarray) -> Loop:
+def loop_of(problem: HomoclinicProblem, u: np.ndarray, settings: HomoclinicSettings) -> Loop:
     """Integrate the segments of a homoclinic orbit, and return its states at many instants."""
     family, parts, scales = problem.family, problem.parts(u), np.asarray(problem.system.scales)
     m = problem.n_segments
     rows = family.rows(np.column_stack([parts.nodes[:-1], np.tile(parts.values, (m, 1))]))
     step = parts.seconds / m
-    times = np.linspace(0.0, step, PER_SEGMENT + 1)
+    times = np.linspace(0.0, step, settings.per_segment + 1)
     found = sample(
         family.system,
         rows.parameters,

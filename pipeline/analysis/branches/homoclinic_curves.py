@@ -38,9 +38,8 @@ from pipeline.analysis.branches.codimension_two import BT, NEUTRAL, NONCENTRAL, 
 from pipeline.analysis.branches.equilibrium_curves import SINGULAR
 from pipeline.analysis.branches.following import leading_of, opposite
 from pipeline.analysis.branches.homoclinic import (
-    CUTS,
-    SETTINGS,
     HomoclinicProblem,
+    HomoclinicSettings,
     Loop,
     homoclinic_point,
     lay_nodes,
@@ -55,25 +54,6 @@ from pipeline.results.tolerances import BRANCH_RTOL
 HETEROCLINIC = "heteroclinic"
 """End of a curve of homoclinic orbits near another equilibrium."""
 
-AT_ONCE = 8
-"""Points that are followed before the nodes are laid anew."""
-
-VANISHED = 0.08
-"""A leading eigenvalue has vanished if it is below this share of its largest value on the curve."""
-
-RANGE, FITTED = 6.0, 7
-"""Range of the vanishing eigenvalue, as a factor, over which both parameters are fitted, and the number of points."""
-
-MEETS = 1e-3
-"""Distance from another equilibrium at which the orbit ends as heteroclinic, in units of the orbit's size."""
-
-SAMPLES = 8000
-"""Instants of a long cycle that is the first guess."""
-
-ANGLES, NARROWEST, LOOP = 36, 1e-6, 6.0
-"""Directions about a Bogdanov-Takens point that are tried, the width to which they are narrowed [rad], and half the
-length of a loop in units of its time 1/k.
-"""
 
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 """Intervals of both parameters."""
@@ -102,7 +82,7 @@ class Arm:
 
 
 def follow_homoclinic(
-    problem: HomoclinicProblem, start: Point, bounds: Bounds, settings: Settings = SETTINGS
+    problem: HomoclinicProblem, start: Point, bounds: Bounds, settings: HomoclinicSettings = HomoclinicSettings()
 ) -> Steps[Arm]:
     """Follow homoclinic orbits in the plane of two parameters in the direction of the tangent of a start.
 
@@ -116,14 +96,14 @@ def follow_homoclinic(
         watch = _Watch(problem, settings, bounds, arm)
         size = np.full(problem.size, max(1.0, problem.extent))
         size[-3:] = 1.0  # time and parameters
-        rest = replace(settings, first_step=step, max_points=AT_ONCE, size=size)
+        rest = replace(settings, first_step=step, max_points=settings.at_once, size=size)
         found = yield from trace(problem, here, rest, watch.stop, watch.between)
         if found.end != "max_points" or len(arm.points) >= settings.max_points:
             arm.end = found.end
             break
         before, here = found.points[-2:]
         step = float(np.linalg.norm(here.u - before.u))
-        if meets_another(loop_of(problem, here.u)):
+        if meets_another(loop_of(problem, here.u, settings)):
             arm.end = HETEROCLINIC
         elif (laid := (yield from _laid_anew(problem, here, settings))) is None:
             arm.end = "stuck"
@@ -135,10 +115,10 @@ def follow_homoclinic(
 
 
 def _laid_anew(
-    problem: HomoclinicProblem, here: Point, settings: Settings
+    problem: HomoclinicProblem, here: Point, settings: HomoclinicSettings
 ) -> Steps[tuple[HomoclinicProblem, Point] | None]:
     """Distribute the nodes of an orbit anew, and carry the curve's direction over to them."""
-    laid = lay_nodes(loop_of(problem, here.u), CUTS[0])
+    laid = lay_nodes(loop_of(problem, here.u, settings), settings.cuts[0], settings)
     if laid is None:
         return None
     fresh, u = laid
@@ -225,15 +205,18 @@ def _leading(point: Point) -> np.ndarray:
 
 def vanished(points: Sequence[Point]) -> str:
     """Return which leading eigenvalues have vanished at the end of a curve: the end's name, or an empty text."""
+    vanishes = 0.08  # a leading eigenvalue has vanished if it is below this share of its largest value on the curve
     rates = np.array([_leading(one) for one in points])
-    small = rates[-1] < VANISHED * rates.max(axis=0)
+    small = rates[-1] < vanishes * rates.max(axis=0)
     if small.all():
         return BT
-    return NONCENTRAL if small.any() and rates[-1].min() < VANISHED * rates[-1].max() else ""
+    return NONCENTRAL if small.any() and rates[-1].min() < vanishes * rates[-1].max() else ""
 
 
 def meets_another(loop: Loop) -> bool:
     """Return whether a homoclinic orbit comes near another equilibrium than its own."""
+    # distance from another equilibrium at which the orbit ends as heteroclinic, in units of the orbit's size
+    meets = 1e-3
     family, system = loop.family, loop.family.system
     scales = np.asarray(system.scales)
     packed = family.rows(family.unknowns(loop.saddle, loop.values)[None]).parameters[0]
@@ -245,14 +228,16 @@ def meets_another(loop: Loop) -> bool:
         return False
     found = find_equilibria(system, loop.states[slow], packed)
     gaps = np.linalg.norm(wrap_angles(loop.states[slow] - found.states, system) / scales, axis=1)
-    return bool((found.converged & (gaps < MEETS * away.max())).any())
+    return bool((found.converged & (gaps < meets * away.max())).any())
 
 
 def _carry_on(family: Family, arm: Arm) -> None:
     """Carry a curve on to where leading eigenvalues vanish, by polynomials of them through its last points."""
+    # range of the vanishing eigenvalue, as a factor, over which both parameters are fitted, and the number of points
+    reach, fitted = 6.0, 7
     rates = np.array([_leading(one) for one in arm.points])
     size = rates.mean(axis=1) if arm.end == BT else rates[:, rates[-1].argmin()]
-    wanted = size[-1] * np.geomspace(1.0, RANGE, FITTED)
+    wanted = size[-1] * np.geomspace(1.0, reach, fitted)
     chosen = np.unique([int(np.abs(size - one).argmin()) for one in wanted])[::-1]
     x, u = size[chosen], np.array([arm.points[k].u for k in chosen])
     last = _at_zero(x, u)
@@ -334,9 +319,10 @@ def _cycle(
     family: Family, start: np.ndarray, values: np.ndarray, seconds: float, saddle: np.ndarray, limit: np.ndarray
 ) -> Loop:
     """Return a cycle from where it is nearest to a saddle until it is there again."""
+    samples = 8000
     system = family.system
     packed = family.rows(family.unknowns(start, values)[None]).parameters
-    times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
+    times, drive = np.linspace(0.0, seconds, samples), Drive(np.array([seconds]))
     orbit = sample(system, packed, start[None], [times], drives=[drive], **tolerances_at(BRANCH_RTOL)).states[0]
     away = np.linalg.norm(wrap_angles(orbit - saddle, system) / np.asarray(system.scales), axis=1)
     first = int(away[:-1].argmin())
@@ -344,7 +330,9 @@ def _cycle(
     return Loop(family, times, states, saddle, limit)
 
 
-def homoclinic_curves(loops: Sequence[Loop], bounds: Bounds, settings: Settings = SETTINGS) -> list[HomoclinicCurve]:
+def homoclinic_curves(
+    loops: Sequence[Loop], bounds: Bounds, settings: HomoclinicSettings = HomoclinicSettings()
+) -> list[HomoclinicCurve]:
     """Follow homoclinic orbits in both directions in the plane of two parameters, no curve twice.
 
     Loops are approximate orbits, such as those of `loops_of`, or predictions from Bogdanov-Takens points. Curves whose
@@ -397,13 +385,14 @@ def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
     the critical eigenvalues at x_s and six sevenths of that at x_f add up to 0 (Melnikov's integral). None if no
     direction in the plane of the parameters fulfils the condition. Distances are in units of the parameters' scales.
     """
-    known = [(angle, _pair_at(takens, away, angle)) for angle in np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)]
+    angles, narrowest = 36, 1e-6  # directions that are tried, and the width to which they are narrowed [rad]
+    known = [(angle, _pair_at(takens, away, angle)) for angle in np.linspace(0.0, 2.0 * np.pi, angles + 1)]
     for one, other in pairwise(known):
         (inner, pair), (outer, beyond) = (one, other) if one[1] is not None else (other, one)
         if pair is None or (beyond is not None and pair.work * beyond.work > 0.0):
             continue
         # where the equilibria meet there is no pair; the work may change its sign just before
-        while abs(outer - inner) > NARROWEST:
+        while abs(outer - inner) > narrowest:
             middle = 0.5 * (inner + outer)
             found = _pair_at(takens, away, middle)
             if found is None or found.work * pair.work < 0.0:
@@ -428,10 +417,11 @@ class _Pair:
 
     def loop(self, family: Family) -> Loop:
         """Return the loop of the leading order about the focus."""
+        half, samples = 6.0, 2000  # length of the loop, in units of its time 1/k, and its instants
         rates = leading_of(np.linalg.eigvals(self.jacobian))
         k = 0.5 * float(np.sqrt(rates[0].real * -rates[1].real))
         along = self.focus - self.saddle
-        t = np.linspace(-LOOP / k, LOOP / k, SAMPLES // 4)
+        t = np.linspace(-half / k, half / k, samples)
         bow = 1.5 / np.cosh(k * t) ** 2
         states = self.saddle + bow[:, None] * along + (-2.0 * k * np.tanh(k * t) * bow)[:, None] * self.across
         scales = np.asarray(family.system.scales)

@@ -22,8 +22,6 @@ from pipeline.results.tolerances import SAME_ON_BRANCH
 GUESS = 0.05
 """Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""
 
-INEXACT = 1e-12
-"""Error of the residual of an orbit [scaled]."""
 
 AT_FOLD, NEAR_FOLD = 1e-9, 1e-3
 """Largest distances of an orbit from a fold, in the parameter and in the states [scaled], at which it is the fold's: it
@@ -89,8 +87,9 @@ def error_of(point: Point) -> float:
     Both vanish towards a bifurcation: at a distance x from the orbit as x^2 and 2 x near a fold, and as x^3 and 3 x^2
     where branches cross symmetrically, as those of twice the period at a doubling.
     """
+    inexact = 1e-12  # error of the residual of an orbit [scaled]
     least = float(np.linalg.svd(point.value.derivative[:, :-1], compute_uv=False)[-1])
-    residual = 3.0 * (point.residual + INEXACT)
+    residual = 3.0 * (point.residual + inexact)
     return float(residual / max(least, residual ** (2.0 / 3.0)))
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -35,27 +36,26 @@ from pipeline.analysis.branches.problems import Family
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.results.tolerances import BRANCH_RTOL
 
-NEAR = 0.05
-"""Largest distance of an equilibrium that is near to an orbit, in units of the orbit's size."""
 
-SAMPLES, GUESSES = 4000, 8
-"""Points on an orbit, and most of its slow places from which equilibria are looked for."""
+@dataclass(frozen=True)
+class LimitSettings:
+    """Numbers of the search for the equilibrium at the end of a branch, and of the fit of the law of its period."""
 
-SAME_FOLD = 1e-9
-"""Largest distance between the values of two folds of equilibria that happen at once, in units of the interval."""
+    near: float = 0.05  # largest distance of an equilibrium that is near to an orbit, in units of the orbit's size
+    samples: int = 4000  # points on the last orbit
+    # most slow places of the orbit from which equilibria are looked for; more find those that are hardly met
+    guesses: int = 8
+    # largest distance between the values of two folds of equilibria that happen at once, in units of the interval
+    same_fold: float = 1e-9
+    agrees: float = 0.05  # largest relative difference between the fitted and the computed slope of the period's law
+    # largest deviation of a period from its law, in units of the range of the fitted periods; more confirms laws nearer
+    # to the end of a branch, also false ones
+    fits: float = 0.003
+    # natural logarithms of the ranges of distances that are fitted, each with the least number of points. The first
+    # gives the numbers; the change from one to the other is part of their errors.
+    windows: tuple[tuple[float, int], ...] = ((3.0, 8), (4.5, 12))
+    least_range: float = 2.5  # least natural logarithm of the first range of distances, if it is to confirm a law
 
-AGREES = 0.05
-"""Largest relative difference between the fitted and the computed slope of the period's law."""
-
-FITS = 0.003
-"""Largest deviation of a period from its law, in units of the range of the fitted periods."""
-
-WINDOWS = ((3.0, 8), (4.5, 12))
-"""Natural logarithms of the ranges of distances that are fitted, each with the least number of points. The first gives
-the numbers; the change from one to the other is part of their errors."""
-
-LEAST_RANGE = 2.5
-"""Least natural logarithm of the first range of distances, if it is to confirm a law."""
 
 TOO_FAR = "the last points are too few, or too far from a limit, to confirm a law of the period"
 
@@ -82,49 +82,51 @@ def has_cycles(branch: Branch) -> bool:
     return bool(branch.family.period) and crossed_state(branch.family.system) is not None
 
 
-def limit_of(branch: Branch, points: Sequence[Point]) -> Limit | str:
+def limit_of(branch: Branch, points: Sequence[Point], settings: LimitSettings = LimitSettings()) -> Limit | str:
     """Find the equilibrium at which the cycles of a branch come to rest, and fit the law of their period.
 
     `points` are in order to the end. Returns the reason if neither law is confirmed.
     """
     family = branch.family
-    if len(points) < WINDOWS[-1][1]:
+    if len(points) < settings.windows[-1][1]:
         return TOO_FAR
-    states = last_orbit(family, points[-1])
-    places, eigenvalues = saddles_near(family, points[-1], states)
+    states = last_orbit(family, points[-1], settings)
+    places, eigenvalues = saddles_near(family, points[-1], states, settings)
     reason = "no equilibrium found at which the orbit comes to rest"
     if len(places) == 1:
-        found = _homoclinic(family, points, places[0], eigenvalues[0])
+        found = _homoclinic(family, points, places[0], eigenvalues[0], settings)
         if isinstance(found, Limit):
             return found
         reason = found
     elif len(places) > 1:
         reason = f"{len(places)} saddles are near"
-    fold = _snic(family, points, states)
+    fold = _snic(family, points, states, settings)
     return fold if fold is not None and (isinstance(fold, Limit) or not len(places)) else reason
 
 
-def last_orbit(family: Family, end: Point) -> np.ndarray:
+def last_orbit(family: Family, end: Point, settings: LimitSettings) -> np.ndarray:
     """Return states of a flow's last orbit on a branch, at equal intervals of time, shape (time, state)."""
     rows, seconds = family.rows(end.u[None]), end.value.seconds
-    times, drive = np.linspace(0.0, seconds, SAMPLES), Drive(np.array([seconds]))
+    times, drive = np.linspace(0.0, seconds, settings.samples), Drive(np.array([seconds]))
     packed = rows.parameters[:1]
     orbit = sample(family.system, packed, rows.states, [times], drives=[drive], **tolerances_at(BRANCH_RTOL))
     return np.asarray(orbit.states[0][np.isfinite(orbit.states[0]).all(axis=1)])
 
 
-def saddles_near(family: Family, end: Point, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def saddles_near(
+    family: Family, end: Point, states: np.ndarray, settings: LimitSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the saddles near an orbit, shape (saddle, state), and their eigenvalues by falling real part [1/s]."""
     system = family.system
     none = np.empty((0, system.n_states))
     if not len(states):
         return none, none
     packed, size = family.rows(end.u[None]).parameters[0], _size(family, states)
-    found = find_equilibria(system, states[_slow(family, packed, states)], packed)
+    found = find_equilibria(system, states[_slow(family, packed, states, settings)], packed)
     places, eigenvalues = none, none
     for place, own in zip(found.states[found.converged], found.eigenvalues[found.converged], strict=True):
-        is_near = scaled_distance(states, place, system).min() <= NEAR * size
-        is_known = bool((scaled_distance(places, place, system) < NEAR * size).any())
+        is_near = scaled_distance(states, place, system).min() <= settings.near * size
+        is_known = bool((scaled_distance(places, place, system) < settings.near * size).any())
         if is_near and not is_known and own.real.min() < 0.0 < own.real.max():
             places, eigenvalues = np.vstack([places, place]), np.vstack([eigenvalues, own])
     return places, eigenvalues
@@ -134,11 +136,11 @@ def _size(family: Family, states: np.ndarray) -> float:
     return float((np.ptp(states, axis=0) / np.asarray(family.system.scales)).max())
 
 
-def _slow(family: Family, packed: np.ndarray, states: np.ndarray) -> np.ndarray:
+def _slow(family: Family, packed: np.ndarray, states: np.ndarray, settings: LimitSettings) -> np.ndarray:
     """Return the indices of the slow places of an orbit, the slowest first."""
     speed = np.linalg.norm(rates_at(family.system, states, packed) / np.asarray(family.system.scales), axis=1)
     slow = np.flatnonzero((speed <= np.roll(speed, 1)) & (speed <= np.roll(speed, -1)))
-    return np.asarray(slow[np.argsort(speed[slow])][:GUESSES])
+    return np.asarray(slow[np.argsort(speed[slow])][: settings.guesses])
 
 
 # ---- the laws ----------------------------------------------------------------------------------
@@ -158,7 +160,11 @@ def root(d: np.ndarray) -> np.ndarray:
 
 
 def fit_law(
-    law: Law, values: np.ndarray, seconds: np.ndarray, floors: Sequence[float]
+    law: Law,
+    values: np.ndarray,
+    seconds: np.ndarray,
+    floors: Sequence[float],
+    settings: LimitSettings = LimitSettings(),
 ) -> tuple[float, float, float, float, float] | None:
     """Fit a law of the period to the last points of a branch.
 
@@ -171,22 +177,24 @@ def fit_law(
     seconds
         Periods, shape (point,) [s].
     floors
-        Least periods of the points that are fitted, one for each of `WINDOWS` [s].
+        Least periods of the points that are fitted, one for each of `settings.windows` [s].
+    settings
+        Numbers to choose.
 
     Returns
     -------
     tuple or None
         The limit of the parameter, its error, the slope, its error, and the largest deviation in units of the range of
         the periods; None if there are too few points, or their distances from the limit range over less than
-        `LEAST_RANGE`.
+        `settings.least_range`.
     """
     way = np.sign(values[-1] - values[-2])
     turns = np.flatnonzero(np.diff(values) * way <= 0.0)
     first = int(turns[-1]) + 1 if len(turns) else 0
-    if len(values) - first < WINDOWS[-1][1]:
+    if len(values) - first < settings.windows[-1][1]:
         return None
     fits, further = [], np.nan
-    for floor, (_, least) in zip(floors, WINDOWS, strict=True):
+    for floor, (_, least) in zip(floors, settings.windows, strict=True):
         chosen = seconds >= floor
         chosen[-least:] = True
         chosen[:first] = False
@@ -194,7 +202,7 @@ def fit_law(
         fits.append(_fit(law, away, seconds[chosen]))
         if len(fits) == 1:  # with the next order, of eigenvalues that vary with the parameter
             further = _fit(lambda d: np.vstack([law(d), d * np.log(d)]), away, seconds[chosen])[0]
-        if np.log1p(away.max() / fits[0][0]) < LEAST_RANGE:
+        if np.log1p(away.max() / fits[0][0]) < settings.least_range:
             return None
     (gap, gap_error, slope, slope_error, rest), (other_gap, _, other_slope, _, _) = fits
     error = float(np.linalg.norm([gap_error, gap - other_gap, gap - further]))
@@ -234,11 +242,15 @@ def _packed(family: Family, value: float) -> np.ndarray:
     return np.asarray(family.rows(unknowns[None]).parameters[0])
 
 
-def _homoclinic(family: Family, points: Sequence[Point], saddle: np.ndarray, eigenvalues: np.ndarray) -> Limit | str:
+def _homoclinic(
+    family: Family, points: Sequence[Point], saddle: np.ndarray, eigenvalues: np.ndarray, settings: LimitSettings
+) -> Limit | str:
     """Fit the law of the period near a saddle, given at the last point; return the reason if it fails."""
     values, seconds = _laid(points, family)
     rate = min(abs(v.real) for v in leading_of(eigenvalues))
-    fitted = fit_law(logarithm, values, seconds, [seconds[-1] - reach / rate for reach, _ in WINDOWS])
+    fitted = fit_law(
+        logarithm, values, seconds, [seconds[-1] - reach / rate for reach, _ in settings.windows], settings
+    )
     if fitted is None:
         return TOO_FAR
     value, error, slope, slope_error, rest = fitted
@@ -250,28 +262,30 @@ def _homoclinic(family: Family, points: Sequence[Point], saddle: np.ndarray, eig
     if slowest.imag:
         return "the period oscillates about its law near a saddle focus whose leading eigenvalues are complex"
     limit = Limit("homoclinic", value, error, at.states, own, slope, slope_error, 1.0 / abs(slowest.real))
-    return limit if (why := _contradiction(limit, rest)) == "" else why
+    return limit if (why := _contradiction(limit, rest, settings)) == "" else why
 
 
-def _contradiction(limit: Limit, rest: float) -> str:
+def _contradiction(limit: Limit, rest: float, settings: LimitSettings) -> str:
     """Return why a fitted law is not confirmed by the computed slope; an empty text if it is."""
     law = "-ln|p - p_h|" if limit.kind == "homoclinic" else "1/sqrt|p - p_h|"
-    if rest > FITS:
+    if rest > settings.fits:
         return f"the period does not follow {law}: it deviates by {rest:.1%} of its range"
-    if not abs(limit.slope / limit.expected - 1.0) <= AGREES:
+    if not abs(limit.slope / limit.expected - 1.0) <= settings.agrees:
         return f"the period's slope over {law} is {limit.slope:.4g}; from the equilibrium follows {limit.expected:.4g}"
     return ""
 
 
-def _snic(family: Family, points: Sequence[Point], states: np.ndarray) -> Limit | str | None:
+def _snic(family: Family, points: Sequence[Point], states: np.ndarray, settings: LimitSettings) -> Limit | str | None:
     """Fit the law of the period near saddle nodes on a circle. Return the reason if it fails, None without a fold."""
     values, seconds = _laid(points, family)
-    folds = _folds(family, values[-1], states)
+    folds = _folds(family, values[-1], states, settings)
     if not folds:
         return None
     state, value, error, _ = folds[0]
     expected = sum(slope for *_, slope in folds)
-    fitted = fit_law(root, values, seconds, [seconds[-1] * np.exp(-0.5 * reach) for reach, _ in WINDOWS])
+    fitted = fit_law(
+        root, values, seconds, [seconds[-1] * np.exp(-0.5 * reach) for reach, _ in settings.windows], settings
+    )
     if fitted is None:
         return TOO_FAR
     by_law, law_error, slope, slope_error, rest = fitted
@@ -279,9 +293,9 @@ def _snic(family: Family, points: Sequence[Point], states: np.ndarray) -> Limit 
     eigenvalues = eigenvalues[np.lexsort((eigenvalues.imag, -eigenvalues.real))]
     places = wrap_angles(np.array([place for place, *_ in folds]), family.system)
     limit = Limit("snic", value, error, places, eigenvalues, slope, slope_error, expected)
-    if why := _contradiction(limit, rest):
+    if why := _contradiction(limit, rest, settings):
         return why
-    if abs(by_law - value) > max(3.0 * law_error, AGREES * abs(values[-1] - value)):
+    if abs(by_law - value) > max(3.0 * law_error, settings.agrees * abs(values[-1] - value)):
         return f"the law of the period ends at {by_law:.7g}, and the fold of the equilibria is at {value:.7g}"
     return limit
 
@@ -291,23 +305,23 @@ Fold = tuple[np.ndarray, float, float, float]
 period over 1/sqrt(d) [s times the root of the parameter's unit], pi over the root of the normal form's coefficients."""
 
 
-def _folds(family: Family, value: float, states: np.ndarray) -> list[Fold]:
+def _folds(family: Family, value: float, states: np.ndarray, settings: LimitSettings) -> list[Fold]:
     """Find the folds of equilibria on an orbit, given at a parameter value: that at its slowest place, and those at
     other slow places that happen at the same value.
     """
     if not len(states):
         return []
     system, size, folds = family.system, _size(family, states), list[Fold]()
-    for place in _slow(family, _packed(family, value), states):
+    for place in _slow(family, _packed(family, value), states, settings):
         with np.errstate(all="ignore"):
             found = _fold(family, value, states[place])
-        is_near = found is not None and scaled_distance(states, found[0], system).min() <= NEAR * size
+        is_near = found is not None and scaled_distance(states, found[0], system).min() <= settings.near * size
         if found is None or not is_near:
             if not folds:
                 return []
             continue
-        is_known = any(scaled_distance(found[0], own, system) < NEAR * size for own, *_ in folds)
-        if not folds or (not is_known and abs(found[1] - folds[0][1]) <= SAME_FOLD * family.scales[0]):
+        is_known = any(scaled_distance(found[0], own, system) < settings.near * size for own, *_ in folds)
+        if not folds or (not is_known and abs(found[1] - folds[0][1]) <= settings.same_fold * family.scales[0]):
             folds.append(found)
     return folds
 
@@ -353,7 +367,7 @@ def _fold(family: Family, value: float, state: np.ndarray) -> Fold | None:
 # ---- ends within the interval ------------------------------------------------------------------
 
 
-def cut_ends(branches: Sequence[Branch]) -> list[str]:
+def cut_ends(branches: Sequence[Branch], settings: LimitSettings = LimitSettings()) -> list[str]:
     """Return text lines on the ends at which a branch was cut off: one that is stuck, with what was met there, one with
     too many points, and those at the bounds of the parameter, together.
     """
@@ -363,7 +377,7 @@ def cut_ends(branches: Sequence[Branch]) -> list[str]:
             points, why = towards(branch, which), branch.ends[which]
             at = f"{parameter_name(branch.family.free[0])} = {branch.family.values(points[-1].u)[0]:.7g}"
             if why == "stuck":
-                lines.append(f"branch {i} at {at}: {'; '.join(_met(branch, points))}")
+                lines.append(f"branch {i} at {at}: {'; '.join(_met(branch, points, settings))}")
             elif why == "max_points":
                 lines.append(f"branch {i} at {at}: {len(points)} points, no more are followed; see the rest by --start")
             elif why == "bound":
@@ -378,7 +392,7 @@ def _numbered(branches: Sequence[int]) -> str:
     return f"branch{'es' if len(counts) > 1 else ''} {', '.join(told)}"
 
 
-def _met(branch: Branch, points: Sequence[Point]) -> list[str]:
+def _met(branch: Branch, points: Sequence[Point], settings: LimitSettings) -> list[str]:
     """Describe the end of a branch whose last points are given, from within the branch to the end."""
     met = [_why(branch, points[-1])]
     if not has_cycles(branch):
@@ -387,7 +401,7 @@ def _met(branch: Branch, points: Sequence[Point]) -> list[str]:
     if grows:
         last = ", ".join(f"{p.value.seconds:.4g}" for p in points[-4:])
         met.append(f"the period grows faster and faster: {last} s, as if without bound")
-    saddles = _saddles(branch, points[-1])
+    saddles = _saddles(branch, points[-1], settings)
     met += [text for text, _ in saddles]
     if grows and not saddles:
         met.append("no saddle found near the last orbit")
@@ -395,7 +409,7 @@ def _met(branch: Branch, points: Sequence[Point]) -> list[str]:
         kind = "homoclinic" if len(saddles) == 1 else "heteroclinic"
         focus = " of a saddle focus (Shilnikov)" if any(is_focus for _, is_focus in saddles) else ""
         met.append(f"this suggests a {kind} bifurcation{focus}")
-    if grows and not isinstance(why := limit_of(branch, points), Limit):
+    if grows and not isinstance(why := limit_of(branch, points, settings), Limit):
         met.append(f"not decided: {why}")
     return met
 
@@ -411,11 +425,11 @@ def _why(branch: Branch, end: Point) -> str:
     )
 
 
-def _saddles(branch: Branch, end: Point) -> list[tuple[str, bool]]:
+def _saddles(branch: Branch, end: Point, settings: LimitSettings) -> list[tuple[str, bool]]:
     """Return a text on each saddle near the last orbit of a branch of a flow, and whether it is a saddle focus."""
-    system, states = branch.family.system, last_orbit(branch.family, end)
+    system, states = branch.family.system, last_orbit(branch.family, end, settings)
     texts = []
-    for place, values in zip(*saddles_near(branch.family, end, states), strict=True):
+    for place, values in zip(*saddles_near(branch.family, end, states, settings), strict=True):
         away = float(scaled_distance(states, place, system).min()) / _size(branch.family, states)
         is_focus = any(abs(v.imag) > 0.0 for v in leading_of(values))
         where = ", ".join(f"{name} {x + 0.0:.6g}" for name, x in zip(system.state_names, place.round(12), strict=True))

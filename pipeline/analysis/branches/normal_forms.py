@@ -29,7 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.engine.system import System
-from pipeline.analysis.branches.bifurcations import CONTRADICTORY, WIDTH, Bifurcation
+from pipeline.analysis.branches.arclength import Settings
+from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
 from pipeline.analysis.branches.center_manifold import Rest, lyapunov, normal_form, null_vectors, solved
 from pipeline.analysis.branches.critical_motion import Critical, mean_squares
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
@@ -178,7 +179,7 @@ def _tell_branch_point(one: Bifurcation, square: tuple[float, float], cubic: tup
     if not np.isfinite(square[0] + size):
         return
     # from where the point was located to where it is: two branches cross, so the residual grows as its square
-    away = max(WIDTH, float(np.sqrt(one.point.residual)))
+    away = max(Settings.bracket, float(np.sqrt(one.point.residual)))
     error = square[1] + 3.0 * float(np.nan_to_num(abs(cubic[0]))) * away
     if abs(square[0]) > max(SAME * size, 3.0 * error):
         one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square[0], error

@@ -12,6 +12,7 @@ from magpend_core.engine.system import System
 from pipeline.analysis.branches.asked import has_equilibria, start_problems
 from pipeline.analysis.branches.declaration import OrbitOptions
 from pipeline.analysis.branches.deflation import (
+    DeflationSettings,
     FoundOrbit,
     coverage,
     expected_index,
@@ -62,7 +63,7 @@ def orbits(run: OpenRun, options: OrbitOptions) -> xr.Dataset:
         frequency,
         packed,
         system,
-        rounds=options.rounds,
+        settings=DeflationSettings(rounds=options.rounds),
     )
     asked = None
     if options.start:

@@ -34,9 +34,6 @@ from pipeline.analysis.branches.starting_orbits import family_of, parameters_at,
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, grid_dim, parameter_units, split_dims
 
-STARTS = (100, 400)
-"""Starts per period: of the search, and of a second one where the sum of the indices shows that orbits are missing."""
-
 VERDICTS = ("agrees", "missing", "diverged", "unfinished", "flow")
 """Values of `index_verdict`: whether the indices add up as expected. There is nothing to expect if cells of the run
 diverged or did not finish, or for the return map of a flow, which need not be defined everywhere."""
@@ -60,13 +57,15 @@ class Place:
         """System of equations."""
         return self.family.system
 
-    def search(self, periods: np.ndarray) -> None:
-        """Search the orbits of some periods; with more starts if the sum of the indices shows that some are missing."""
-        for n_starts in STARTS:
-            starts = starts_around(self.seen, n_starts, 0, self.system, self.reach)
+    def search(self, periods: np.ndarray, n_starts: Sequence[int] = (100, 400)) -> None:
+        """Search the orbits of some periods, with the next number of starts if the sum of the indices shows that some
+        are missing.
+        """
+        for n in n_starts:
+            starts = starts_around(self.seen, n, 0, self.system, self.reach)
             found = search_orbits(
                 np.tile(starts, (len(periods), 1)),
-                np.repeat(periods, n_starts),
+                np.repeat(periods, n),
                 self.family.frequency_hz,
                 self.family.parameters,
                 self.system,

@@ -40,14 +40,6 @@ STEPS = 10.0 ** -np.arange(2.0, 6.5, 0.5)
 """Steps of central differences, in units of the scales. The one is taken at which the extrapolated difference changes
 least; the change is its error."""
 
-INNER = 1e-3
-"""Step of the differences by the continued parameter inside of the test function of a branch point."""
-
-NEWTON_STEPS, CLOSE, NEAR = 6, 1e-9, 1e-6
-"""Most steps of Newton's method, the step after which it ends, and the largest last one with which a point counts."""
-
-PERSISTS = 1e-5
-"""Largest part of a parameter's derivative of the equations of a branch point that no motion of the point balances."""
 
 KNOWN, BREAKS, FAILED = range(3)
 STATUSES = ("known", "breaks", "failed")
@@ -93,6 +85,7 @@ class Located:
 
     def equations(self, many: Array) -> Array:
         """Return G at m vectors of unknowns, (m, n_states + 1); of a branch point (m, n_states + 2)."""
+        inner = 1e-3  # step of the differences by the continued parameter inside of the test function of a branch point
         gaps, matrices = self.closure(many)
         if self.kind == HOPF:
             return np.column_stack([gaps, [_test(hopf_test, m) for m in matrices]])
@@ -102,10 +95,10 @@ class Located:
         right[:, -1, 0] = 1.0
         if self.kind in BRANCH_POINTS:
             step = np.zeros(many.shape[1])
-            step[self.n_states] = INNER
+            step[self.n_states] = inner
             around = np.concatenate([many + k * step for k in (-2, -1, 1, 2)])
             far, near, after, beyond = np.split(self.closure(around)[0], 4)
-            right[:, :-1, 1] = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * INNER)
+            right[:, :-1, 1] = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * inner)
         bordered = np.zeros((len(many), self.n_states + 1, self.n_states + 1))
         bordered[:, :-1, :-1] = [self.by_state(m) for m in matrices]
         bordered[:, :-1, -1], bordered[:, -1, :-1] = self.border
@@ -154,6 +147,8 @@ def sensitivity_of(located: Located) -> Sensitivity:
     located
         A bifurcation, near the solution of its equations.
     """
+    # largest part of a parameter's derivative of the equations of a branch point that no motion of the point balances
+    persists = 1e-5
     n, others = located.n_states, range(located.n_states + 1, len(located.u))
     found = _polished(located)
     if found is None:
@@ -165,7 +160,7 @@ def sensitivity_of(located: Located) -> Sensitivity:
     adjoint, moves = inverse[n], -inverse @ right
     error = np.abs(adjoint) @ (right_error + matrix_error @ np.abs(moves))
     left = np.abs(matrix @ moves + right).max(axis=0)
-    bound = PERSISTS * np.abs(right).max(axis=0) + 10.0 * (right_error + matrix_error @ np.abs(moves)).max(axis=0)
+    bound = persists * np.abs(right).max(axis=0) + 10.0 * (right_error + matrix_error @ np.abs(moves)).max(axis=0)
     status = np.where(np.isfinite(error), np.where(left > bound, BREAKS, KNOWN), FAILED).astype(np.int8)
     units = np.where(status == KNOWN, 1.0, np.nan) * found.family.scales[0] / np.array(found.family.scales[1:])
     return Sensitivity(float(found.family.values(found.u)[0]), -adjoint @ right * units, error * units, status)
@@ -173,8 +168,10 @@ def sensitivity_of(located: Located) -> Sensitivity:
 
 def _polished(located: Located) -> Located | None:
     """Refine a bifurcation by Newton's method; None if its steps do not become small."""
+    # most steps of Newton's method, the step after which it ends, and the largest last one with which a point counts
+    most_steps, close, near = 6, 1e-9, 1e-6
     n = located.n_states
-    for _ in range(NEWTON_STEPS):
+    for _ in range(most_steps):
         residual = located.equations(located.u[None])[0]
         matrix, _ = located.slopes(range(n + 1))
         if not (np.isfinite(residual).all() and np.isfinite(matrix).all()):
@@ -183,9 +180,9 @@ def _polished(located: Located) -> Located | None:
         u = located.u.copy()
         u[: n + 1] += step
         located = replace(located, u=u)
-        if np.abs(step).max() <= CLOSE:
+        if np.abs(step).max() <= close:
             break
-    return located if np.abs(step).max() <= NEAR else None
+    return located if np.abs(step).max() <= near else None
 
 
 def _moving(model: Model, first: str) -> list[str]:

@@ -17,17 +17,29 @@ from pipeline.results.tolerances import CONNECT_RTOL, SAME_CONNECTED
 
 Array = np.ndarray
 
-NEAR = 0.1
-"""Largest distance of an orbit from the step along the tangent, as a share of the step's length."""
 
-LONGEST = 0.1
-"""Longest step, in units of the states' scales and the axes' ranges."""
+@dataclass(frozen=True)
+class SheetSettings:
+    """Numbers of following orbits over a grid (`connecting`)."""
 
-WILDEST = 1e2
-"""Largest det(1 - M) of an orbit that is followed further: beyond, Newton's method needs ever shorter steps."""
+    # largest distance of an orbit from the step along the tangent, as a share of the step's length; more takes longer
+    # steps, and may link two sheets
+    near: float = 0.1
+    longest: float = 0.1  # longest step, in units of the states' scales and the axes' ranges
+    # largest det(1 - M) of an orbit that is followed further: beyond, Newton's method needs ever shorter steps
+    wildest: float = 1e2
+    most_rows: int = 8192  # trajectories in one call of the engine; more take more memory
+    # step at which following ends [ranges of the axis]; it is shorter where `least_steps` of them exceed the way
+    shortest: float = 2.0**-13
+    least_steps: int = 16
+    before_first: float = 1.0 / 64.0  # share of `shortest` that the first step may have: two orbits tell a fold
+    # a step is refused if it shrinks an orbit's distance from orbits of a part of its period to less than this share
+    collapsed: float = 0.2
+    halved: float = 0.2  # largest distance of the two halves of an orbit at a period doubling
+    agreed: float = 0.1  # largest difference between two estimates of where a fold is, as a share of its distance
+    together: int = 8  # Newton steps of all orbits on their way before others are sent; fewer follow fewer in vain
+    corrections: int = 6  # most Newton steps at one point
 
-MOST_ROWS = 8192
-"""Trajectories in one call of the engine, which bounds the memory."""
 
 UNTRIED, LINKED, ENDED, OPEN, BORDER, GOING = range(6)
 """States of the way from an orbit to the next point: `ENDED` at a fold or a doubling, `BORDER` of the grid."""
@@ -96,7 +108,8 @@ class Values(NamedTuple):
 class Orbits:
     """Orbits on a grid (`nodes`), the links between them, and the number of each orbit's component."""
 
-    def __init__(self, grid: Grid, place: Array, orbits: list[Array]) -> None:
+    def __init__(self, grid: Grid, place: Array, orbits: list[Array], settings: SheetSettings) -> None:
+        self.settings = settings
         self.grid, self.geometry = grid, Geometry.of(grid.system)
         self.scales = np.asarray(grid.system.scales)
         n, n_axes, longest = grid.system.n_states, len(grid.axes), max(map(len, orbits))
@@ -136,7 +149,7 @@ class Orbits:
         last, derivatives = np.empty((len(states), n)), np.empty((len(states), n, n))
         images = np.full((m, int(period.max(initial=1)), n), np.nan)
         order = np.argsort(-periods, kind="stable")
-        for rows in np.split(order, range(MOST_ROWS, len(order), MOST_ROWS)):
+        for rows in np.split(order, range(self.settings.most_rows, len(order), self.settings.most_rows)):
             ends = section_map(
                 packed[rows], frequency[rows], states[rows], periods[rows], rtol=CONNECT_RTOL, system=self.grid.system
             )
@@ -184,7 +197,7 @@ class Orbits:
     def _mark_borders(self, own: Array) -> None:
         """Mark the ways of new orbits: an orbit that is very unstable, or at a bifurcation, is not followed."""
         nodes = self.nodes[own]
-        can_follow = np.isfinite(nodes["slopes"]).all(axis=(1, 2)) & (np.abs(nodes["det"]) <= WILDEST)
+        can_follow = np.isfinite(nodes["slopes"]).all(axis=(1, 2)) & (np.abs(nodes["det"]) <= self.settings.wildest)
         for axis in range(len(self.grid.axes)):
             for side, way in enumerate((1, -1)):
                 beyond = self.grid.neighbour(nodes["place"], axis, way) < 0
@@ -236,7 +249,7 @@ class Orbits:
             move = self.nodes["slopes"][one, axis] * step[:, None]
             away, phase = self._nearest(self.nodes["points"][one, 0] + move, other)
             length = np.hypot(np.linalg.norm(move, axis=1), step)
-            good &= (length <= LONGEST) & (away <= NEAR * length)
+            good &= (length <= self.settings.longest) & (away <= self.settings.near * length)
             phases += phase
         return np.asarray(good & (phases % self.nodes["period"][a] == 0))
 

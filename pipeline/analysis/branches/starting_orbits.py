@@ -20,9 +20,6 @@ from pipeline.results.ragged import points_of_rows
 from pipeline.results.tabular import sets_of
 from pipeline.results.tolerances import RECURRENCE
 
-TRIES = 16
-"""Most recurrences tried per period."""
-
 
 @dataclass(frozen=True)
 class Listed:
@@ -234,9 +231,10 @@ def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
     """Choose section points to which a trajectory returns most closely, all more than `RECURRENCE` apart."""
+    tries = 16  # most recurrences tried per period
     chosen: list[np.ndarray] = []
     for place in places:
-        if len(chosen) == TRIES or not distance[place] <= RECURRENCE:
+        if len(chosen) == tries or not distance[place] <= RECURRENCE:
             break
         point = section[place]
         if all(scaled_distance(point, other, system) > RECURRENCE for other in chosen):

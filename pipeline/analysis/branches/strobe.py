@@ -16,14 +16,8 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.results.tolerances import BRANCH_RTOL
 
-SHARES = (1e-5, 1e-4, 1e-3, 1e-2)
-"""Distances in time of the states from the section, in drive periods, tried in turn: the impact lies nearer to it."""
-
 EXTRAPOLATES = np.array([4.0, -6.0, 4.0, -1.0])
 """Weights of the states at 1, 2, 3 and 4 distances in the cubic through them at distance 0."""
-
-JUMP, UNSURE = 1e-4, 0.1
-"""Least scaled jump that is an impact, and the largest error of the extrapolated state in units of the jump."""
 
 
 def other_side(
@@ -45,10 +39,14 @@ def other_side(
     period
         Period of the orbit [drive periods].
     """
+    # distances in time of the states from the section, in drive periods, tried in turn: the impact lies nearer to it
+    shares = (1e-5, 1e-4, 1e-3, 1e-2)
+    # least scaled jump that is an impact, and the largest error of the extrapolated state in units of the jump
+    least_jump, unsure = 1e-4, 0.1
     if not system.n_impacts or system.is_map or crossed_state(system) is not None:
         return None
     drive = Drive(np.full(period, 1.0 / frequency_hz))
-    for share in SHARES:
+    for share in shares:
         after = share / frequency_hz * np.arange(1.0, 5.0)
         times = np.concatenate([after, period / frequency_hz - after[::-1]])
         orbit = sample(system, packed[None], state[None], [times], drives=[drive], rtol=BRANCH_RTOL, atol=BRANCH_RTOL)
@@ -57,6 +55,6 @@ def other_side(
         for near in (orbit.states[0][:4], orbit.states[0][:3:-1]):
             found = EXTRAPOLATES @ near
             jump = scaled_distance(found, state, system)
-            if jump > JUMP and scaled_distance(found, 2.0 * near[0] - near[1], system) < UNSURE * jump:
+            if jump > least_jump and scaled_distance(found, 2.0 * near[0] - near[1], system) < unsure * jump:
                 return wrap_angles(found, system)
     return None

@@ -39,26 +39,25 @@ from pipeline.results.tabular import Words, aligned, counted, number
 from pipeline.results.tolerances import BRANCH_RTOL
 from pipeline.specification.problems import SpecError
 
-BISECTIONS = 26
-"""Most halvings of an interval of the parameter in which a fraction is passed between two cells."""
 
-N_TRANSIENT = 300
-"""Drive periods for which a trajectory settles after each halving."""
+@dataclass(frozen=True)
+class TongueSettings:
+    """Numbers of the search for locked orbits between cells."""
 
-RECURRENCES = 8
-"""Periods q among which the closest return of a trajectory is sought, as a first guess of the orbit."""
+    # most halvings of an interval of the parameter in which a fraction is passed between two cells; more find thinner
+    # tongues
+    bisections: int = 26
+    # drive periods for which a trajectory settles after each halving; more find tongues of weakly attracting orbits,
+    # and take longer
+    n_transient: int = 300
+    # periods q among which the closest return of a trajectory is sought, as a first guess of the orbit
+    recurrences: int = 8
+    tolerance: float = 1e-9  # of the integrations for the search; Newton's method has its own
+    locked: float = 1e-6  # largest distance of a closed cell's rotation number from a fraction that counts as equal
 
-TOLERANCE = 1e-9
-"""Tolerance of the integrations for the search; Newton's method has its own."""
-
-LOCKED = 1e-6
-"""Largest distance of a closed cell's rotation number from a fraction that counts as equal."""
 
 IN_TONGUE = Settings(longest_step=0.05)
 """Settings with long steps: of the orbits in a tongue only the folds are wanted."""
-
-ACCURACY = 10.0 * BRANCH_RTOL
-"""Least error of a fold, in units of the interval of the parameter: that of the integrations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +77,7 @@ class Search:
     family: Family
     turning: TurningState
     n_periods: int
+    settings: TongueSettings = TongueSettings()
 
     @property
     def system(self) -> System:
@@ -95,7 +95,7 @@ class Search:
             turning=self.turning,
             n_periods=self.n_periods,
             orbit_period=closed,
-            **tolerances_at(TOLERANCE),
+            **tolerances_at(self.settings.tolerance),
         )
         return np.asarray(np.where(found.error <= CLOSED_TURNS, found.rotation, np.nan))
 
@@ -108,7 +108,7 @@ class Search:
             rows.states,
             n_transient=n_transient,
             n_keep=n_keep,
-            **limits_at(TOLERANCE),
+            **limits_at(self.settings.tolerance),
             system=self.system,
         )
         return np.asarray(found.section[:, 0])
@@ -143,7 +143,7 @@ def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start |
 
 def _of_cells(row: Row, search: Search, fraction: Fraction) -> Start | None:
     """Return the periodic orbit of least period among the cells with a rotation number; None if there is none."""
-    has = (row.orbit_period > 0) & (np.abs(row.rotation - float(fraction)) < LOCKED)
+    has = (row.orbit_period > 0) & (np.abs(row.rotation - float(fraction)) < search.settings.locked)
     if not has.any():
         return None
     period = int(row.orbit_period[has].min())
@@ -172,20 +172,20 @@ def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int
     ends = np.array([[row.values[i], row.values[i + 1]] for i, _ in gaps.values()])
     rising = np.array([row.rotation[i, j] < row.rotation[i + 1, j] for i, j in gaps.values()])
     states = np.array([row.section[i, j] for i, j in gaps.values()])
-    for _ in range(BISECTIONS):
+    for _ in range(search.settings.bisections):
         middle = ends.mean(axis=1)
-        reached = search.sections(middle, states, N_TRANSIENT, 1)[:, -1]
+        reached = search.sections(middle, states, search.settings.n_transient, 1)[:, -1]
         states = np.where(np.isfinite(reached).all(axis=1)[:, None], reached, states)
         off = search.rotation(middle, states) - targets
         is_low = (off < 0.0) == rising
-        is_done = ~(np.abs(off) > LOCKED)  # NaN: nothing more can be learnt there
+        is_done = ~(np.abs(off) > search.settings.locked)  # NaN: nothing more can be learnt there
         ends = np.where(is_done[:, None], np.stack([middle, middle], axis=1), ends)
         ends[is_low & ~is_done, 0] = middle[is_low & ~is_done]
         ends[~is_low & ~is_done, 1] = middle[~is_low & ~is_done]
         if is_done.all():
             break
     longest = max(f.denominator for f in gaps)
-    sections = search.sections(ends.mean(axis=1), states, 0, (RECURRENCES + 1) * longest)
+    sections = search.sections(ends.mean(axis=1), states, 0, (search.settings.recurrences + 1) * longest)
     return {
         f: _closest_return(replace(search.family, period=f.denominator), points, float(value))
         for f, points, value in zip(gaps, sections, ends.mean(axis=1), strict=True)
@@ -216,7 +216,7 @@ def fraction_of(branch: Branch, search: Search) -> Fraction | None:
     values, states = family.values(first.u), family.state(first.u)[None]
     closed = None if search.turning.of_section else np.array([family.period])
     whole = float(search.rotation(values, states, closed)[0]) * family.period
-    return Fraction(round(whole), family.period) if abs(whole - np.round(whole)) < LOCKED else None
+    return Fraction(round(whole), family.period) if abs(whole - np.round(whole)) < search.settings.locked else None
 
 
 def needs_rotation(run: OpenRun, options: TongueOptions) -> None:
@@ -239,6 +239,8 @@ def settle_tongues(run: OpenRun, options: TongueOptions) -> TongueOptions:
 
 def tongues(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     """Find orbits with rotation numbers p/q along a row of cells, and continue their folds in the parameter plane."""
+    # least error of a fold, in units of the interval of the parameter: that of the integrations
+    error = 10.0 * BRANCH_RTOL
     point, base = _row_of(run, options), parameters_of(run.cube())
     first, second = axis_name(options.parameter), axis_name(options.second)
     assert options.low is not None
@@ -255,7 +257,7 @@ def tongues(run: OpenRun, options: TongueOptions) -> xr.Dataset:
     branches = explore(list(found.values()), Scope(options.low, options.high, longest, 0, IN_TONGUE))
     numbers = [fraction_of(branch, search) for branch in branches]
     located = dataset_of(branches, first, base)
-    on_row = _on_row(list(starts), numbers, located, ACCURACY * (options.high - options.low))
+    on_row = _on_row(list(starts), numbers, located, error * (options.high - options.low))
     folds = located.isel(bifurcation=[k for tongue in on_row for k in tongue.folds])
     bounds = ((options.low, options.high), (options.second_low, options.second_high))
     edges = curves_from(folds, base, second, bounds, longest, generations=0) if branches else []

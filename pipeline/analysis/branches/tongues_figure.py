@@ -25,15 +25,6 @@ from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.products.product import FigureOptions
 from pipeline.results.run import OpenRun
 
-NAMED = 5
-"""Largest denominator of the steps p/q that a staircase names."""
-
-LEAST_STEP = 0.01
-"""Least length of a step that is named, in units of the axis."""
-
-CLOSE = 1e-6
-"""Largest distance of the rotation number of a closed orbit from p/q."""
-
 UNKNOWN = "0.8"
 
 _NAME: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom"}
@@ -46,7 +37,7 @@ def plot_rotation(
     """Draw the rotation numbers of a run's cells over one swept parameter, or in the plane of two.
 
     Over one parameter every cell has a dot, blue where it is locked to the drive (closed), and steps p/q with
-    denominators up to `NAMED` have their names. Over two the colour is the median over the cells of a point; points at
+    denominators up to 5 have their names. Over two the colour is the median over the cells of a point; points at
     which all cells are locked have white dots. The figure's `data` hold ``rotation`` and ``locked``, the share of the
     cells that are. Raise ValueError if there are no rotation numbers, or more than two swept parameters are left.
     """
@@ -110,14 +101,17 @@ def _draw_staircase(fig: style.DataFigure, ax: Axes, data: xr.Dataset, axis: xr.
 
 def _steps(x: np.ndarray, rotation: np.ndarray, axis: xr.DataArray) -> dict[Fraction, tuple[float, float]]:
     """Return the parameter interval of each step p/q of a devil's staircase; short steps are left out."""
+    # largest denominator of the steps p/q that are named, the least length of such a step in units of the axis, and the
+    # largest distance of the rotation number of a closed orbit from p/q
+    named, least_step, close = 5, 0.01, 1e-6
     whole = float(axis.max() - axis.min())
     found = {}
     for value in np.unique(np.round(rotation, 9)):
-        fraction = Fraction(float(value)).limit_denominator(NAMED)
-        if abs(float(fraction) - value) > CLOSE:
+        fraction = Fraction(float(value)).limit_denominator(named)
+        if abs(float(fraction) - value) > close:
             continue
-        here = x[np.abs(rotation - value) < CLOSE]
-        if here.max() - here.min() >= LEAST_STEP * whole:
+        here = x[np.abs(rotation - value) < close]
+        if here.max() - here.min() >= least_step * whole:
             found[fraction] = (float(here.min()), float(here.max()))
     return found
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.deflation import search_orbits, starts_around
+from pipeline.analysis.branches.deflation import DeflationSettings, search_orbits, starts_around
 from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.connections import connection_of
 from pipeline.analysis.events.contact import (
@@ -259,7 +259,12 @@ class Crises:
                     starts.append(line.points[node, :1])
                     asked = np.append(asked, line.period)
         found = search_orbits(
-            np.concatenate(starts), asked, float(rows.frequency_hz[0]), rows.parameters[0], system, rounds=effort.rounds
+            np.concatenate(starts),
+            asked,
+            float(rows.frequency_hz[0]),
+            rows.parameters[0],
+            system,
+            settings=DeflationSettings(rounds=effort.rounds),
         )
         saddles = [along.saddle(seen, one.points[0], one.period) for one in found]
         return [one for one in saddles if one is not None]

@@ -11,7 +11,7 @@ import xarray as xr
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
-from pipeline.analysis.branches.exploring import BESIDE
+from pipeline.analysis.branches.exploring import POINTS_BESIDE
 from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LIMITS, PITCHFORK, TRANSCRITICAL
 from pipeline.analysis.branches.known import GUESS, NEAR_FOLD, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
@@ -259,7 +259,7 @@ def crossing_at(ds: xr.Dataset, lines: Sequence[Line], k: int) -> str:
     for branch in (int(ds[name].values[k]) for name in ("of_branch", "to_branch")):
         for line in lines:
             for node in np.flatnonzero(line.bifurcation == k).tolist() if line.branch == branch else ():
-                before, after = max(node - BESIDE, 0), min(node + BESIDE, len(line.value) - 1)
+                before, after = max(node - POINTS_BESIDE, 0), min(node + POINTS_BESIDE, len(line.value) - 1)
                 if before < node < after:
                     turning.append(bool(np.prod(line.value[[before, after]] - line.value[node]) > 0.0))
     kind = KINDS[int(ds["kind"].values[k])]

@@ -27,7 +27,7 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct
 from pipeline.analysis.attractors.finding.equilibria import equilibria_near
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
-from pipeline.analysis.branches.deflation import search_orbits
+from pipeline.analysis.branches.deflation import DeflationSettings, search_orbits
 from pipeline.analysis.flown import flown
 from pipeline.analysis.resilience.declaration import EdgeOptions
 from pipeline.products.reporting import report
@@ -286,7 +286,12 @@ def orbits_on(
     starts = [_starts(paths, period, there) for period in range(1, max_period + 1)]
     periods = np.repeat(np.arange(1, max_period + 1), [len(own) for own in starts])
     found = search_orbits(
-        np.concatenate(starts), periods, point.frequency, point.packed, point.integrates, rounds=ROUNDS
+        np.concatenate(starts),
+        periods,
+        point.frequency,
+        point.packed,
+        point.integrates,
+        settings=DeflationSettings(rounds=ROUNDS),
     )
     polished = there.polished(
         np.array([one.points[0] for one in found]).reshape(len(found), point.n_states),

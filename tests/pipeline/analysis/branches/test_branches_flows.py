@@ -16,7 +16,7 @@ from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.figure import plot_branches
 from pipeline.analysis.branches.known import Start
-from pipeline.analysis.branches.limits import FITS, fit_law, grows_without_bound, logarithm, root
+from pipeline.analysis.branches.limits import LimitSettings, fit_law, grows_without_bound, logarithm, root
 from pipeline.analysis.branches.starting_orbits import family_of
 from tests.core.cells import scipy_end
 from tests.core.flows import BAUTIN, HOPF, LORENZ, PAIR, ROSSLER, flow, table
@@ -321,7 +321,7 @@ def test_fit_law__tells_the_laws_apart(period, follows_logarithm, follows_root):
         (root, follows_root, seconds[-1] * np.exp([-1.5, -2.25])),
     ):
         value, error, slope, _, rest = fit_law(law, 0.7 + away, seconds, reach)
-        assert (rest < FITS) == follows
+        assert (rest < LimitSettings.fits) == follows
         if follows:
             assert value == pytest.approx(0.7, abs=1e-9)
             assert error < 1e-9

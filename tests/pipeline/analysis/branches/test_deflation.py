@@ -6,6 +6,7 @@ import pytest
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from pipeline.analysis.branches.deflation import (
+    DeflationSettings,
     FoundOrbit,
     coverage,
     expected_index,
@@ -28,7 +29,7 @@ def found_of(rounds, n=600, longest=2):
     starts = np.random.default_rng(1).uniform(-1.5, 1.5, (n, 2))
     periods = np.arange(1, longest + 1)
     starts, periods = np.tile(starts, (longest, 1)), np.repeat(periods, n)
-    return search_orbits(starts, periods, FREQUENCY, packed, DUFFING.system, rounds=rounds)
+    return search_orbits(starts, periods, FREQUENCY, packed, DUFFING.system, settings=DeflationSettings(rounds=rounds))
 
 
 @pytest.fixture(scope="module")
@@ -75,12 +76,16 @@ def test_search_orbits__an_equilibrium_on_the_section_is_none():
     parameters = seen(HOPF, "y")
     starts = np.array([[0.45, 0.0], [0.02, 0.0], [-0.03, 0.0], [0.55, 0.0]])
     one = np.ones(len(starts), int)
-    (cycle,) = search_orbits(starts, one, 1.0 / 50.0, parameters.pack(), parameters.model.system, rounds=2)
+    (cycle,) = search_orbits(
+        starts, one, 1.0 / 50.0, parameters.pack(), parameters.model.system, settings=DeflationSettings(rounds=2)
+    )
     np.testing.assert_allclose(cycle.points, [[0.5, 0.0]], atol=1e-9)
     assert cycle.seconds == pytest.approx(np.pi, rel=1e-9)
     # a circle of radius .01 about a rest that is hardly unstable is one, too
     parameters = seen(HOPF, "y", mu=1e-4)
-    (cycle,) = search_orbits(0.02 * starts, one, 1.0 / 50.0, parameters.pack(), parameters.model.system, rounds=0)
+    (cycle,) = search_orbits(
+        0.02 * starts, one, 1.0 / 50.0, parameters.pack(), parameters.model.system, settings=DeflationSettings(rounds=0)
+    )
     np.testing.assert_allclose(cycle.points, [[1e-2, 0.0]], atol=1e-6)
 
 

@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import fsolve
 
 import magpend
-from pipeline.analysis.branches import searching
 from pipeline.analysis.branches.analysis import branches_table, cut_of, isolas_of
 from pipeline.analysis.branches.exploring import Scope, explore
 from pipeline.analysis.branches.kinds import KINDS, PITCHFORK
@@ -172,14 +171,13 @@ def test_fold_curve__holds_the_isola_from_its_birth_on(run):
 
 
 @pytest.mark.slow
-def test_deflation__needs_fewer_starts(run, monkeypatch):
+def test_deflation__needs_fewer_starts(run):
     """Sixteen starts find all three orbits at each value, and do not without deflation."""
     cube = run.cube()
     base, ends = parameters_of(cube), (0.1440, 0.1520)
-    monkeypatch.setattr(searching, "STARTS", (16,))
     whole = places_of(cube, base, "frequency", ends, 4)
     for place in whole:
-        place.search(np.array([1]))
+        place.search(np.array([1]), (16,))
     assert [len(place.found) for place in whole] == [3, 3, 3, 3]
     # branches that pass a value bring the same orbits
     scope = Scope(*ends, max_period=1, max_generations=0)
