@@ -35,6 +35,9 @@ If the rates solve an implicit equation by a fixed number of iterations, the Jac
 where the iterations converge slowly.
 """
 
+SATURATED = 1e100
+"""Rates from which derivatives are not compared: exponentials are cut off there, and their differences are 0."""
+
 TWICE = 2
 """An error is reported if it occurs at this many samples; a single sample may lie within a layer."""
 
@@ -427,7 +430,8 @@ class _Motion:
         if flat is None:
             return
         given = whole_jacobian(self.system, np.array(flat).T).transpose(1, 2, 0)
-        size = np.abs(rates[:, np.isfinite(rates).all(axis=0)]).max(axis=1)
+        known = (np.abs(rates) < SATURATED).all(axis=0)
+        size = np.abs(rates[:, known]).max(axis=1, initial=0.0)
         for j in range(n):
             step = STEP * self.scales[j]
             coarse, fine = self._slopes(j, step), self._slopes(j, 0.5 * step)
@@ -435,7 +439,7 @@ class _Motion:
             rounding = 1e-14 * size[:, None] / step
             own_error = 10.0 * (np.abs(fine - coarse) + rounding) + 1e-8 * size[:, None] / self.scales[j]
             allowed = LEAST_MISTAKE * (np.abs(given[:, j]) + np.abs(slopes)) + own_error
-            wrong = np.abs(given[:, j] - slopes) > allowed
+            wrong = known & (np.abs(given[:, j] - slopes) > allowed)
             for i in np.flatnonzero(wrong.sum(axis=1) >= TWICE):
                 k = int(np.flatnonzero(wrong[i])[0])
                 self.functions.problems.append(

@@ -17,7 +17,7 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import TWO_PI, sincos
 from magpend_core.models import load_model, model_names
-from tests.core.flows import table
+from tests.core.flows import model_of, table
 
 FREQUENCY = 0.16
 DUFFING = [0.15, -1.0, 1.0, 0.2]
@@ -133,6 +133,13 @@ def test_check_system__jacobian_is_held_against_differences_at_the_doors(broken,
     arguments = np.array([DUFFING]), np.array([FREQUENCY]), np.array([[0.3, 0.2]])
     with pytest.raises(SystemCheckError, match="entry 2"):
         door(*arguments, system)
+
+
+def test_check_system__jacobian_is_not_compared_where_exponentials_are_cut_off():
+    """States sampled 10,000 beside a start at 14,000: exp(x - 14000) is cut off there, and its differences are 0."""
+    model = model_of({"x": "v", "v": "1 - exp(x - 14000) - d*v"}, {"d": 0.2})
+    system = dataclasses.replace(model.system, units=(1e4, 100.0))
+    assert found(system, [0.2], 1.0, ((14000.0, 0.0),), tangents=True) == []
 
 
 @inline
