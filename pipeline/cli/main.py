@@ -18,22 +18,18 @@ from pipeline.cli.analyse import analyse_app
 from pipeline.cli.animate import animate
 from pipeline.cli.common import CommandError
 from pipeline.cli.console import EnoughError, Exit, visible
-from pipeline.cli.explore import explore, export
 from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup, add_command
-from pipeline.cli.identify import identify_app
-from pipeline.cli.magnet import fit_magnet
-from pipeline.cli.measured import measured_app
 from pipeline.cli.model import model_app
 from pipeline.cli.models import models, presets
 from pipeline.cli.options import drawing
 from pipeline.cli.plot import plot_app
-from pipeline.cli.recordings import recordings_app
 from pipeline.cli.report import report
 from pipeline.cli.reproduce import reproduce
 from pipeline.cli.running import run, status, submit, verify
 from pipeline.cli.simulate import EXTRA, simulate
 from pipeline.cli.zoom import zoom
+from pipeline.products.plugins import added
 
 MOST_SAID, MOST_LINE = 2000, 600
 """Most bytes of a message, and most characters of one of its lines."""
@@ -78,22 +74,21 @@ for _command in (
     extend,
     zoom,
     drawing(simulate),
-    explore,
-    export,
     animate,
     report,
     reproduce,
     models,
     presets,
-    drawing(fit_magnet),
 ):
     add_command(app, _command, settings=EXTRA if _command.__name__ in _ANY_OPTION else {})
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
 app.add_typer(model_app, name="model")
-app.add_typer(measured_app, name="measured")
-app.add_typer(recordings_app, name="recordings")
-app.add_typer(identify_app, name="identify")
+for _name, _added in added("commands").items():
+    if isinstance(_added, typer.Typer):
+        app.add_typer(_added, name=_name)
+    else:
+        add_command(app, _added, _name)
 
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:

@@ -37,7 +37,10 @@ def rendered(text: str) -> str:
     KeyError
         If a mark names a table that does not exist.
     """
-    return _BLOCK.sub(lambda block: f"{block[1]}{TABLES[block[2]]()}\n{block[3]}", text)
+    from pipeline.products.plugins import added
+
+    tables = TABLES | added("tables")
+    return _BLOCK.sub(lambda block: f"{block[1]}{tables[block[2]]()}\n{block[3]}", text)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -226,24 +229,7 @@ def specification() -> str:
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
     ]
-    return "\n\n".join(_keys(*part) for part in parts)
-
-
-def identification() -> str:
-    """Return Markdown tables of the keys of the TOML file that describes an identification."""
-    from pipeline.rig.identify import specification as tables
-    from pipeline.rig.identify.specification import BifurcationTable, Identified, OrbitsTable
-
-    parts = [
-        ("[identify] NAME = {...}", Identified, "NAME is a parameter of the model."),
-        ("[sensors]", tables.SensorsTable, ""),
-        ("[[recordings]]", tables.RecordingTable, ""),
-        ("[[orbits]]", OrbitsTable, "Measured orbits of one branch."),
-        ("[[orbits.bifurcations]]", BifurcationTable, ""),
-        ("[fit]", tables.FitTable, ""),
-        ("[search]", tables.SearchTable, ""),
-    ]
-    return "\n\n".join(_keys(*part) for part in parts)
+    return "\n\n".join(keys(*part) for part in parts)
 
 
 _STATES = (
@@ -257,70 +243,33 @@ def products() -> str:
     from pipeline.products.registry import CELL_PRODUCTS
 
     return "\n\n".join(
-        _keys(f"[products] {name} = {{...}}", product.options, product.help) for name, product in CELL_PRODUCTS.items()
+        keys(f"[products] {name} = {{...}}", product.options, product.help) for name, product in CELL_PRODUCTS.items()
     )
-
-
-def mapping() -> str:
-    """Return Markdown tables of the keys of the file that describes a recording's channels."""
-    from pipeline.rig.recordings import mapping as found
-
-    top = ("csv", "channels", "drive")
-    parts = [
-        _keys("MAPPING.toml", found.Mapping, "", top),
-        _keys("time = {...}", found.TimeMap, "", ()),
-        _keys("piece = {...}", found.PieceMap, "", ()),
-        _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model, or a quantity.", ()),
-        _keys("[drive]", found.DriveMap, 'Or `drive = "none"`.', ()),
-        _keys("[csv]", found.CsvMap, "For CSV files only; missing keys are detected from the file.", ()),
-    ]
-    return "\n\n".join(parts)
-
-
-def findings() -> str:
-    """Return the Markdown table of the defects that are searched for in recordings."""
-    from pipeline.rig.recordings.channels import KINDS
-
-    return table(("finding", "meaning"), ((f"`{kind}`", meaning) for kind, meaning in KINDS.items()))
-
-
-def virtual_rig() -> str:
-    """Return Markdown tables of the keys of the TOML file that describes a virtual experiment."""
-    from pipeline.rig import virtual
-
-    parts = [
-        _keys("RIG.toml", virtual.RigTable, "", ("drive", "sensors")),
-        _keys("[drive]", virtual.DriveTable, 'Or `drive = "none"`.', ()),
-        _keys("sweep = {...}", virtual.SweepTable, "In `[drive]`.", ()),
-        _keys("[sensors.STATE]", virtual.SensorTable, "", ()),
-    ]
-    return "\n\n".join(parts)
 
 
 def study() -> str:
     """Return Markdown tables of the keys of the TOML file that describes a study (figures and claims of a paper)."""
     from pipeline.report import study as tables
 
+    pictures = "; ".join(f"`{name}`, {kind.meaning}" for name, kind in tables.kinds().items())
     parts = [
-        _keys("STUDY.toml", tables.StudyTable, "", ("runs", "recordings", "torques", "figures")),
-        _keys("[runs.NAME]", tables.RunTable, "", ()),
-        _keys("[recordings.NAME]", tables.RecordingTable, "", ()),
-        _keys("[torques.NAME]", tables.TorqueTable, "", ()),
-        _keys("[[figures]]", tables.FigureTable, "", ("pictures", "claims")),
-        _keys("[[figures.pictures]]", tables.PictureTable, "", ()),
-        _keys("[[figures.claims]]", tables.ClaimTable, "", ()),
+        keys("STUDY.toml", tables.StudyTable, "", ("runs", *tables.INPUTS, "figures")),
+        keys("[runs.NAME]", tables.RunTable, "", ()),
+        *(keys(f"[{key}.NAME]", kind.table, "", ()) for key, kind in tables.INPUTS.items()),
+        keys("[[figures]]", tables.FigureTable, "", ("pictures", "claims")),
+        keys("[[figures.pictures]]", tables.PictureTable, f"Kinds: {pictures}.", ()),
+        keys("[[figures.claims]]", tables.ClaimTable, "", ()),
     ]
     return "\n\n".join(parts)
 
 
 def measures() -> str:
     """Return the Markdown table of the measures that the claims of a study can use, with their options."""
-    from pipeline.report import torque_curves
     from pipeline.report.measures import MEASURES
 
     rows = []
     for name, measure in MEASURES.items():
-        text = inspect.getdoc(getattr(torque_curves, measure.__name__, measure)) or ""
+        text = inspect.getdoc(measure) or ""
         first, _, more = text.partition("\n\n")
         first = _flat(first).removeprefix("Return the ")
         rows.append((f"`{name}`", f"{first[:1].upper()}{first[1:]}", _flat(more)))
@@ -331,7 +280,8 @@ def _flat(text: str) -> str:
     return " ".join(text.replace("``", "`").split())
 
 
-def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",)) -> str:
+def keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",)) -> str:
+    """Return a Markdown section on the keys of a table of a TOML file, with a text above."""
     rows = []
     for name, info in model.model_fields.items():
         if name in left_out:
@@ -421,34 +371,12 @@ def public() -> str:
     return ", ".join(f"`{name}`" for name in dir(magpend) if not name.startswith("_"))
 
 
-def measured_branch() -> str:
-    """Return Markdown tables of the keys that describe measured branches, and a virtual rig under control."""
-    from pipeline.rig.control import ControlTable
-    from pipeline.rig.measured.branch import MeasuredBranch, RecordedOrbit
-
-    parts = [
-        _keys(
-            "[measured.branch]", MeasuredBranch, "In the specification of a run, or in a file of its own.", ("orbits",)
-        ),
-        _keys("[[measured.branch.orbits]]", RecordedOrbit, "One for each orbit.", ()),
-        _keys(
-            "[control]", ControlTable, "Beside `model`, `preset` and `parameters`: for `magpend measured trace`.", ()
-        ),
-    ]
-    return "\n\n".join(parts)
-
-
 TABLES: dict[str, Callable[[], str]] = {
     "commands": commands,
     "exit codes": exit_codes,
     "workflows": workflows,
     "specification": specification,
-    "identification": identification,
     "products": products,
-    "mapping": mapping,
-    "findings": findings,
-    "virtual rig": virtual_rig,
-    "measured branch": measured_branch,
     "study": study,
     "measures": measures,
     "variables": variables,

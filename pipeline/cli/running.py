@@ -93,6 +93,7 @@ def run(
     above 1 % a warning reports them.
     """
     from pipeline.compute.clients import Where
+    from pipeline.products.plugins import added
     from pipeline.runs import preview
     from pipeline.runs import run as runs
     from pipeline.runs.derive import analyses_in
@@ -100,7 +101,8 @@ def run(
 
     analyses = analyses_in(analyse)
     if posterior is not None:
-        _run_posterior(spec, posterior, n_draws, out, smoke=smoke, workers=workers)
+        of_draws = added("functions")["run_posterior"]
+        console.result(*of_draws(spec, posterior, n_draws, out, smoke=smoke, workers=workers, echo=console.note))
         return
     if dry_run:
         console.result(*preview.describe_plan(spec, out, workers=workers, smoke=smoke))
@@ -124,14 +126,6 @@ def run(
         show(done.name, name, {}, workers, where)
     if plot:
         _plot(done)
-
-
-def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke: bool, workers: int | None) -> None:
-    from pipeline.rig.identify.posterior_runs import run_posterior, spread
-
-    folder = run_posterior(spec, directory, n, out, smoke=smoke, workers=workers, echo=console.note)
-    console.result(*spread(folder, echo=console.note).lines)
-    console.result(f"runs: {folder}; their bifurcations: magpend identify spread {folder} --branches")
 
 
 def _plot(run: RunDirectory) -> None:

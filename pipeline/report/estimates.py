@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 from pipeline.runs.derive import AnalysedRun
-
-if TYPE_CHECKING:
-    import xarray as xr
-
 
 NOWHERE = math.nan
 
@@ -35,16 +33,23 @@ def absent(why: str, step: float | None = None) -> Estimate:
 
 
 class Results(Protocol):
-    """The results of a study that measures can read by name: runs, recordings and torque fits."""
+    """The results of a study that measures can read by name: runs, and those of other inputs."""
+
+    folder: Path
 
     def run(self, name: str) -> AnalysedRun:
         """Return a run of the study by name."""
 
-    def recording(self, name: str) -> xr.Dataset:
-        """Return a simulated recording of the study by name."""
+    def read(self, name: str) -> Any:
+        """Return what an input of the study is computed from."""
 
-    def torques(self, name: str) -> Any:
-        """Return the fit of the study's torque readings by name."""
+    def computed(self, name: str) -> Any:
+        """Return the result of an input of the study by name."""
+
+
+Options = Mapping[str, Any]
+Measure = Callable[[Results, Sequence[str], Options], Estimate]
+"""A function of results, the names of those to measure, and options."""
 
 
 class Verdict(Enum):

@@ -10,15 +10,16 @@ exponent, a dimension or the place of a bifurcation needs no measure of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.layout.vocabulary import parameter_name, split_dims
+from pipeline.products.plugins import added
 from pipeline.products.registry import ANALYSES
-from pipeline.report.estimates import Estimate, Results, absent
+from pipeline.report.estimates import Estimate, Measure, Options, Results, absent
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.selection import place
 from pipeline.results.sides import classify
@@ -168,10 +169,6 @@ def ratio_of_intervals(results: Results, of: Sequence[str], options: Options) ->
     half = abs(value) * (above / abs(second - first) + below / abs(third - second))
     text = f"located at {first:.7g}, {second:.7g} and {third:.7g}"
     return Estimate(value, value - half, value + half, text)
-
-
-Options = Mapping[str, Any]
-Measure = Callable[[Results, Sequence[str], Options], Estimate]
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
@@ -493,27 +490,6 @@ def share_above(results: Results, of: Sequence[str], options: Options) -> Estima
     return Estimate(low, low, high, text)
 
 
-def recorded_duty_cycle(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the duty cycle of a recorded drive, computed from the drive's switching edges."""
-    from pipeline.rig.edges import edges_of
-
-    timing = edges_of(results.recording(of[0])).frequency()
-    half = 1.96 * timing.duty_cycle_error
-    text = f"{timing.n_periods} periods at {timing.frequency_hz:.6g} Hz"
-    return Estimate(timing.duty_cycle, timing.duty_cycle - half, timing.duty_cycle + half, text, n=timing.n_periods)
-
-
-def _of_torques(name: str) -> Measure:
-    def measure(results: Results, of: Sequence[str], options: Options) -> Estimate:
-        from pipeline.report import torque_curves
-
-        found: Estimate = getattr(torque_curves, name)(results.torques(of[0]), options)
-        return found
-
-    measure.__name__ = name
-    return measure
-
-
 MEASURES: dict[str, Measure] = {
     "least_share": least_share,
     "largest_share": largest_share,
@@ -530,10 +506,6 @@ MEASURES: dict[str, Measure] = {
     "derived_number": derived_number,
     "ratio_of_intervals": ratio_of_intervals,
     "share_above": share_above,
-    "recorded_duty_cycle": recorded_duty_cycle,
-    "curves_described": _of_torques("curves_described"),
-    "torque_gain": _of_torques("gain_over_dipoles"),
-    "width_spread": _of_torques("width_spread"),
-    "signs_apart": _of_torques("signs_apart"),
+    **added("measures"),
 }
 """Measures by the names that studies use."""

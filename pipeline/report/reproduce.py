@@ -8,119 +8,17 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
-import xarray as xr
 
 from pipeline.layout.writing import json_value, write_atomically
 from pipeline.report.estimates import Estimate, Verdict, judged
 from pipeline.report.measures import MEASURES
-from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, picture_of, write
-from pipeline.report.report import command_of, made_by, provenance_of
-from pipeline.report.study import ClaimTable, FigureTable, PictureTable, Results, Study
-from pipeline.runs.derive import derive
-from pipeline.runs.drawing import figure
+from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, write
+from pipeline.report.pictures import picture
+from pipeline.report.report import made_by, provenance_of
+from pipeline.report.study import ClaimTable, FigureTable, Results, Study
 from pipeline.runs.stopping import stoppable
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.store.provenance import versions
-
-if TYPE_CHECKING:
-    from magpend_core.models.model import Parameters
-    from pipeline.plots.style import DataFigure
-
-
-_FINE = 2001
-"""Points over a drive period."""
-
-
-def picture(results: Results, table: PictureTable) -> Block:
-    """Draw a picture of a study as a block of the page; if it cannot be drawn, return a note with the reason."""
-    alt = f"{table.caption.rstrip('.')} ({table.of})"
-    try:
-        drawn = _DRAW[table.kind](results, table)
-    except SpecError as error:
-        return Note(f"{table.caption} Not drawn: {error}")
-    return picture_of(drawn, alt, table.caption, _command_of_picture(results, table))
-
-
-def _plot(results: Results, table: PictureTable) -> DataFigure:
-    run = results.run(table.of)
-    if table.branches:
-        derive(run, "branches", table.branches)
-    return figure(run, table.figure, table.options)
-
-
-def _quantities(results: Results, table: PictureTable) -> DataFigure:
-    return draw_quantities(results.run(table.of).parameters, table.quantities, table.frequency_hz or 1.0)
-
-
-def _recording(results: Results, table: PictureTable) -> DataFigure:
-    from pipeline.plots.style import Frame
-    from pipeline.rig.recordings.figure import plot_recording
-
-    low, high = table.options.get("xlim", (None, None))
-    return plot_recording(results.recording(table.of), frame=Frame(xlim=(low, high) if low is not None else None))
-
-
-def _series(results: Results, table: PictureTable) -> DataFigure:
-    from pipeline.rig.measured.figures import plot_series
-
-    return plot_series(results.series(table.of, int(table.options.get("periods", 10))))
-
-
-def _torques(results: Results, table: PictureTable) -> DataFigure:
-    from pipeline.report.torque_curves import drawn
-
-    return drawn(results.torques(table.of), table.figure)
-
-
-_DRAW = {"plot": _plot, "quantities": _quantities, "recording": _recording, "series": _series, "torques": _torques}
-
-
-def _command_of_picture(results: Results, table: PictureTable) -> str:
-    if table.kind == "plot":
-        place = shlex.quote(str(results.folder / "runs" / table.of))
-        found = [command_of("analyse branches", table.branches, place)] if table.branches else []
-        return "\n".join([*found, command_of(f"plot {table.figure}", table.options, place)])
-    if table.kind == "recording":
-        file = results.folder / "recordings" / f"{table.of}.csv"
-        mapping, out = file.with_suffix(".toml"), file.with_suffix(".png")
-        return f"magpend recordings show {shlex.quote(str(file))} --mapping {mapping} --out {out}"
-    return ""
-
-
-def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz: float) -> DataFigure:
-    """Draw quantities of a model over one drive period, with all states at 0."""
-    from magpend_core import evaluate
-    from pipeline.plots import style
-    from pipeline.plots.labels import with_unit
-    from pipeline.plots.looks import look
-
-    model = parameters.model
-    share = np.linspace(0.0, 1.0, _FINE, endpoint=False)
-    rest = np.zeros((_FINE, len(model.states)))
-    values = np.asarray(evaluate(list(names), share / frequency_hz, rest, parameters, frequency_hz))
-    about = [model.quantity(name) for name in names]
-    data = xr.Dataset(
-        {q.name: ("share", values[:, k], {"units": q.unit, "long_name": q.meaning}) for k, q in enumerate(about)},
-        coords={"share": ("share", share, {"units": "1", "long_name": "share of the drive's period"})},
-        attrs={"title": "quantities over a drive period", "frequency_hz": frequency_hz},
-    )
-    with look():
-        drawn = style.new_figure(1.2 + 1.6 * len(names), data)
-        for row, (ax, q) in enumerate(
-            zip(drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], about, strict=True)
-        ):
-            style.style_axes(ax)
-            ax.plot(share, values[:, row], color=style.BLUE, linewidth=1.2)
-            ax.axhline(0.0, color="0.75", linewidth=0.7, zorder=0)
-            style.label_axes(ax, y=with_unit(f"${q.symbol}$" if q.symbol else q.name, q.unit))
-        style.label_axes(ax, x=f"time since {model.section} [drive periods]")
-        ax.set_xlim(0.0, 1.0)
-        style.complete(drawn, drawn.axes[0], f"$f$ = {frequency_hz:.6g} Hz, the model at rest")
-    return drawn
-
 
 PAGE, CLAIMS = "report.html", "claims.json"
 Echo = Callable[[str], None]
@@ -379,7 +277,7 @@ def calibrated_on(judgements: Sequence[Judgement]) -> str:
 
 
 def _provenance(results: Results) -> list[Part]:
-    runs = results.computed()
+    runs = results.runs()
     if not runs:
         return []
     rows = [(name, run.info.title, str(run.plan.n_cells), run.digest) for name, run in runs.items()]

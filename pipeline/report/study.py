@@ -1,16 +1,19 @@
-"""Read the file of a study, and compute its results, each once: runs, simulated recordings, fits of torque readings."""
+"""Read the file of a study, and compute its results, each once: runs, and inputs that plug-ins add."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from types import GenericAlias
+from typing import Annotated, Any
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, create_model, model_validator
 
-from pipeline.layout.writing import write_atomically
+from pipeline.products.plugins import added
 from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.report.inputs import Input
+from pipeline.report.pictures import PictureTable, kinds
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.specification.files import STUDY, find_spec, read_toml, shipped_files
@@ -18,45 +21,14 @@ from pipeline.specification.problems import SpecError, problems_of, unknown_name
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import Table
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from pipeline.rig.virtual import Rig
+INPUTS: dict[str, Input] = added("inputs")
+"""Kinds of input beside runs, by their key in a study's file."""
 
 
 class RunTable(Table):
     """Table ``[runs.NAME]`` of a study's file: a run of the study."""
 
     spec: str = Field(description="Specification: a file, relative to the study, or the name of one that ships.")
-
-
-class RecordingTable(Table):
-    """Table ``[recordings.NAME]`` of a study's file: a recording of a simulated test rig."""
-
-    rig: str = Field(description="Virtual rig: a file, relative to the study.")
-
-
-class TorqueTable(Table):
-    """Table ``[torques.NAME]`` of a study's file: torque readings to fit."""
-
-    header: str = Field(description="Header of torque readings: a file, or the name of one that ships.")
-
-
-class PictureTable(Table):
-    """Table ``[[figures.pictures]]`` of a study's file: a picture that reproduces (part of) a figure of the paper."""
-
-    kind: Literal["plot", "quantities", "recording", "series", "torques"] = Field(
-        description="plot: a figure of a run, by the name of its command; quantities: quantities of the "
-        "model over a drive period; recording, series: a recording, and with the model from the same state; "
-        "torques: a figure of a fit of torque readings."
-    )
-    of: str = Field(description="Name of the run, the recording or the torque readings.")
-    figure: str = Field("", description="Name of the figure of a run or of torque readings.")
-    quantities: Annotated[tuple[str, ...], Field(strict=False)] = Field((), description="Names of the quantities.")
-    frequency_hz: Annotated[float, Field(gt=0)] | None = Field(None, description="Drive frequency [Hz].")
-    caption: str = Field(description="Sentence below the picture.")
-    options: dict[str, Any] = Field({}, description="Options of the figure, as its command has them.")
-    branches: dict[str, Any] = Field({}, description="Options with which the run's branches are found before.")
 
 
 class ClaimTable(Table):
@@ -66,7 +38,7 @@ class ClaimTable(Table):
     source: str = Field(description="Author and place of the claim.")
     measure: str = Field(description="Name of the measure, see pipeline.report.measures.")
     of: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = Field(
-        description="Names of the measured runs, recordings or torque readings."
+        description="Names of the measured runs or other inputs."
     )
     options: dict[str, Any] = Field({}, description="Options of the measure.")
     least: float = Field(-math.inf, allow_inf_nan=True, description="Least value that meets the claim.")
@@ -124,12 +96,12 @@ class FigureTable(Table):
 
     @property
     def needs(self) -> set[str]:
-        """Names of the runs, recordings and torque readings that the pictures and claims use."""
+        """Names of the runs and other inputs that the pictures and claims use."""
         return {p.of for p in self.pictures} | {name for claim in self.claims for name in claim.of}
 
 
-class StudyTable(Table):
-    """Content of the TOML file of a study."""
+class _StudyTable(Table):
+    """Content of the TOML file of a study, without the inputs that plug-ins add."""
 
     title: str = Field(description="Title of the report.")
     source: str = Field(description="Citation of the reproduced paper.")
@@ -137,17 +109,25 @@ class StudyTable(Table):
         (), description="Paragraphs that introduce the report."
     )
     runs: dict[str, RunTable] = Field({}, description="Runs that are computed.")
-    recordings: dict[str, RecordingTable] = Field({}, description="Recordings of virtual rigs.")
-    torques: dict[str, TorqueTable] = Field({}, description="Torque readings that are fitted.")
     figures: Annotated[tuple[FigureTable, ...], Field(strict=False, min_length=1)] = Field(
         description="Figures, in order."
     )
+
+    def given(self) -> dict[str, tuple[Input, Table]]:
+        """Return the kind and the table of all inputs beside runs, by name."""
+        return {name: (kind, table) for key, kind in INPUTS.items() for name, table in getattr(self, key).items()}
+
+
+_FIELDS: dict[str, Any] = {
+    key: (GenericAlias(dict, (str, kind.table)), Field({}, description=kind.meaning)) for key, kind in INPUTS.items()
+}
+StudyTable = create_model("StudyTable", __base__=_StudyTable, __doc__="Content of the TOML file of a study.", **_FIELDS)
 
 
 class Study:
     """A study: its name, the path of its TOML file and the content of this file."""
 
-    def __init__(self, name: str, path: Path, table: StudyTable) -> None:
+    def __init__(self, name: str, path: Path, table: _StudyTable) -> None:
         self.name, self.path, self.table = name, path, table
 
     def file(self, name: str) -> Path:
@@ -177,11 +157,12 @@ def load_study(name: str | Path) -> Study:
     return Study(path.parent.name if path.name == STUDY else path.stem, path, table)
 
 
-def _problems(table: StudyTable) -> list[str]:
+def _problems(table: _StudyTable) -> list[str]:
     """Return what is wrong with the names in a study: duplicates, and unknown inputs, figures or measures."""
     from pipeline.report.measures import MEASURES
 
-    known = [*table.runs, *table.recordings, *table.torques]
+    pictures = kinds()
+    known = [*table.runs, *(name for key in INPUTS for name in getattr(table, key))]
     twice = {name for name in known if known.count(name) > 1}
     problems = [f"{name}: names two things of the study; give one another name." for name in sorted(twice)]
     for i, figure in enumerate(table.figures):
@@ -189,6 +170,9 @@ def _problems(table: StudyTable) -> list[str]:
             f"figures[{i}]: {unknown_name('input', name, known)}" for name in sorted(figure.needs - set(known))
         ]
         for k, picture in enumerate(figure.pictures):
+            if picture.kind not in pictures:
+                at = f"figures[{i}].pictures[{k}].kind"
+                problems.append(f"{at}: {unknown_name('kind of picture', picture.kind, pictures)}")
             if picture.kind == "plot":
                 problems += _plot_problems(f"figures[{i}].pictures[{k}]", picture)
         for k, claim in enumerate(figure.claims):
@@ -218,21 +202,20 @@ Echo = Callable[[str], None]
 class Results:
     """Results of a study in a folder; each is computed when it is first needed, in small sizes if `smoke`.
 
-    Runs lie in ``runs/`` and are completed, not repeated. Recordings and fits take seconds and are computed
-    again, with the same numbers.
+    Runs lie in ``runs/`` and are completed, not repeated. Other inputs take seconds and are computed again, with the
+    same numbers; their files lie in a folder named by their key.
     """
 
     def __init__(self, study: Study, folder: Path, *, smoke: bool, workers: int | None, echo: Echo) -> None:
         self.study, self.folder, self.smoke = study, folder, smoke
         self._workers, self._echo = workers, echo
         self._runs: dict[str, AnalysedRun] = {}
-        self._recordings: dict[str, xr.Dataset] = {}
-        self._torques: dict[str, Any] = {}
+        self._computed: dict[str, Any] = {}
 
     def prepare(self, names: set[str]) -> None:
         """Check the inputs of the results that are needed, then compute the runs among them.
 
-        Raise SpecError with all problems of specifications, rigs and headers, before anything is computed.
+        Raise SpecError with all problems of specifications and other inputs, before anything is computed.
         """
         self._check(names)
         for name in self.study.table.runs:
@@ -240,12 +223,11 @@ class Results:
                 self.run(name)
 
     def _check(self, names: set[str]) -> None:
-        """Read all needed specifications and headers; raise a SpecError that lists all problems."""
+        """Read all needed specifications and inputs; raise a SpecError that lists all problems."""
         table, problems = self.study.table, []
         checks: list[tuple[str, Callable[[str], Any]]] = [
             *((name, lambda name: Spec.read(self.spec(name), smoke=self.smoke)) for name in table.runs),
-            *((name, self.rig) for name in table.recordings),
-            *((name, self._measurement) for name in table.torques),
+            *((name, self.read) for name in table.given()),
         ]
         for name, check in checks:
             if name in names:
@@ -261,11 +243,6 @@ class Results:
         given = self.study.table.runs[name].spec
         return self.study.file(given) if given.endswith(".toml") else find_spec(given)
 
-    def _measurement(self, name: str) -> Any:
-        from pipeline.report.torque_curves import measured
-
-        return measured(self.study.table.torques[name].header, self.study.path.parent)
-
     def run(self, name: str) -> AnalysedRun:
         """Compute the missing cells of one of the study's runs, and return the run."""
         if name not in self._runs:
@@ -276,43 +253,20 @@ class Results:
             self._runs[name] = AnalysedRun.of(place, self._echo)
         return self._runs[name]
 
-    def computed(self) -> dict[str, AnalysedRun]:
+    def runs(self) -> dict[str, AnalysedRun]:
         """Return the runs of the study that are computed so far, by name."""
         return dict(self._runs)
 
-    def rig(self, name: str) -> Rig:
-        """Return the simulated test rig that makes a recording of the study."""
-        from pipeline.rig.virtual import load_rig
+    def read(self, name: str) -> Any:
+        """Return what an input of the study is computed from; raise SpecError if it cannot be read."""
+        kind, table = self.study.table.given()[name]
+        return kind.read(table, self.study.path.parent)
 
-        return load_rig(self.study.file(self.study.table.recordings[name].rig))
-
-    def recording(self, name: str) -> xr.Dataset:
-        """Return a recording of a simulated test rig by name; it is computed at the first call."""
-        if name not in self._recordings:
-            from pipeline.rig.recordings import read_recording
-            from pipeline.rig.recordings.writing import write_raw
-            from pipeline.rig.virtual import simulated
-
-            self._echo(f"{name}: recording of a virtual rig")
-            raw, mapping = simulated(self.rig(name), is_csv=True)
-            place = self.folder / "recordings" / f"{name}.csv"
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_raw(raw, place)
-            write_atomically(place.with_suffix(".toml"), mapping.toml())
-            self._recordings[name] = read_recording(place, mapping)
-        return self._recordings[name]
-
-    def series(self, name: str, n_periods: int) -> xr.Dataset:
-        """Return a recording's time series, and that of the model integrated from the same state."""
-        from pipeline.rig.measured.series import series_of
-
-        return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)
-
-    def torques(self, name: str) -> Any:
-        """Return a fit of the study's torque readings by name; it is computed at the first call."""
-        if name not in self._torques:
-            from pipeline.report.torque_curves import fitted
-
-            self._echo(f"{name}: fit of torque readings")
-            self._torques[name] = fitted(self._measurement(name))
-        return self._torques[name]
+    def computed(self, name: str) -> Any:
+        """Return the result of an input of the study by name; it is computed at the first call."""
+        if name not in self._computed:
+            kind, table = self.study.table.given()[name]
+            self._echo(f"{name}: {kind.title}")
+            key = next(key for key, other in INPUTS.items() if other is kind)
+            self._computed[name] = kind.compute(kind.read(table, self.study.path.parent), self.folder / key / name)
+        return self._computed[name]

@@ -79,6 +79,13 @@ def run_posterior(
     return folder
 
 
+def run_and_spread(spec: str, identification: Path, n: int, out: str | None = None, **options: Any) -> list[str]:
+    """Run a specification for draws of a posterior, and return lines on the spread of its results."""
+    folder = run_posterior(spec, identification, n, out, **options)
+    spread_there = f"magpend identify spread {folder} --branches"
+    return [*spread(folder, echo=options["echo"]).lines, f"runs: {folder}; their bifurcations: {spread_there}"]
+
+
 def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[str], names: list[str]) -> None:
     problems = []
     if canonical(reference) != canonical(result["model"]):

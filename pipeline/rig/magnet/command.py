@@ -9,9 +9,11 @@ import typer
 
 from pipeline.cli import console
 from pipeline.cli.common import Json, tell_data
+from pipeline.cli.options import drawing
 from pipeline.cli.outputs import check_place
 
 
+@drawing
 def fit_magnet(
     measurement: Annotated[
         str,

@@ -1,15 +1,19 @@
-"""Measure and draw the fits of torque curves for a study."""
+"""Fits of torque curves as inputs of a study: pictures and measures of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field
 
-from pipeline.report.estimates import Estimate
+from pipeline.report.estimates import Estimate, Options, Results
+from pipeline.report.inputs import Input
+from pipeline.report.pictures import Picture, PictureTable
 from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.tables import Table
 
 if TYPE_CHECKING:
     from pipeline.plots.style import DataFigure
@@ -19,32 +23,44 @@ if TYPE_CHECKING:
 _DRAWS, _SEED = 2000, 2018
 
 
-def measured(header: str, folder: Path) -> Measurement:
+class TorqueTable(Table):
+    """Table ``[torques.NAME]`` of a study's file: torque readings to fit."""
+
+    header: str = Field(description="Header of torque readings: a file, or the name of one that ships.")
+
+
+def _read(table: TorqueTable, folder: Path) -> Measurement:
     """Read torque readings, given by the path of their header file or by the name of a shipped measurement."""
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
 
-    own = folder / header
-    return read_measurement(find_measurement(str(own) if own.is_file() else header))
+    own = folder / table.header
+    return read_measurement(find_measurement(str(own) if own.is_file() else table.header))
 
 
-def fitted(readings: Measurement) -> Outcome:
-    """Fit models of the magnet torque to torque readings."""
+def _fitted(readings: Measurement, place: Path) -> Outcome:
     from pipeline.rig.magnet.fitting import fit_measurement
 
     return fit_measurement(readings)
 
 
-def drawn(outcome: Outcome, name: str) -> DataFigure:
+TORQUES = Input(TorqueTable, "Torque readings that are fitted.", "fit of torque readings", _read, _fitted)
+
+
+def _drawn(results: Results, table: PictureTable) -> DataFigure:
     """Draw a named figure of torque readings from `pipeline.rig.magnet.figures.FIGURES`."""
     from pipeline.rig.magnet.figures import FIGURES
 
-    if name not in FIGURES:
-        raise SpecError(unknown_name("figure of torque readings", name, FIGURES))
-    return FIGURES[name](outcome)
+    if table.figure not in FIGURES:
+        raise SpecError(unknown_name("figure of torque readings", table.figure, FIGURES))
+    return FIGURES[table.figure](results.computed(table.of))
 
 
-def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+FIT = Picture("a figure of a fit of torque readings", _drawn)
+
+
+def curves_described(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Return the fraction of torque curves whose single-curve fit reaches a coefficient of determination of ``r2``."""
+    outcome: Outcome = results.computed(of[0])
     from pipeline.results.intervals import binomial_interval
 
     r2 = np.array([fit.quality.r2 for fit in outcome.curves])
@@ -54,11 +70,12 @@ def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
     return Estimate(count / r2.size, float(low), float(high), text, n=int(r2.size))
 
 
-def gain_over_dipoles(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+def gain_over_dipoles(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Return the relative reduction of squared residuals by the joint fit, compared with the fit of point dipoles.
 
     The interval is a bootstrap over whole curves, so residuals within a curve may be correlated.
     """
+    outcome: Outcome = results.computed(of[0])
     own, other = (_squares(outcome, r) for r in (outcome.joint.residuals, outcome.dipoles.residuals))
     rng = np.random.default_rng(_SEED)
     drawn = rng.integers(0, own.size, (_DRAWS, own.size))
@@ -73,12 +90,13 @@ def _squares(outcome: Outcome, residuals: np.ndarray) -> np.ndarray:
     return np.array([float((residuals[fit.curve.rows] ** 2).sum()) for fit in outcome.curves])
 
 
-def width_spread(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+def width_spread(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Return the variation of the torque peaks' width with the locked angle, relative to the mean width.
 
     A parabola in the locked angle is fitted to the widths. Its range over the measured angles is divided by
     its mean. The interval is a bootstrap over the curves.
     """
+    outcome: Outcome = results.computed(of[0])
     width = np.array([_width(fit.values) for fit in outcome.curves])
     locked = np.array([fit.curve.locked for fit in outcome.curves])
     rng = np.random.default_rng(_SEED)
@@ -101,8 +119,9 @@ def _width(values: Mapping[str, float]) -> float:
     return abs(float(values[laws.WIDTH]))
 
 
-def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
+def signs_apart(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Return the fraction of readings in which torque and distance from the transition angle have the same sign."""
+    outcome: Outcome = results.computed(of[0])
     from magpend_core.models.pendulum import magnet_torque as laws
     from pipeline.results.intervals import binomial_interval
 

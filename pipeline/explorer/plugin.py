@@ -1,0 +1,7 @@
+"""What the interactive page adds to other rooms."""
+
+from __future__ import annotations
+
+from pipeline.products.plugins import Plugin
+
+PLUGIN = Plugin(commands={"explore": "pipeline.explorer.command:explore", "export": "pipeline.explorer.command:export"})
