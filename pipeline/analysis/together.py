@@ -16,7 +16,7 @@ V = TypeVar("V")
 T = TypeVar("T")
 
 
-def run_together(
+def answer_together(
     computations: Mapping[K, Generator[Q, V, T]], answer: Callable[[dict[K, Q], dict[K, T]], Mapping[K, V]]
 ) -> dict[K, T]:
     """Run computations side by side to their ends, and return the result of each.

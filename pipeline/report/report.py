@@ -28,7 +28,7 @@ from pipeline.results.outcomes import sentence
 from pipeline.results.tabular import axis_ranges, counted, distinct, leading, number
 from pipeline.runs.derive import AnalysedRun, changed_options, is_current, shown_table
 from pipeline.runs.drawing import figure
-from pipeline.runs.naming import in_own_words as options_in_own_words
+from pipeline.runs.naming import options_in_own_words
 from pipeline.runs.status import state
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.tables import RATES

@@ -155,23 +155,7 @@ class Spec:
         execution: Table | None = None,
         smoke: Table | None = None,
     ) -> None:
-        given = {
-            "kind": kind,
-            "title": title,
-            "parameters": parameters,
-            "axes": axes,
-            "initial_conditions": initial_conditions,
-            "section": section,
-            "drive": drive,
-            "drift": drift,
-            "noise": noise,
-            "continuation": continuation,
-            "integration": integration,
-            "products": products,
-            "execution": execution,
-            "smoke": smoke,
-            "model": model,
-        }
+        given = {name: value for name, value in locals().items() if name != "self"}
         self._set(plain_tables(given))
 
     def _set(

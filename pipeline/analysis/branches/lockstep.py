@@ -49,7 +49,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
             report(what, round(len(results) + sum(covered[i] for i in queries), 1), len(computations))
         return dict(zip(queries, _evaluate(list(queries.values()), rtol), strict=True))
 
-    found = together.run_together(dict(enumerate(computations)), answer)
+    found = together.answer_together(dict(enumerate(computations)), answer)
     if what:
         report(what, len(computations), len(computations))
     return list(found.values())

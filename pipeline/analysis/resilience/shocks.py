@@ -30,7 +30,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.flown import flown
 from pipeline.analysis.resilience.declaration import ResilienceOptions
-from pipeline.analysis.together import run_together
+from pipeline.analysis.together import answer_together
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, samples_per_period
 from pipeline.products.reporting import report
 from pipeline.results.outcomes import DIVERGED
@@ -444,7 +444,7 @@ def search_together(asked: Mapping[K, Asked], there: Destinations, units: np.nda
         ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
         return dict(zip(trials, np.split(found, ends), strict=True))
 
-    return run_together({key: one.search for key, one in asked.items()}, answer)
+    return answer_together({key: one.search for key, one in asked.items()}, answer)
 
 
 def _states(trials: Trials, asked: Asked, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

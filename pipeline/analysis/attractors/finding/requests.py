@@ -21,7 +21,7 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.flight import Flight
-from pipeline.analysis.together import run_together
+from pipeline.analysis.together import answer_together
 from pipeline.products.reporting import UNTOLD, report
 from pipeline.results.sets import Geometry, hashes
 from pipeline.results.tolerances import SLOPE_RTOL, STRICT
@@ -162,7 +162,7 @@ def answer_all(
         return answers
 
     report(what, 0, len(works), UNTOLD)
-    found = run_together(works, answer)
+    found = answer_together(works, answer)
     report(what, len(works), len(works), UNTOLD)
     return found
 
