@@ -44,7 +44,7 @@ plot_app = command_group(
 def draw(directory: str, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it with its data, and print where they are."""
     from pipeline.runs.drawing import drawn, ready
-    from pipeline.runs.naming import in_own_words
+    from pipeline.runs.naming import options_in_own_words
     from pipeline.store.errors import RefusedError
     from pipeline.store.files import FIGURES
     from pipeline.store.local import make_folder, refuse_links, unwritable
@@ -53,7 +53,9 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     if options.out:
         check_figure_path(_target_of(options), FIGURES, [read_run(directory).digest])
     run, wanted = ready(directory, name, options, console.note)
-    target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, in_own_words(wanted, run.spec.rate))
+    target = (
+        _target_of(wanted) if wanted.out else _in_run(run.info.files, name, options_in_own_words(wanted, run.spec.rate))
+    )
     if not wanted.out and run.info.files.local is None:  # runs of other buckets may have the same name
         for file in (target, target.with_suffix(".nc")):
             check_file(file, digests=[run.info.digest])

@@ -249,15 +249,16 @@ def products() -> str:
 
 def study() -> str:
     """Return Markdown tables of the keys of the TOML file that describes a study (figures and claims of a paper)."""
+    from pipeline.report import pictures
     from pipeline.report import study as tables
 
-    pictures = "; ".join(f"`{name}`, {kind.meaning}" for name, kind in tables.kinds().items())
+    kinds = "; ".join(f"`{name}`, {kind.meaning}" for name, kind in pictures.kinds().items())
     parts = [
         keys("STUDY.toml", tables.StudyTable, "", ("runs", *tables.INPUTS, "figures")),
         keys("[runs.NAME]", tables.RunTable, "", ()),
         *(keys(f"[{key}.NAME]", kind.table, "", ()) for key, kind in tables.INPUTS.items()),
         keys("[[figures]]", tables.FigureTable, "", ("pictures", "claims")),
-        keys("[[figures.pictures]]", tables.PictureTable, f"Kinds: {pictures}.", ()),
+        keys("[[figures.pictures]]", pictures.PictureTable, f"Kinds: {kinds}.", ()),
         keys("[[figures.claims]]", tables.ClaimTable, "", ()),
     ]
     return "\n\n".join(parts)

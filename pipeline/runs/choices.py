@@ -13,7 +13,7 @@ from pydantic import Field
 from pipeline.analysis.attractors.declaration import AttractorOptions
 from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.products.product import Options, as_flags
-from pipeline.runs.naming import in_own_words
+from pipeline.runs.naming import options_in_own_words
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED
 from pipeline.store.run import RunDirectory
@@ -82,7 +82,7 @@ def branches_in_words(changed: str, word: str) -> list[str]:
     lines = []
     for parameter, given in json.loads(changed).items():
         options = BranchOptions.model_validate_json(json.dumps({**given, "parameter": parameter}))
-        told = in_own_words(options, word).changed()
+        told = options_in_own_words(options, word).changed()
         name = told.pop("parameter")
         lines.append(f"branches along {name}, found with {' '.join(as_flags(BranchOptions, told))}")
     return lines

@@ -114,7 +114,7 @@ def _bounds(role: str, given: Mapping[str, Any], rate: Rate, convert: Callable[[
     return found
 
 
-def in_own_words(options: Some, word: str) -> Some:
+def options_in_own_words(options: Some, word: str) -> Some:
     """Return options from `named` with the drive's rate, where it occurs, in a word for it."""
     rate, fields, changes = RATES[word], type(options).model_fields, dict[str, Any]()
     if at := getattr(options, "at", None):
