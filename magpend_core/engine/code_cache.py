@@ -10,6 +10,7 @@ alone, and a folder that others own or can write to is not used.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import logging
@@ -18,13 +19,18 @@ import os
 import pickle
 import stat
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, UserProvidedCacheLocator
+from numba.core.compiler_lock import global_compiler_lock
+
+fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None  # Windows has none
 
 LOG = logging.getLogger("magpend.cache")
 
@@ -65,7 +71,8 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
     problem = _made(home, own)
     if not problem:
         try:
-            dispatcher._cache = KeptCode(function, folder)
+            dispatcher._cache = cache = KeptCode(function, folder)
+            dispatcher.compile = cache.compiling_once(dispatcher.compile, dispatcher.targetctx)
         except RuntimeError as error:  # the folder was removed after the check
             problem = f"{error};"
     if problem:
@@ -133,7 +140,7 @@ class KeptCode(FunctionCache):
             finally:
                 settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
         stamp = self._impl.locator.get_source_stamp()
-        self._cache_file = _Entries(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+        self._cache_file = self._entries = _Entries(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the cached machine code for a signature; None if there is no usable one."""
@@ -143,6 +150,17 @@ class KeptCode(FunctionCache):
             # intact but unreadable: written by another version of Python or numpy than the cache key says
             say(f"a compiled kernel in {self._cache_path} cannot be used ({error!r}); it is compiled again.")
             return None
+
+    def compiling_once(self, compile_: Callable[[Any], Any], target_context: Any) -> Callable[[Any], Any]:
+        """Return numba's compilation of the function such that other processes wait for it and read its result."""
+
+        def compile_once(sig: Any) -> Any:
+            path = self._entries.path_of(self._index_key(sig, target_context.codegen()))  # type: ignore[no-untyped-call]
+            # threads of this process wait for numba's lock first, so that none waits for another one's file
+            with global_compiler_lock, made_once(path):
+                return compile_(sig)
+
+        return compile_once
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save the machine code for a signature, if the folder can be written to."""
@@ -180,8 +198,47 @@ class PartFolder:
         except OSError as error:
             _say_not_kept(str(self._folder), error)
 
+    def making(self, name: str) -> contextlib.AbstractContextManager[None]:
+        """Return a context in which no other process makes the record of a precompiled function."""
+        return contextlib.nullcontext() if _made(self._home, self._folder) else made_once(self._path(name))
+
     def _path(self, name: str) -> str:
         return os.path.join(self._folder, f"{name}.part")
+
+
+@contextlib.contextmanager
+def made_once(path: str) -> Iterator[None]:
+    """Let other processes that want to make the same cache file wait while this context is open, unless it is there.
+
+    A process that is killed holds no lock. Where files cannot be locked, each process makes its own.
+    """
+    lock = None if fcntl is None or os.path.exists(path) else _locked(f"{path}.lock")
+    try:
+        yield
+    finally:
+        if lock is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(f"{path}.lock")
+            os.close(lock)
+
+
+def _locked(path: str) -> int | None:
+    """Open and lock a file; None if it cannot be locked."""
+    while True:
+        try:
+            opened = _for_the_owner(path, os.O_RDWR | os.O_CREAT)
+        except OSError:
+            return None
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX)
+            if os.fstat(opened).st_ino == os.stat(path).st_ino:
+                return opened
+        except FileNotFoundError:  # whoever had the lock has removed the file
+            pass
+        except OSError:
+            os.close(opened)
+            return None
+        os.close(opened)
 
 
 def _for_the_owner(path: str, flags: int) -> int:
@@ -215,7 +272,7 @@ class _Entries(IndexDataCacheFile):
     """Cache files of numba, one per signature, without numba's index, which two processes could garble."""
 
     def load(self, key: Any) -> Any:
-        path = self._path(key)
+        path = self.path_of(key)
         content = _read_sealed(path)
         if content is None:
             return None
@@ -227,7 +284,7 @@ class _Entries(IndexDataCacheFile):
 
     def save(self, key: Any, data: Any) -> None:
         content = self._dump((key, self._source_stamp, data))  # type: ignore[no-untyped-call]
-        with self._open_for_write(self._path(key)) as file:
+        with self._open_for_write(self.path_of(key)) as file:
             os.chmod(file.name, 0o600)
             file.write(_DIGEST(content).digest())
             file.write(content)
@@ -236,6 +293,7 @@ class _Entries(IndexDataCacheFile):
         for path in Path(self._cache_path).glob(self._data_name_pattern.format(number=0)[:-5] + "*.nbc"):
             path.unlink(missing_ok=True)
 
-    def _path(self, key: Any) -> str:
+    def path_of(self, key: Any) -> str:
+        """Return the path of the file with the machine code for a key of numba."""
         name = _DIGEST(repr(key).encode()).hexdigest()[:16]
         return os.path.join(self._cache_path, f"{self._index_name.removesuffix('.nbi')}.{name}.nbc")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -31,9 +32,12 @@ _SYMBOL = "magpend.size."
 
 def placeholder(name: str) -> int:
     """Return the unique integer that stands for a system size (such as the number of states) while a part is
-    compiled.
+    compiled. It follows from the name, so that every process shares the cached part.
     """
-    return _NAMES.setdefault(name, _PLACEHOLDER + len(_NAMES))
+    number = _PLACEHOLDER + zlib.crc32(name.encode())
+    if any(other != name and known == number for other, known in _NAMES.items()):
+        raise RuntimeError(f"the system size {name} has the placeholder of another one; rename it.")
+    return _NAMES.setdefault(name, number)
 
 
 class PartLibrary(FusedLibrary):

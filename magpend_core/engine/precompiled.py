@@ -15,6 +15,7 @@ Read in this order: `PartDispatcher` (a function that only compiled functions ca
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import pickle
 from collections.abc import Callable, Mapping
@@ -235,7 +236,7 @@ class PartDispatcher(CPUDispatcher):
 
     def compile(self, sig: Any) -> Any:
         """Compile this part for a signature, or load its code from the cache."""
-        with global_compiler_lock:
+        with global_compiler_lock, self._cache.making(sig):
             _COMPILED_NOW.append(self)
             try:
                 return super().compile(sig)
@@ -295,6 +296,13 @@ class PartCache:
         if found is not None:
             _MEMORY[name] = record
         return found
+
+    def making(self, sig: Any) -> contextlib.AbstractContextManager[None]:
+        """Return a context in which no other process compiles this part for a signature, if it has yet to be read."""
+        name = self._name(sig)
+        if self._folder is None or name is None or name in _MEMORY:
+            return contextlib.nullcontext()
+        return self._folder.making(name)
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         """Write the code compiled for a signature to the cache, if this part has a cache key."""

@@ -231,6 +231,42 @@ def test_keep__two_processes_that_write_at_once(tmp_path):
     assert len(entries(tmp_path / "cache")) == 2
 
 
+COMPILES = """
+from magpend_core import load_preset, sections
+from magpend_core.engine import code_cache, precompiled
+made = []
+for cache in (code_cache.KeptCode, precompiled.PartCache):
+    def save(self, sig, data, kept=cache.save_overload):
+        made.append(sig)
+        kept(self, sig, data)
+    cache.save_overload = save
+sections(load_preset("wojna2018"), 0.4, [[0.1, 0.0, 0.0, 0.0]], n_transient=0, n_keep=2)
+print(len(made))
+"""
+
+
+@pytest.mark.slow
+def test_keep__processes_at_once_compile_each_function_once(tmp_path):
+    """One compiles, the others wait and read; whoever is killed holds nobody up."""
+    environment = {**os.environ, "MAGPEND_CACHE_DIR": str(tmp_path)}
+    environment["PYTHONPATH"] = str(Path(jit.__file__).parents[2])
+
+    def started():
+        return subprocess.Popen([sys.executable, "-c", COMPILES], env=environment, stdout=subprocess.PIPE, text=True)
+
+    killed = started()
+    while not list(tmp_path.rglob("*.lock")):
+        assert killed.poll() is None
+        time.sleep(0.01)
+    killed.kill()
+    killed.communicate()
+    before = len([*entries(tmp_path), *tmp_path.rglob("*.part")])
+    counts = [int(process.communicate(timeout=300)[0]) for process in [started() for _ in range(3)]]
+    assert sum(counts) + before == len([*entries(tmp_path), *tmp_path.rglob("*.part")])
+    assert max(counts) > 20
+    assert not list(tmp_path.rglob("*.lock"))
+
+
 def test_keep__threads_at_once_find_their_folder(cache, monkeypatch, tmp_path):
     """Whoever computes in threads binds kernels there: each has its place in the cache, none elsewhere."""
     monkeypatch.chdir(tmp_path)
