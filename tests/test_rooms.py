@@ -36,6 +36,7 @@ PENDULUM = {
 KNOWS_A_PART = {
     "pipeline/rig/__init__.py": ("its magnets", "says that the measurement of their torque is here"),
     "pipeline/rig/magnet": ("its magnets", "the paper's measurement of their torque, named for it"),
+    "pipeline/rig/commands": ("its magnets", "has the command of that measurement"),
     "pipeline/rig/plugin.py": ("its magnets", "lists the command of that measurement"),
 }
 """Files, or folders of them, that may name one part of one model, and why."""

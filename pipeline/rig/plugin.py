@@ -6,10 +6,10 @@ from pipeline.products.plugins import Plugin
 
 PLUGIN = Plugin(
     commands={
-        "fit-magnet": "pipeline.rig.magnet.command:fit_magnet",
-        "measured": "pipeline.rig.measured.command:measured_app",
-        "recordings": "pipeline.rig.recordings.command:recordings_app",
-        "identify": "pipeline.rig.identify.command:identify_app",
+        "fit-magnet": "pipeline.rig.commands.magnet:fit_magnet",
+        "measured": "pipeline.rig.commands.measured:measured_app",
+        "recordings": "pipeline.rig.commands.recordings:recordings_app",
+        "identify": "pipeline.rig.commands.identify:identify_app",
     },
     functions={"run_posterior": "pipeline.rig.identify.posterior_runs:run_and_spread"},
     inputs={"recordings": "pipeline.rig.recordings.study:RECORDINGS", "torques": "pipeline.rig.magnet.study:TORQUES"},

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,13 @@ from pipeline.runs.preview import figure_command
 from pipeline.specification import files
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
+
+
+def test_start__loads_nothing_large():
+    """Each command imports what it needs when it is called, also those of plug-ins."""
+    code = "import sys, pipeline.cli.main; print(sorted({'numpy', 'pydantic', 'xarray', 'numba'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.slow

@@ -1,0 +1,1 @@
+"""Define the commands of a rig: recordings, identification, measured diagrams, and the magnets' torque."""
