@@ -18,6 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magpend_core.models.clock import DRIVEN, MAP, STROBED
 from magpend_core.models.model import Mirror, Model, Preset, Quantity, State
 from magpend_core.models.parameters import BOUNDS, Parameter, ParameterError, has_controls
 
@@ -98,8 +99,8 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
 def _description(path: str, model: Model) -> dict[str, Any]:
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
-    table["autonomous"] = model.autonomous
-    if model.is_map:
+    table["autonomous"] = model.clock.has_equilibria
+    if not model.clock.is_continuous:
         table["is_map"] = True
     for name in ("states", "parameters", "quantities"):
         table[name] = {one.name: _plain(one) for one in getattr(model, name)}
@@ -196,8 +197,7 @@ def described_model(table: Mapping[str, Any]) -> Model:
         **given,
         system_path="",
         sources=(),
-        autonomous=table.get("autonomous") is True,
-        is_map=table.get("is_map") is True,
+        clock=MAP if table.get("is_map") is True else STROBED if table.get("autonomous") is True else DRIVEN,
         text=dict(table),
     )
 

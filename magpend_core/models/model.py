@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from magpend_core.models.clock import DRIVEN, Clock
 from magpend_core.models.parameters import Parameter, ParameterError, near_names, unknown_name_problem
 from magpend_core.models.presets import Preset as Preset
 from magpend_core.models.presets import completed, find_preset
@@ -203,10 +204,8 @@ class Model:
         Dim of what there is one of per angle, such as full turns.
     relations : callable
         Sentences on values that are in bounds each, but not together.
-    autonomous : bool
-        Whether it is a flow, and nothing depends on time but through the states.
-    is_map : bool
-        Whether the equations give the next state; a drive period then stands for one iteration.
+    clock : Clock
+        How it counts time: by periods of a drive, at even times, by returns, or by iterations.
     text : mapping, optional
         The table that the model was read from, if it was text; plain data, see `reference`.
     """
@@ -226,8 +225,7 @@ class Model:
     drawing: Drawing | None = None
     angle_dim: str = "angle"
     relations: Callable[[Mapping[str, float]], list[str]] = field(default=_no_relations)
-    autonomous: bool = False
-    is_map: bool = False
+    clock: Clock = DRIVEN
     text: Mapping[str, Any] | None = None
 
     def __repr__(self) -> str:
@@ -254,14 +252,7 @@ class Model:
     @property
     def crossing(self) -> Crossing | None:
         """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
-        return None
-
-    @property
-    def clock_hz(self) -> float | None:
-        """Return what the engine takes as the drive frequency [Hz] of a model without a drive: of a map 1, with a
-        section by crossing one over the longest time between crossings; None where the frequency is given.
-        """
-        return 1.0 if self.is_map else None
+        return self.clock.crossing
 
     @property
     def disturbance(self) -> Disturbance | None:

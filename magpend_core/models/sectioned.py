@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.crossing import Crossing
+from magpend_core.models.clock import returns
 from magpend_core.models.model import Mirror, Model, Parameters
 from magpend_core.models.parameters import Parameter
 from magpend_core.models.presets import Preset
@@ -31,22 +32,15 @@ class SectionedModel(Model):
     ----------
     whole : Model
         The model without the section.
-    through : Crossing
-        The section.
     """
 
     whole: Model
-    through: Crossing
 
     @property
-    def crossing(self) -> Crossing | None:
+    def through(self) -> Crossing:
         """Return the Poincare section: its state, level and direction."""
-        return self.through
-
-    @property
-    def clock_hz(self) -> float | None:
-        """Return one over the longest time between crossings [Hz]."""
-        return self.through.frequency_hz
+        assert self.crossing is not None
+        return self.crossing
 
     @property
     def flow(self) -> Model:
@@ -103,7 +97,7 @@ def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
     ValueError
         If the model is forced, or has a parameter named like the section's level.
     """
-    if not model.autonomous:
+    if not model.clock.has_equilibria:
         raise ValueError(f"{model.name} is forced: its sections are at the drive's period; drop the crossing.")
     if LEVEL in model.parameter_names:
         raise ValueError(f"{model.name} has a parameter named {LEVEL}, which is the level's name; rename it.")
@@ -114,9 +108,10 @@ def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
         "parameters": (*model.parameters, level),
         "presets": tuple(_with_level(p, crossing) for p in model.presets),
         "section": crossing.sentence,
+        "clock": returns(crossing),
         "mirror": _mirror(model, crossing),
     }
-    return SectionedModel(**{**own, **changes}, whole=model, through=crossing)
+    return SectionedModel(**{**own, **changes}, whole=model)
 
 
 def of_flow(parameters: Parameters) -> Parameters:

@@ -16,7 +16,7 @@ def checks_of(model: Model) -> list[str]:
         "finite at the starts",
         "Jacobian equal to differences",
         *(["nothing changes as an angle goes round"] if model.angles else []),
-        *([] if model.autonomous or model.is_map else ["forcing of the drive's period"]),
+        *(["forcing of the drive's period"] if model.clock.has_drive else []),
     ]
 
 

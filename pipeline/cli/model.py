@@ -80,12 +80,12 @@ for _command in (show, new):
 def _lines(model: Model, found: Description) -> list[str]:
     from magpend_core.models.summary import checks_of
 
-    lines = all_of(model)
+    lines, is_flow = all_of(model), model.clock.is_continuous
     if found.equations:
         lines += ["", "equations"]
         lines += [f"  {name} = {text}" for name, text in found.definitions.items()]
-        lines += [f"  {name}' = {t}" if model.is_map else f"  d{name}/dt = {t}" for name, t in found.equations.items()]
-    if not model.is_map:  # no step of a map goes across anything
+        lines += [f"  d{name}/dt = {t}" if is_flow else f"  {name}' = {t}" for name, t in found.equations.items()]
+    if is_flow:  # no step of a map goes across anything
         lines += ["", "found", *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"])]
     if model.remarks:
         lines += ["", "warnings", *(f"  {line}" for line in model.remarks)]
@@ -111,8 +111,8 @@ def _latex(model: Model, found: Description) -> None:
 def _as_dict(model: Model, found: Description) -> dict[str, Any]:
     return {
         **described(model),
-        "autonomous": model.autonomous,
-        "is_map": model.is_map,
+        "kind": model.clock.system,
+        "has_drive": model.clock.has_drive,
         "section": model.section,
         "digest": model.digest,
         "definitions": found.definitions,

@@ -74,9 +74,7 @@ def all_of(model: Model) -> list[str]:
     """Return text lines that list the states, parameters, quantities, motions and presets of a model."""
     from pipeline.products.product import padded
 
-    seen = "no drive: the equations do not depend on time" if model.autonomous else ""
-    seen = "a map: the equations give the next states" if model.is_map else seen
-    seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
+    seen = model.clock.meaning + (f"; sections are taken at {model.section}" if model.clock.has_drive else "")
     lines = [f"{model.name}: {model.title}", seen, "", "states"]
     lines += padded([(s.name, s.unit, s.meaning) for s in model.states])
     lines += ["", "parameters"]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from magpend_core.defaults import ATOL, RTOL
+from magpend_core.models.clock import DRIVEN
 from pipeline.cli import console
 from pipeline.cli.common import PresetName, Set, read_pairs
 from pipeline.cli.models import DEFAULT, names
@@ -19,7 +20,6 @@ from pipeline.cli.plot import check_figure_path
 if TYPE_CHECKING:
     import xarray as xr
 
-DEFAULT_HZ = 2.2
 
 ModelName = Annotated[
     str | None,
@@ -33,7 +33,7 @@ Frequency = Annotated[
     typer.Option(
         "--frequency-hz",
         "--frequency",
-        help=f"Drive frequency [Hz]; by default {DEFAULT_HZ:g}. Without a drive a period is 1 s.",
+        help=f"Drive frequency [Hz]; by default {DRIVEN.default_hz:g}. Without a drive a period is 1 s.",
     ),
 ]
 
@@ -83,8 +83,8 @@ def simulate(
         check_figure_path(target)
     overrides = read_pairs("--set", settings or [], "q=1.5")
     frequency, overrides = simulation.with_rate(overrides.pop("frequency", frequency_hz), overrides, chosen)
-    if frequency is None and drive is None and not chosen.autonomous:
-        frequency = DEFAULT_HZ
+    if frequency is None and drive is None:
+        frequency = chosen.clock.default_hz
     ds = simulation.simulate(
         frequency,
         simulation.start_of(chosen, read_states(context.args)),

@@ -138,8 +138,8 @@ SUFFIXES = (".csv", ".nc")
 MAX_SAMPLES = 100_000_000
 DEGREES = "_deg"
 DEFAULT_PERIODS = 10
-CLOCK_HZ, FLOW_PERIODS = 1.0, 50
-"""Frequency that stands for a missing drive (periods are seconds), and the default number of its periods."""
+FLOW_PERIODS = 50
+"""Default number of a flow's strobe periods."""
 
 
 @dataclass(frozen=True)
@@ -206,10 +206,10 @@ def simulate(
     from magpend_core.models.parameters import ParameterError
 
     chosen = load_model(model)
-    if chosen.is_map:
+    if not chosen.clock.is_continuous:
         raise SpecError(f"{chosen.name} is a map, without motion between its iterations: run it with magpend run.")
-    if chosen.autonomous and drive is None:
-        frequency_hz = CLOCK_HZ if frequency_hz is None else frequency_hz
+    if drive is None and not chosen.clock.has_drive:
+        frequency_hz = chosen.clock.default_hz if frequency_hz is None else frequency_hz
         n_periods = FLOW_PERIODS if n_periods is None else n_periods
     series = Series(n_transient, n_periods, samples_per_period, rtol, atol)
     problems = _problems(series) + _state_problems(chosen, initial_state)
@@ -288,8 +288,7 @@ def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray
     names = [q.name for q in parameters.model.quantities]
     values = evaluate(names, time, states, parameters, frequency_hz)
     ds = _labelled(parameters, time, f"time since {parameters.model.section}", states, values)
-    # a flow has no drive, and no section at even times
-    if parameters.model.autonomous:
+    if not parameters.model.clock.has_drive:  # no period to close on
         return ds
     return ds.assign_attrs(frequency_hz=float(frequency_hz), **_closing(sections, parameters, series))
 

@@ -140,7 +140,7 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
     """
     model = spec.model
     found = [Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model)) for a in parameter_axes(spec)]
-    if FREQUENCY not in spec.axes and spec.model.clock_hz is None:
+    if FREQUENCY not in spec.axes and spec.model.clock.hertz is None:
         attrs = {"units": "Hz", "long_name": spec.motion.frequency_meaning}
         value = np.array(spec.frequency_hz, dtype=np.float64)
         found.append(Coordinate(FREQUENCY_DIM, (), value, attrs))

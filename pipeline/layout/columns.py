@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pipeline.layout.vocabulary import parameter_name, period_of, periods_of, time_unit
+from magpend_core.models.clock import DRIVEN
+from pipeline.layout.vocabulary import parameter_name
 from pipeline.products.column import OWN, POINTS, STATES, Column, over
 from pipeline.specification.tables import FREQUENCY
 
@@ -45,7 +46,8 @@ def described(ds: xr.Dataset, columns: Iterable[Column], model: Model | None = N
     Dataset
         Texts have no unit.
     """
-    words = {"period": period_of(model), "periods": periods_of(model), "time": time_unit(model)}
+    clock = DRIVEN if model is None else model.clock
+    words = {"period": clock.period, "periods": clock.periods, "time": clock.unit}
     words |= {"unit": str(ds.attrs.get("unit", "1"))}
     units = ", ".join(model.state_units) if model is not None else ""
 

@@ -53,7 +53,7 @@ def check_starts(spec: Spec) -> None:
     points = parameter_points(spec)
     model = load_model(spec.reference)
     check_states(model, states.at(chosen), points)
-    if isinstance(model, TextModel) and not model.autonomous and spec.drive is None:
+    if isinstance(model, TextModel) and model.clock.has_drive and spec.drive is None:
         _check_period(model, states.at(chosen[: len(SHARES)]), points)
 
 

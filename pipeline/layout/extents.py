@@ -114,9 +114,9 @@ def _measured(spec: Spec, model: TextModel) -> dict[str, tuple[float, tuple[floa
         )
     columns["f"] = columns.pop(FREQUENCY)
     n_periods = spec.integration.n_transient + spec.integration.n_keep
-    motion = _Motion(model.definition, columns)
+    motion, seconds = _Motion(model.definition, columns), n_periods / columns["f"]
     with np.errstate(all="ignore"):
-        times, path = motion.iterated(y, n_periods) if model.is_map else motion.path(y, n_periods / columns["f"])
+        times, path = motion.path(y, seconds) if model.clock.is_continuous else motion.iterated(y, n_periods)
         own = [(natural_size(*_size(times, np.abs(x))), _extent(times, x)) for x in path.transpose(1, 0, 2)]
     return dict(zip(model.state_names, own, strict=True))
 
@@ -186,7 +186,7 @@ class _Motion:
         A cell that has arrived at its end, or fails, stays where it is.
         """
         t, slope = np.zeros(y.shape[1]), self._rates(np.zeros(y.shape[1]), y)
-        longest = ends / PER_PERIOD if self.definition.autonomous else 1.0 / (self.columns["f"] * PER_PERIOD)
+        longest = 1.0 / (self.columns["f"] * PER_PERIOD) if self.definition.has_drive else ends / PER_PERIOD
         least = TOLERANCE * np.ptp(y, axis=1, keepdims=True)  # a cell that begins at rest hardly moves
         pace = np.where(least > 0.0, np.abs(slope) * TOLERANCE / least, 0.0).max(axis=0)
         h = np.minimum(longest, TOLERANCE * np.where(pace > 0.0, 1.0 / pace, longest))

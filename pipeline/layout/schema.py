@@ -12,7 +12,6 @@ from dataclasses import replace
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.layout.vocabulary import periods_of
 from pipeline.products.product import Options, Variable, flag_attrs
 from pipeline.products.registry import CELL_PRODUCTS
 
@@ -30,10 +29,10 @@ def base_variables(model: Model) -> tuple[Variable, ...]:
     section = Variable(
         "section", ("period_index", "state"), "float64", math.nan, "", f"state at {model.section}{wrapped}", units
     )
-    turns = Variable("turns", (model.angle_dim,), "int32", 0, "1", f"full turns over the kept {periods_of(model)}")
+    turns = Variable("turns", (model.angle_dim,), "int32", 0, "1", f"full turns over the kept {model.clock.periods}")
     flow = (RETURN_TIME, replace(REST_STATE, attrs=units)) if model.crossing is not None else ()
     noise = (STRONG_ERROR,) if model.disturbance is not None else ()
-    return (section, *([turns] if model.angles else []), *_counts(periods_of(model)), *flow, *noise)
+    return (section, *([turns] if model.angles else []), *_counts(model.clock.periods), *flow, *noise)
 
 
 RETURN_TIME = Variable("return_time", ("period_index",), "float64", math.nan, "s", "time since the crossing before")

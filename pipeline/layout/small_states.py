@@ -38,7 +38,7 @@ def small_states(ds: xr.Dataset) -> list[str]:
         return []
     model = model_of(ds)
     whole = model.flow
-    if not isinstance(whole, TextModel) or whole.is_map or model.disturbance is not None:
+    if not isinstance(whole, TextModel) or not whole.clock.is_continuous or model.disturbance is not None:
         return []
     values = dict(parameters_of(ds).items())
     logs = one_sided(whole, values)

@@ -181,7 +181,7 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
     """Return the drive frequency at a parameter point [Hz]; NaN if it is unknown.
 
-    For a map, and for a flow with sections at crossings, it is `Model.clock_hz`, as in the engine.
+    For a map, and for a flow with sections at crossings, it is `Model.clock.hertz`, as in the engine.
 
     Parameters
     ----------
@@ -190,8 +190,8 @@ def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
     values
         Coordinates of the point by name.
     """
-    if model is not None and model.clock_hz is not None:
-        return model.clock_hz
+    if model is not None and model.clock.hertz is not None:
+        return model.clock.hertz
     return float(values.get(FREQUENCY_DIM, math.nan))
 
 
@@ -234,43 +234,3 @@ def letter(attractor: int) -> str:
         attractor, digit = divmod(attractor - 1, 26)
         text = chr(ord("A") + digit) + text
     return text
-
-
-def period_of(model: Model | None) -> str:
-    """Return the word for the time between two section points: drive period, return, iteration or strobe period."""
-    if model is None:
-        return "drive period"
-    if model.is_map:
-        return "iteration"
-    if model.crossing is not None:
-        return "return"
-    return "strobe period" if model.autonomous else "drive period"
-
-
-def periods_of(model: Model | None) -> str:
-    """Return the plural of the word that `period_of` returns."""
-    return f"{period_of(model)}s"
-
-
-def time_unit(model: Model | None) -> str:
-    """Return the unit of the time in which exponents count: s, or iteration of a map."""
-    return "iteration" if model is not None and model.is_map else "s"
-
-
-def samples_per_period(model: Model, n: int) -> int:
-    """Return the number of instants at which a period is sampled: `n`, but 1 of a map, which has its iterates alone."""
-    return 1 if model.is_map else n
-
-
-def section_name(model: Model | None) -> str:
-    """Return the name of a model's section: stroboscopic, Poincar\u00e9, or the iterates of a map."""
-    if model is not None and model.is_map:
-        return "iterates"
-    return "stroboscopic section" if model is None or model.crossing is None else "Poincar\u00e9 section"
-
-
-def once(model: Model | None) -> str:
-    """Return the phrase for the instants of section points, such as "once per drive period"."""
-    if model is None or model.crossing is None:
-        return f"once per {period_of(model)}"
-    return f"crossing of {model.crossing.sentence}"

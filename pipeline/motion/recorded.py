@@ -25,8 +25,11 @@ class Recorded(Steady):
     drive: RecordedDrive
 
     kind: ClassVar[str] = "recorded"
-    frequency_meaning: ClassVar[str] = "mean frequency of the recorded drive"
     has_quantities: ClassVar[bool] = False  # the drive is another one at each section
+
+    @property
+    def frequency_meaning(self) -> str:
+        return "mean frequency of the recorded drive"
 
     @property
     def obstacle(self) -> str:

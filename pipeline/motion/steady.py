@@ -80,9 +80,13 @@ class Steady:
     kind: ClassVar[str] = "steady"
     """The kind of motion that an `Analysis` is for."""
 
-    frequency_meaning: ClassVar[str] = "drive frequency"
     has_quantities: ClassVar[bool] = True
     """Whether the model's quantities follow from a section point."""
+
+    @property
+    def frequency_meaning(self) -> str:
+        """Meaning of the frequency that a specification gives or sweeps."""
+        return self.model.clock.frequency
 
     @property
     def obstacle(self) -> str:
@@ -102,7 +106,7 @@ class Steady:
 
     def unsuited(self, analysis: Analysis) -> str:
         """Return the sentences that refuse an analysis that is for another kind of motion; empty if it suits."""
-        if self.model.is_map and analysis.name in NOT_OF_MAPS:
+        if not self.model.clock.is_continuous and analysis.name in NOT_OF_MAPS:
             return f"{analysis.name} follows the motion over a period; {self.model.name} is a map, of iterates alone."
         if self.kind in analysis.motions:
             return ""
@@ -120,7 +124,7 @@ class Steady:
 
     def seconds_per_period(self, frequency_hz: np.ndarray) -> np.ndarray:
         """Estimate the computing time per drive period of one trajectory on one core [s], by a rule of thumb."""
-        if self.model.is_map:
+        if not self.model.clock.is_continuous:
             return np.full(np.shape(frequency_hz), MICROSECONDS_PER_ITERATION * 1e-6)
         microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND / np.asarray(frequency_hz)
         return np.asarray(microseconds * 1e-6 * (RTOL_OF_RULE / self.integration.rtol) ** (1 / ROOT))

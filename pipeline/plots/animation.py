@@ -68,7 +68,7 @@ class Animation:
         data = self.figure.data
         shown, frequencies = float(data["time"][-1]), np.unique(data["drive_frequency"].values)
         told = f"{shown:.4g} s of the model"
-        if not model_of(data).autonomous and len(frequencies) == 1:
+        if model_of(data).clock.has_drive and len(frequencies) == 1:
             told += f" ({shown * frequencies[0]:.4g} drive periods)"
         told += f", {float(data.attrs['speed']):.3g} \N{MULTIPLICATION SIGN} real time"
         return f"{self.n_frames} frames, {self.n_frames / self.fps:.3g} s: {told}"

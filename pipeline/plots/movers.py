@@ -249,7 +249,7 @@ def _scale_bar(ax: Axes, width: float, unit: str) -> None:
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeLabel:
     """Text that shows the time of the model in a film, in drive periods or in seconds."""
 
     text: Any
@@ -265,10 +265,10 @@ class Clock:
         return [self.text]
 
 
-def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
-    """Write the speed of a film into its figure, and return the clock that shows the time of the model."""
+def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> TimeLabel:
+    """Write the speed of a film into its figure, and return the label that shows the time of the model."""
     frequencies = ds["drive_frequency"].values
-    forced = not model_of(ds).autonomous and np.ptp(frequencies) == 0.0
+    forced = model_of(ds).clock.has_drive and np.ptp(frequencies) == 0.0
     width, height = fig.get_size_inches()
     size = fig.look.tick - 1.0
     y = 0.06 / height
@@ -282,4 +282,4 @@ def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
             fig.text(1.0 - 0.1 / width, y, words, fontsize=size, color="0.35", va="bottom", ha="right")
             break
     period = 1.0 / float(frequencies[0]) if forced else 0.0
-    return Clock(text, ds["time"].values, period)
+    return TimeLabel(text, ds["time"].values, period)

@@ -35,7 +35,6 @@ from pipeline.layout.vocabulary import (
     UNSTABLE,
     letter,
     model_of,
-    period_of,
 )
 from pipeline.plots import style
 from pipeline.results import outcomes
@@ -205,7 +204,7 @@ def describe(one: xr.Dataset) -> str:
         return "absent"
     words = _words(one, one["side"].values.ravel()[present]) if "side" in one else ""
     kinds, periods = (one[name].values.ravel()[present] for name in ("kind", "orbit_period"))
-    told = _periods(periods, kinds, model_of(one).autonomous) + _seconds(one)
+    told = _periods(periods, kinds) + _seconds(one)
     return style.join([told, words, _turns(one, present), _stability(one)])
 
 
@@ -216,7 +215,7 @@ def _stability(one: xr.Dataset) -> str:
 
 
 def _seconds(one: xr.Dataset) -> str:
-    if not model_of(one).autonomous or "period_s" not in one:
+    if not model_of(one).clock.has_equilibria or "period_s" not in one:
         return ""
     known = one["period_s"].values[np.isfinite(one["period_s"].values)]
     if not known.size:
@@ -225,13 +224,13 @@ def _seconds(one: xr.Dataset) -> str:
     return f" ({low if low == high else f'{low} to {high}'}\u00a0s)"
 
 
-def _periods(periods: np.ndarray, kinds: np.ndarray, is_flow: bool) -> str:
+def _periods(periods: np.ndarray, kinds: np.ndarray) -> str:
     closed = sorted({int(p) for p in periods if p > 0})
     parts = []
     if closed:
         listed = ", ".join(map(str, closed)) if len(closed) < 4 else f"{closed[0]} to {closed[-1]}"
         parts.append(f"period {listed}")
-    words = ("limit cycle" if is_flow else "not periodic", "quasi-periodic", "chaotic", "not periodic", "at rest")
+    words = ("limit cycle", "quasi-periodic", "chaotic", "not periodic", "at rest")
     for kind, text in zip(_KINDS, words, strict=True):
         if ((periods == 0) & (kinds == kind)).any() and text not in parts:
             parts.append(text)
@@ -256,7 +255,7 @@ def _turns(one: xr.Dataset, present: np.ndarray) -> str:
         return ""
     told = [_signed(x) for x in turns.mean(axis=0)]
     word = "turn" if told in (["+1"], ["\N{MINUS SIGN}1"]) else "turns"
-    return f"{' and '.join(told)} {word} per {period_of(model_of(one))}"
+    return f"{' and '.join(told)} {word} per {model_of(one).clock.period}"
 
 
 def _signed(turns: float) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model
-from pipeline.layout.vocabulary import model_of, section_name, split_dims
+from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, palette, pixels, style
 from pipeline.plots.bifurcation import absent_handles, fixed_of, say_empty
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
@@ -84,7 +84,7 @@ def plot_section(
     data = pixels.draw_points([pixels.Panel(ax, (0,))], view, diameter)
     for axis, m in zip("xy", measures, strict=True):
         data[axis].attrs = {"units": m.unit, "long_name": m.name}
-    fig.data = data.assign_coords(fixed_of(part)).assign_attrs(title=section_name(model_of(part)))
+    fig.data = data.assign_coords(fixed_of(part)).assign_attrs(title=model_of(part).clock.section)
     return fig
 
 

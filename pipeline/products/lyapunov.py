@@ -92,7 +92,7 @@ LYAPUNOV_VARIABLES = (
 
 
 def _variables(options: LyapunovOptions, model: Any) -> tuple[Variable, ...]:
-    if not model.is_map:
+    if model.clock.is_continuous:
         return LYAPUNOV_VARIABLES
     words = {
         "lyapunov": "Lyapunov exponents per iteration, in falling order",

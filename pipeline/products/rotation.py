@@ -105,7 +105,7 @@ def _settled(options: RotationOptions, model: Any) -> RotationOptions:
     if len(set(of)) < len(of):
         raise ValueError(f"of: {of[0]} is given twice; name two different states.")
     # a map has no path between its points, whose turns could be counted
-    of_section = options.section or (model.is_map and len(of) > 1)
+    of_section = options.section or (len(of) > 1 and not model.clock.is_continuous)
     return options.model_copy(update={"of": of, "section": of_section})
 
 

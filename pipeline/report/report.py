@@ -156,7 +156,7 @@ def _parameters(shown: Shown) -> Iterator[Block]:
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
     rows = []
     rate, hertz = RATES[run.spec.rate], run.spec.frequency_hz
-    if hertz and rate.column not in swept and run.model.clock_hz is None:
+    if hertz and rate.column not in swept and run.model.clock.hertz is None:
         rows.append((rate.meaning, f"{rate.given(hertz):g}", rate.unit, "of the forcing", "the specification"))
     for p in run.model.parameters:
         source = chosen.provenance.get(p.name, f"preset {chosen.name}")

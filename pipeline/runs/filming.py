@@ -37,9 +37,6 @@ if TYPE_CHECKING:
     from magpend_core.models.model import Parameters
     from pipeline.plots.animation import Animation
 
-CLOCK_HZ, DEFAULT_HZ = 1.0, 2.2
-"""Frequency of a start's periods for a model without a drive, and default drive frequency."""
-
 
 @dataclass(frozen=True)
 class Start:
@@ -157,7 +154,7 @@ def _alone(start: Start) -> instants.Moving:
     _refuse_map(model)
     frequency = start.frequency_hz
     if frequency is None:
-        frequency = CLOCK_HZ if model.autonomous else DEFAULT_HZ
+        frequency = model.clock.default_hz
     state = start_of(model, start.state)
     parameters = model.load(start.preset, **start.overrides)
     check_states(model, np.array([state]), [{**parameters, FREQUENCY: frequency}])
@@ -165,7 +162,7 @@ def _alone(start: Start) -> instants.Moving:
 
 
 def _refuse_map(model: Model) -> None:
-    if model.is_map:
+    if not model.clock.is_continuous:
         raise SpecError(f"{model.name} is a map, without motion between its iterations to animate; draw its section.")
 
 
@@ -268,7 +265,7 @@ def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
         return 0.0
     if kind != PERIODIC_ORBIT:
         return math.nan
-    if parameters.model.crossing is None and periods and not parameters.model.autonomous:
+    if parameters.model.clock.has_drive:
         return periods / frequency
     return float(one["period_s"]) if "period_s" in one else math.nan
 
@@ -316,12 +313,9 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
             problems.append(f"--cell {number}: has no sections to start from ({status.sentence}).")
             continue
         parameters, frequency = _at_point(cube, one)
-        period = int(one["orbit_period"]) / frequency if "orbit_period" in one else 0.0
-        seen_by_drive = not parameters.model.autonomous and period > 0.0
+        periods = int(one["orbit_period"]) if parameters.model.clock.has_drive else 0
         name = f"cell {number}: {_where(one)}"
-        moving.append(
-            Moving(name, colour, parameters, frequency, points[0], points, period if seen_by_drive else math.nan)
-        )
+        moving.append(Moving(name, colour, parameters, frequency, points[0], points, periods / frequency or math.nan))
     if problems:
         raise SpecError(problems)
     return moving

@@ -105,7 +105,7 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
 
 def _cycle(one: Moving) -> float:
     """Return the time unit of a motion [s]: the drive period or, without a drive, the period of the orbit."""
-    if not one.parameters.model.autonomous:
+    if one.parameters.model.clock.has_drive:
         return 1.0 / one.frequency_hz
     return one.period_s if one.period_s > 0.0 else 2.0
 

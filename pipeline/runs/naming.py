@@ -146,7 +146,7 @@ def _swept(run: RunDirectory, others: Iterable[str]) -> str:
             + " or ".join(f"--parameter={name}" for name in swept)
             + "."
         )
-    if swept or run.model.clock_hz is None:
+    if swept or run.model.clock.hertz is None:
         return swept[0] if swept else FREQUENCY
     known = ", ".join(run.model.parameter_names)
     raise SpecError(

@@ -45,7 +45,7 @@ def first_figure(run: RunDirectory) -> str:
         return "section"
     if any(not is_start_dim(d) for d in plan.dims):
         return "bifurcation"
-    return "section" if run.model.is_map else "gallery"
+    return "gallery" if run.model.clock.is_continuous else "section"
 
 
 def figure_command(run: RunDirectory) -> str:

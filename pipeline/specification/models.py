@@ -108,10 +108,10 @@ def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Mode
             return None
     if not isinstance(reference, Mapping) or not isinstance(reference.get("states"), Mapping):
         return None
-    is_map, quantities = reference.get("kind") == "map", reference.get("quantities", {})
-    rate = "0*t" if forced and not is_map else "0"
+    kind, quantities = "map" if reference.get("kind") == "map" else "flow", reference.get("quantities", {})
+    rate = "0*t" if forced and kind == "flow" else "0"
     table = {
-        "kind": "map" if is_map else "flow",
+        "kind": kind,
         "name": "stand-in",
         "states": reference["states"],
         "parameters": reference.get("parameters", {}),

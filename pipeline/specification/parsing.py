@@ -113,7 +113,7 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
         model = stand_in(data.get("model"), folder, forced="section" not in data)
     if model is None:
         raise SpecError(problems)
-    if model.is_map:
+    if not model.clock.is_continuous:
         problems += _map_problems(model, data)
         data = {key: table for key, table in data.items() if key not in _NOT_OF_MAPS}
         tables, drift = {**tables, **dict.fromkeys(_NOT_OF_MAPS)}, {}
@@ -129,8 +129,8 @@ def valid_tables(data: Mapping[str, Any], folder: str | Path | None) -> dict[str
     problems += size_problems(axes, starts)
     problems += _method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(data.get("parameters", {}))
-    has_periods = "drive" in data or "section" in data or model.autonomous or model.is_map
-    complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
+    is_periodic = model.clock.has_drive and "drive" not in data and "section" not in data
+    complete = is_periodic and not any(p.startswith(("axes", "parameters")) for p in problems)
     own = parameter_problems(known, seen, tuple(data.get("axes", {})), axes, complete)
     problems += [p for p in own if not follows(p, data, noise)]
     if ramps and not problems:

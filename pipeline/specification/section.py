@@ -61,12 +61,12 @@ def section_of(
         List to which problems are added.
     """
     if "section" not in data:
-        if model.autonomous:
+        if model.clock.has_equilibria:
             problems += _missing(model, data)
         return None
     if table is None:
         return None
-    if not model.autonomous:
+    if model.clock.has_drive:
         problems.append(
             f"section: {model.name} has a drive, so its sections are once per drive period "
             f"({model.section}); drop [section], or remove time from the equations."

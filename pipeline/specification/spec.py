@@ -246,10 +246,10 @@ class Spec:
     def frequency_hz(self) -> float | None:
         """Drive frequency [Hz], for a recorded drive its mean frequency; None if the frequency is swept.
 
-        For a map, and with a section by crossing, it is `Model.clock_hz`, as in the engine.
+        For a map, and with a section by crossing, it is `Model.clock.hertz`, as in the engine.
         """
-        if self.model.clock_hz is not None:
-            return self.model.clock_hz
+        if self.model.clock.hertz is not None:
+            return self.model.clock.hertz
         return self.parameters.hertz if self.recorded is None else self.recorded.frequency_hz
 
     @property

@@ -115,7 +115,7 @@ def rescaled(data: Mapping[str, Any], change: Change) -> tuple[dict[str, Any], U
     plain |= {"name": f"{model.name}-rescaled", "define": all_of("define"), "quantities": all_of("quantities")}
     plain["states"] = {s.name: {"unit": s.unit, "on_circle": s.on_circle} for s in model.states}
     equations = table["equations"]
-    is_map = model.is_map
+    is_map = not model.clock.is_continuous
     plain["equations"] = states_of(equations) if is_map else states_of(equations, units.time, 0.0 * units.zeros)
     plain["impacts"] = [{**one, "of": text(one["of"]), "set": reset(one["set"])} for one in table.get("impacts", [])]
     starts = initial_states(spec.initial_conditions)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from magpend_core.models.clock import DRIVEN, MAP, STROBED, Clock
 from magpend_core.models.model import Mirror, Preset, Quantity, State
 from magpend_core.models.parameters import Parameter
 from magpend_core.models.text.grammar import Tree, names
@@ -118,9 +119,11 @@ class Definition:
         return [*self.equations.values(), *of_impacts]
 
     @property
-    def autonomous(self) -> bool:
-        """Whether it is a flow, of which neither equations nor impacts depend on time or frequency."""
-        return not self.is_map and not self.has_drive
+    def clock(self) -> Clock:
+        """How the model counts time; a flow whose equations and impacts depend on neither time nor frequency is seen at
+        even times.
+        """
+        return MAP if self.is_map else DRIVEN if self.has_drive else STROBED
 
     @property
     def has_drive(self) -> bool:

@@ -93,7 +93,6 @@ class TextModel(Model):
 
 def model_of(definition: Definition, shipped: bool = False) -> TextModel:
     """Make a model from the validated definition of a model's text."""
-    section = "every iteration" if definition.is_map else "the start of the drive's period"
     return TextModel(
         name=definition.name,
         title=definition.title or definition.name,
@@ -101,13 +100,12 @@ def model_of(definition: Definition, shipped: bool = False) -> TextModel:
         parameters=definition.parameters,
         presets=definition.presets,
         system_path="",
-        section=definition.section or ("one instant of every period" if definition.autonomous else section),
+        section=definition.section or definition.clock.instant,
         quantities=definition.described,
         classifier=classifier_of(definition),
         mirror=definition.mirror,
         drawing=drawing_of(definition),
-        autonomous=definition.autonomous,
-        is_map=definition.is_map,
+        clock=definition.clock,
         text=None if shipped else definition.table,
         definition=definition,
         shipped=shipped,

@@ -11,7 +11,7 @@ import xarray as xr
 
 from pipeline.analysis.attractors.declaration import AttractorOptions, IdentifyOptions
 from pipeline.layout.small_states import small_states
-from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims, time_unit
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims
 from pipeline.products.product import Table
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import other_cells, sentence, share_interval, shares_of_others
@@ -200,7 +200,7 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
     out.
     """
-    lines, what = _growing_lines(ds), "the map" if model_of(ds).is_map else "the flow"
+    lines, what = _growing_lines(ds), f"the {model_of(ds).clock.system}"
     lines += ds.attrs.get(WITHOUT_DIGITS, "").splitlines()
     if any(row["evidence"] == "volume" for row in rows):
         if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
@@ -247,7 +247,7 @@ def _growing_lines(ds: xr.Dataset) -> list[str]:
     verbs = "grows without returning and is" if n == 1 else "grow without returning and are"
     return [
         f"{counted(n, 'cell')} {verbs} on no set: the distance from where they began grew {factor:.3g} times over "
-        f"{length} sections, at the end at a rate of {rates[at]:.3g} per {time_unit(model_of(ds))}"
+        f"{length} sections, at the end at a rate of {rates[at]:.3g} per {model_of(ds).clock.unit}"
     ]
 
 
@@ -266,7 +266,7 @@ def _attractor_words(row: Row, n_points: int, model: Model) -> Words:
         "rotation": " ".join(turns) or None,
         "|multiplier|": number(row["multiplier_modulus"], ".4g" if flow else ".4f"),
         "eigenvalue": _eigenvalue(row) if flow else None,
-        f"exponent per {time_unit(model)}": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
+        f"exponent per {model.clock.unit}": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
         "cells": str(row["n_cells"]),
         "share": with_interval(row, FRACTION, ".4f") if "fraction" in row else None,
         "mirror": _known(row["mirror_partner"]) if "mirror_partner" in row else None,

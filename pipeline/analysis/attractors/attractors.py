@@ -335,6 +335,6 @@ def _names(dynamics: Dynamics) -> list[str]:
         "mirror_": model is None or model.mirror is None,
         "side": model is None or model.classifier is None,
         "rotation": not dynamics.n_angles,
-        "eigenvalue_": model is None or not model.autonomous,
+        "eigenvalue_": model is None or not model.clock.has_equilibria,
     }
     return [name for name in _TABLE if not any(name.startswith(k) and out for k, out in left_out.items())]

@@ -29,7 +29,7 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
 from pipeline.analysis.flown import flown
-from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, samples_per_period
+from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.results.sets import TWO_PI, Geometry, hashes, mean_distance, order_of_points, rows_by_number
 from pipeline.results.sides import UNKNOWN
 from pipeline.results.tolerances import PORTRAIT_RTOL
@@ -188,7 +188,7 @@ def follow_orbits(orbits: Sequence[tuple[Features, Parameters, float]], geometry
 
 def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry) -> None:
     flows = [of_flow(parameters) for _, parameters, _ in orbits]
-    per = samples_per_period(flows[0].model, SAMPLES)
+    per = flows[0].model.clock.samples(SAMPLES)
     times = [np.arange(period * per + 1) / (per * frequency) for _, _, frequency in orbits]
     paths = sample(
         flows[0].model.system,

@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, once, parameters_of, told_by
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, parameters_of, told_by
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.trajectory import DrawnMotion, draw_path, draw_portrait, equalise, fixed_handles
@@ -192,7 +192,7 @@ def _write_head(fig: style.DataFigure, text: str, data: xr.Dataset, shown: set[s
     width, height = fig.get_size_inches()
     size = fig.look.legend
     fig.text(0.08 / width, 1.0 - 0.06 / height, text, fontsize=size, va="top", linespacing=1.1)
-    handles: list[Any] = [style.dot(once(model_of(data)), "black", 3.0), *_fixed_handles(data, shown)]
+    handles: list[Any] = [style.dot(model_of(data).clock.once, "black", 3.0), *_fixed_handles(data, shown)]
     fig.legend(
         handles=handles,
         loc="upper left",
@@ -218,7 +218,7 @@ def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     from pipeline.analysis.attractors.portraits import portraits
 
     at, notes = values_of(run, options)
-    if run.model.is_map:
+    if not run.model.clock.is_continuous:
         raise ValueError(f"{run.model.name} is a map, without motion between its iterations; draw its section.")
     found = run.derive("attractors")
     figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.layout.vocabulary import APERIODIC, model_of, periods_of
+from pipeline.layout.vocabulary import APERIODIC, model_of
 from pipeline.products.product import Options, Table
 from pipeline.results.ragged import SET, dims_of
 from pipeline.results.run import OpenRun
@@ -59,7 +59,7 @@ def settling_table(ds: xr.Dataset) -> Table:
     if not rows:
         header = (*dims, "attractor_id", *header_of(ds, SET, _row), "to")
         return Table(rows, ["sets that do not close: none, so there is nothing to extend"], header=header)
-    head = f"sets that do not close: {len(rows)}; lifetimes are in {periods_of(model_of(ds))}"
+    head = f"sets that do not close: {len(rows)}; lifetimes are in {model_of(ds).clock.periods}"
     return Table(rows, [head, *aligned([_words(ds, row, dims) for row in rows])])
 
 

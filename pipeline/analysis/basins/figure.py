@@ -12,7 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.basins.declaration import BasinFigureOptions
-from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of, periods_of
+from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.results.outcomes import outcomes
@@ -86,7 +86,7 @@ def plot_basins(
     style.limits(ax, frame)
     _dress(ax, attractors, axes, degrees)
     if scale is not None:
-        _draw_scale(fig, ax, scale, periods_of(model_of(attractors)))
+        _draw_scale(fig, ax, scale, model_of(attractors).clock.periods)
     style.complete(fig, ax, labels.caption(part, drop=axes))
     _write_letters(ax, codes, cast)
     return fig

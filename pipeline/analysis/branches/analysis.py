@@ -207,7 +207,7 @@ def table_of(ds: xr.Dataset, once: bool = False) -> list[Row]:
                 "normal_form_error": float(one["normal_form_error"]),
                 "unstable_below": below,
                 "unstable_above": above,
-                **({} if model_of(ds).is_map else {"period_s": float(one["bifurcation_period_s"])}),
+                **({"period_s": float(one["bifurcation_period_s"])} if model_of(ds).clock.is_continuous else {}),
                 **fixed_of(ds, branch),
                 "branch": branch,
                 "to_branch": int(one["to_branch"]),

@@ -45,7 +45,7 @@ def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, flo
     if problems:
         raise SpecError(problems)
     if options.all_equilibria or options.within:
-        if not has_equilibria(model):
+        if not model.clock.has_equilibria:
             raise SpecError(
                 f"--all-equilibria: {model.name} is no flow without a drive; --isolas finds all its orbits."
             )
@@ -53,11 +53,6 @@ def check_asked(run: OpenRun, options: BranchOptions, interval: tuple[float, flo
             raise SpecError("--within is the box of --all-equilibria; give that, too, such as --all-equilibria 1.")
         if problems := _box_problems(model, options.within):
             raise SpecError(problems)
-
-
-def has_equilibria(model: Model) -> bool:
-    """Return whether a model is a flow without a drive."""
-    return model.autonomous and not model.is_map
 
 
 def start_problems(model: Model, options: StartOptions, *others: str, word: str = FREQUENCY) -> list[str]:
@@ -71,7 +66,7 @@ def start_problems(model: Model, options: StartOptions, *others: str, word: str 
     problems = [f"--start: {unknown_name('state', one, told)}" for one in options.start if one not in known]
     if missing := [state for state in model.state_names if state not in options.start]:
         problems.append(f"--start: give all states; missing: {', '.join(missing)}.")
-    if options.start_period == 0 and not has_equilibria(model):
+    if options.start_period == 0 and not model.clock.has_equilibria:
         problems.append(f"--start-period 0: {model.name} has no equilibria; its orbits have period 1 or more.")
     return problems
 
@@ -101,7 +96,7 @@ def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, fl
     default = own if interval[0] <= own <= interval[1] and name not in cube.dims else interval[0]
     value = options.start.get(parameter_name(name), default)
     state = np.array([options.start[state] for state in run.model.state_names])
-    rests = has_equilibria(run.model) and (run.model.crossing is None or not options.start_period)
+    rests = run.model.clock.has_equilibria and (run.model.crossing is None or not options.start_period)
     period, starts, lines = (0 if rests else options.start_period), [], []
     for _, where, family in rows_of(cube, base, name, interval[1] - interval[0]):
         there = family_at(family, value)

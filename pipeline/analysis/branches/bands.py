@@ -245,8 +245,8 @@ def moving_of(drawn: xr.Dataset, parameter: str) -> list[str]:
 def _along(options: BandOptions, interval: tuple[float, float], base: Parameters, located: xr.Dataset) -> Along:
     told = [str(v.attrs.get("long_name", "")) for v in located.coords.values() if v.dims == ("branch",)]
     varying = [text.removeprefix("value of ") for text in told if text.startswith("value of ")]
-    frequency = np.nan if base.model.clock_hz is None else base.model.clock_hz
-    if base.model.clock_hz is None and axis_name(options.parameter) != FREQUENCY and FREQUENCY in located:
+    frequency = np.nan if base.model.clock.hertz is None else base.model.clock.hertz
+    if base.model.clock.hertz is None and axis_name(options.parameter) != FREQUENCY and FREQUENCY in located:
         rates = np.unique(located[FREQUENCY].values)
         varying += [FREQUENCY] if len(rates) > 1 else []
         frequency = float(rates[0]) if len(rates) else np.nan

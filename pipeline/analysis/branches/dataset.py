@@ -201,7 +201,7 @@ def _per_branch(
         "first_end": column(first, "int8", **code_flags(ENDS)),
         "last_end": column(last, "int8", **code_flags(ENDS)),
     }
-    if (model is None or model.clock_hz is None) and not np.isnan(frequencies).all():
+    if (model is None or model.clock.hertz is None) and not np.isnan(frequencies).all():
         columns[FREQUENCY] = column(frequencies, "float64")
     found: dict[str, Any] = {name: ("branch", *column) for name, column in columns.items()}
     turns = np.array([rotation_of(b) for b in branches]).reshape(len(branches), n_angles)
@@ -271,7 +271,7 @@ def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
 def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
     per_return = 64  # instants per drive period or return at which the side of an orbit is judged
     family = branch.family
-    if not family.period or base.model.is_map:
+    if not family.period or not base.model.clock.is_continuous:
         return _point_sides(branch, base, classifier)
     own = base.replace(**dict(zip(base.names, map(float, family.parameters), strict=True)))
     name, flow = family.free[0], of_flow(own).model.system

@@ -30,7 +30,7 @@ def interval_along(run: OpenRun, parameter: str) -> tuple[float, float]:
 
 def refuse_frequency_of_flow(run: OpenRun, parameter: str) -> None:
     """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
-    if axis_name(parameter) == FREQUENCY_DIM and run.model.clock_hz is not None:
+    if axis_name(parameter) == FREQUENCY_DIM and run.model.clock.hertz is not None:
         swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
         raise SpecError(f"{run.model.name} has no drive frequency to follow; give --parameter: {known}.")

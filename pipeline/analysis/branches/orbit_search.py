@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from pipeline.analysis.branches.asked import has_equilibria, start_problems
+from pipeline.analysis.branches.asked import start_problems
 from pipeline.analysis.branches.declaration import OrbitOptions
 from pipeline.analysis.branches.deflation import (
     DeflationSettings,
@@ -115,7 +115,7 @@ def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, poi
 def orbits_table(ds: xr.Dataset) -> Table:
     """Return the table of the orbits found, with text lines on whether orbits may be missing."""
     model = model_of(ds)
-    at_rest = has_equilibria(model) and model.crossing is None  # at instants, a flow's fixed points are equilibria
+    at_rest = bool(model.clock.n_neutral)  # at instants, a flow's fixed points are equilibria
     rows = [_row(ds.isel(orbit=i), at_rest, model.crossing is not None) for i in range(ds.sizes["orbit"])]
     found = counted(len(rows), "fixed point" if at_rest else "orbit")
     lines = [f"{found} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]

@@ -187,8 +187,7 @@ def _polished(located: Located) -> Located | None:
 
 def _moving(model: Model, first: str) -> list[str]:
     """Return the names of the parameters that may move a bifurcation along the first one, with the drive frequency."""
-    has_drive = model.clock_hz is None and not model.autonomous
-    names = [*model.parameter_names, *([FREQUENCY] if has_drive else [])]
+    names = [*model.parameter_names, *([FREQUENCY] if model.clock.has_drive else [])]
     return [name for name in names if name not in (first, LEVEL)]
 
 

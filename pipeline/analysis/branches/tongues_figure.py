@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from pipeline.analysis.branches.declaration import TongueFigureOptions, TongueOptions
 from pipeline.analysis.branches.figure import take_room
 from pipeline.layout.conventions import shown_unit
-from pipeline.layout.vocabulary import model_of, period_of
+from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import fixed_of, swept_parameters
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
@@ -75,7 +75,7 @@ def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
         data = data.transpose(swept[1], swept[0])
     keep = {*data["rotation"].dims, *swept}
     data = data.drop_vars([c for c in data.coords if c not in keep])
-    data["rotation"].attrs = {"units": "1", "long_name": f"turns per {period_of(model_of(part))}"}
+    data["rotation"].attrs = {"units": "1", "long_name": f"turns per {model_of(part).clock.period}"}
     return data.assign_attrs(title="rotation numbers")
 
 

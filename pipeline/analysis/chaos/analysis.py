@@ -22,7 +22,7 @@ from pipeline.analysis.chaos.per_attractor import Nature, chaos_per_attractor, p
 from pipeline.analysis.chaos.section_samples import geometry_of
 from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, model_of, period_of, split_dims, time_unit
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, model_of, split_dims
 from pipeline.products.product import Table
 from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.results.run import OpenRun
@@ -98,7 +98,7 @@ def chaos_table(ds: xr.Dataset) -> Table:
     if n_points > FEW_POINTS:
         lines += _summary(ds, rows, dims)
     else:
-        unit = time_unit(model_of(ds))
+        unit = model_of(ds).clock.unit
         for _, where in points_of(ds, dims):
             lines += point_table(ds, where, rows, lambda row: _words(row, unit))
     lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
@@ -195,8 +195,8 @@ def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[
     period = with_error(row["lyapunov_1_per_period"], row["lyapunov_1_stderr_per_period"])
     place = ", ".join(f"{d} {row[d]:g}{unit_of(ds, d)}" for d in dims)
     who = f"attractor {row['attractor_id']}, {_nature_words(row)}"
-    unit = time_unit(model_of(ds))
-    each = f", {period} per {period_of(model_of(ds))}" if period != "-" and unit == "s" else ""
+    unit = model_of(ds).clock.unit
+    each = f", {period} per {model_of(ds).clock.period}" if period != "-" and unit == "s" else ""
     return [f"  largest exponent: {rate} per {unit}{each}, {who}, at {place}"]
 
 

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pipeline.analysis.chaos.declaration import ConvergenceOptions
-from pipeline.analysis.chaos.lyapunov import GOOD, CellMotion, period_seconds, pooled_mean, summarise
-from pipeline.analysis.chaos.lyapunov_figure import UNITS, left_out
-from pipeline.layout.vocabulary import model_of, period_of, periods_of, split_dims, time_unit
+from pipeline.analysis.chaos.lyapunov import GOOD, CellMotion, pooled_mean, rate_scale, summarise
+from pipeline.analysis.chaos.lyapunov_figure import UNITS, left_out, rate_unit
+from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, style
 from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.results.run import OpenRun
@@ -92,10 +92,8 @@ def plot_convergence(
     handles = _draw_running(top, final, data)
     for kind, colour in _COLOURS.items():
         _draw_cells(bottom, data, "in_block", kind, colour)
-    model = model_of(ds)
-    unit = "period" if per == "period" and not model.is_map else time_unit(model)
-    style.label_axes(top, y=f"$\\lambda_{exponent}$, mean so far [1/{unit}]")
-    style.label_axes(bottom, str(data["period"].attrs["long_name"]), f"in the block [1/{unit}]")
+    style.label_axes(top, y=f"$\\lambda_{exponent}$, mean so far [{rate_unit(data)}]")
+    style.label_axes(bottom, str(data["period"].attrs["long_name"]), f"in the block [{rate_unit(data)}]")
     top.set_xlim(0.0, 1.01 * float(data["period"][-1]))
     style.limits(top, frame)
     fig.align_ylabels([top, bottom])
@@ -111,9 +109,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
     if not 1 <= exponent <= part.sizes["exponent"]:
         raise ValueError(f"exponent is {exponent}, and the cube has 1 to {part.sizes['exponent']}")
     place = style.join([labels.caption(part, with_start=False), left_out(part)])
-    model = model_of(part)
-    per = "period" if model.is_map else per
-    scale = period_seconds(part) if per == "period" else 1.0
+    scale, attrs = rate_scale(part, per)
     chosen = xr.Dataset(
         {
             "running": summary["lyapunov_running"] * scale,
@@ -128,10 +124,10 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
     data = chosen.stack(cell=starts, create_index=False).transpose("cell", "block").rename(block="period").load()
     n, length = data.sizes["period"], int(part.attrs.get("lyapunov_n_periods", 0))
     axis = np.arange(1, n + 1) * (length / n if length else 1.0)
-    text = periods_of(model) if length else "blocks"
+    text = model_of(part).clock.periods if length else "blocks"
     data = data.assign_coords(period=("period", axis, {"long_name": text}))
     for name in ("running", "in_block", "exponent_value", "exponent_stderr"):
-        data[name].attrs.update(units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model))
+        data[name].attrs.update(attrs)
     return data.drop_vars([c for c in data.coords if c != "period"]).assign_attrs(
         title="convergence of a Lyapunov exponent", place=place, exponent=exponent
     )

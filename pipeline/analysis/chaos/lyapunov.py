@@ -110,12 +110,20 @@ def period_seconds(ds: xr.Dataset) -> xr.DataArray:
     """Return the time between successive section points [s]: the drive period, each cell's mean return time, or 1 of
     a map.
     """
-    if "model" in ds.attrs and model_of(ds).is_map:
-        return xr.DataArray(1.0)
     if "return_time" in ds:
         return ds["return_time"].mean("period_index")
     frequency = hertz_of(ds)
-    return 1.0 / (xr.DataArray(float(ds.attrs["frequency_hz"])) if frequency is None else frequency)
+    if frequency is None:
+        frequency = xr.DataArray(float(model_of(ds).clock.hertz or ds.attrs["frequency_hz"]))
+    return 1.0 / frequency
+
+
+def rate_scale(ds: xr.Dataset, per: str) -> tuple[xr.DataArray, dict[str, str]]:
+    """Return the factor to rates per ``s`` or ``period``, and the attributes of these; of a map per iteration."""
+    clock = model_of(ds).clock
+    if per == "s" and clock.is_continuous:
+        return xr.DataArray(1.0), {"units": "1/s", "per": "unit time"}
+    return period_seconds(ds), {"units": "1", "per": clock.period}
 
 
 def _running(blocks: xr.DataArray) -> xr.DataArray:

@@ -16,8 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.chaos.declaration import LyapunovFigureOptions
-from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents, period_seconds
-from pipeline.layout.vocabulary import model_of, period_of
+from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents, rate_scale
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import (
     Diagram,
@@ -49,8 +48,7 @@ def left_out(part: xr.Dataset) -> str:
 
 def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
     """Return the Lyapunov exponents and their errors per second or per period, with flags and classes of motion."""
-    per = "period" if model_of(part).is_map else per
-    scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
+    scale, attrs = rate_scale(part, per)
     chosen = part if spectrum else part.isel(exponent=slice(1))
     dims = chosen["lyapunov"].dims
     variables = {
@@ -62,9 +60,7 @@ def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
         variables["motion"] = motion_codes(part)
     data = xr.Dataset(variables).load()
     for name in ("exponent_value", "exponent_stderr"):
-        data[name].attrs.update(
-            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model_of(part))
-        )
+        data[name].attrs.update(attrs)
     # NetCDF cannot store object labels; the numbers of branches and starts suffice
     keep = {"exponent", *data["lyapunov_flag"].dims}
     keep |= {str(c) for c, v in data.coords.items() if not v.ndim and v.dtype.kind == "f"}

@@ -194,7 +194,7 @@ class Crises:
     def _connected(self, along: SectionMap, effort: Effort, sample: Sample, values: tuple[float, float]) -> Crisis:
         """Judge whether a set is lost where the unstable manifold of an equilibrium in it meets an unstable orbit."""
         scene, ds = self.scene, self.scene.located
-        if not scene.base.model.autonomous or along.family.system.section is None:
+        if scene.base.model.crossing is None:
             return Crisis("", "")
         far = values[0] + 2.0 * scene.scale * float(np.sign(values[1] - values[0]))
         parameter = scene.base.model.parameter(parameter_name(scene.axis))
@@ -243,7 +243,7 @@ class Crises:
         return None
 
     def _map(self, place: int) -> tuple[SectionMap, Effort]:
-        return map_along(self.scene, place), OF_MAP if self.scene.base.model.is_map else OF_FLOW
+        return map_along(self.scene, place), OF_FLOW if self.scene.base.model.clock.is_continuous else OF_MAP
 
     def _orbits(self, along: SectionMap, sample: Sample, seen: float, effort: Effort) -> list[Saddle]:
         """Return the saddle orbits at a parameter value: those of located branches, and those around the set."""

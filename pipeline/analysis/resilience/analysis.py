@@ -34,18 +34,7 @@ from pipeline.analysis.resilience.shocks import (
     sizes,
 )
 from pipeline.layout.evaluation import parameter_points
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    grid_dim,
-    letter,
-    model_of,
-    periods_of,
-    samples_per_period,
-    section_attributes,
-    split_dims,
-    time_unit,
-    told_by,
-)
+from pipeline.layout.vocabulary import ATTRACTS, grid_dim, letter, model_of, section_attributes, split_dims, told_by
 from pipeline.products.product import Table
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import DIVERGED, outcomes
@@ -347,12 +336,12 @@ def _head(ds: xr.Dataset) -> str:
     norm = {"euclidean": "root of the sum of squares", "largest": "largest"}[ds.attrs["resilience_norm"]]
     scales = zip(ds["state"].values, ds["state_scale"].values, strict=True)
     units = ", ".join(f"{name} {scale:g}" for name, scale in scales)
-    periods = periods_of(model_of(ds))
-    n_phases = samples_per_period(model_of(ds), int(ds.attrs["resilience_phases"]))
+    periods = model_of(ds).clock.periods
+    n_phases = model_of(ds).clock.samples(int(ds.attrs["resilience_phases"]))
     return (
         f"shocks of {ds.attrs['resilience_states']} at {n_phases} phase{'s' * (n_phases > 1)}, distances of all "
         f"states; sizes: {norm} of the jumps over their scales ({units}); times in {periods}, "
-        f"return times in {time_unit(model_of(ds))}"
+        f"return times in {model_of(ds).clock.unit}"
     )
 
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.resilience.declaration import ResilienceFigureOptions, ResilienceOptions
 from pipeline.layout.own_words import rate_of
-from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, periods_of
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of
 from pipeline.plots import labels, palette, style
 from pipeline.plots.bifurcation import swept_parameters
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
@@ -124,7 +124,7 @@ def _keys() -> list[Line2D]:
 
 def _dress(panels: Any, part: xr.Dataset, along: str, letters: list[str]) -> None:
     """Label the axes, and write what was disturbed."""
-    periods = periods_of(model_of(part))
+    periods = model_of(part).clock.periods
     for ax, text in zip(panels, ("basin stability", "smallest shock", f"arrival [{periods}]"), strict=True):
         style.label_axes(ax, None, text)
         ax.set_ylim(0.0, 1.08 * max(float(ax.dataLim.y1), 1e-300))

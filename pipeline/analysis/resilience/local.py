@@ -77,7 +77,7 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
     most = min(MOST_PHASES, MOST_ROWS // len(scales))
     if kind != PERIODIC_ORBIT or n_points > most:
         return Local()
-    is_cycle = model.autonomous
+    is_cycle = model.clock.has_equilibria
     own = of_flow(parameters) if is_cycle else parameters
     period = float(one["period_s"]) if is_cycle else 1.0 / frequency
     bases = bases_of(one, parameters, frequency, PHASES if is_cycle else min(PHASES, most // n_points))
@@ -86,13 +86,13 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
         return Local()
     n_phases = len(np.unique(bases.phase))
     grown, late = amplification_of_orbit(steps)
-    if model.is_map:
+    if not model.clock.is_continuous:
         with np.errstate(divide="ignore"):  # of a superstable point it is -inf
             reactivity = float(np.log(np.linalg.norm(steps, 2, axis=(1, 2)).max()))
     else:
         slopes = [jacobian(p * period, x, own, 1.0 / period) for p, x in zip(bases.phase, bases.states, strict=True)]
         reactivity = _growth(_scaled(np.array(slopes), scales))
-    back = _return_time(one, model.autonomous and model.crossing is None) * period * (1 if is_cycle else n_points)
+    back = _return_time(one, bool(model.clock.n_neutral)) * period * (1 if is_cycle else n_points)
     return Local(reactivity, grown, late * period / n_phases, back)
 
 

@@ -31,7 +31,7 @@ from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.flown import flown
 from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.together import answer_together
-from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, samples_per_period
+from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.products.reporting import report
 from pipeline.results.outcomes import DIVERGED
 
@@ -367,14 +367,14 @@ def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases
     kind = int(one["kind"])
     if kind == EQUILIBRIUM:
         return Bases(points[:1], np.zeros(1), np.ones(1, bool))
-    if parameters.model.autonomous:
+    if parameters.model.clock.has_equilibria:
         if kind == PERIODIC_ORBIT:
             period = float(one["period_s"])
             return _sampled(of_flow(parameters), points[:1], period, n_phases)
         points = points[:MOST_POINTS]
         return Bases(points, np.zeros(len(points)), np.ones(len(points), bool))
     n = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else MOST_POINTS
-    return _sampled(parameters, points[:n], 1.0 / frequency, samples_per_period(parameters.model, n_phases))
+    return _sampled(parameters, points[:n], 1.0 / frequency, parameters.model.clock.samples(n_phases))
 
 
 def _sampled(parameters: Parameters, points: np.ndarray, period: float, n_phases: int) -> Bases:

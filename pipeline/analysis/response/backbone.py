@@ -73,13 +73,13 @@ def settle_backbone(run: OpenRun, options: BackboneOptions) -> BackboneOptions:
     if unknown := [name for name in options.undamped if name not in model.parameter_names]:
         raise SpecError(unknown_name("parameter", unknown[0], model.parameter_names))
     found: dict[str, Any] = {"channel": channel}
-    if not model.autonomous:
+    if model.clock.has_drive:
         ends: BranchOptions = run.branch_options(FREQUENCY)
         bounds = ((ends.low, options.low), (ends.high, options.high))
         found["low"], found["high"] = interval_of(run, FREQUENCY, *(a if b is None else b for a, b in bounds))
     elif (options.low or 0.0) >= (options.high or np.inf):
         raise SpecError(f"--from {options.low:g}: must be less than --to {options.high:g}.")
-    driven = not model.autonomous and _swing(base, found["high"]).any()
+    driven = model.clock.has_drive and _swing(base, found["high"]).any()
     if driven:
         found |= _settled_force(base, options, found["high"])
     if options.undamped or not driven:
@@ -141,7 +141,7 @@ def _undamped(run: OpenRun, options: BackboneOptions) -> Parameters:
     swept = [n for n in base.names if n not in options.undamped and swept_axis(run, n) is not None]
     if swept:
         raise SpecError(f"the run sweeps {swept[0]}; give its value for normal modes, such as --undamped {swept[0]}=0.")
-    if not base.model.autonomous and _swing(base, _interval(options)[1]).any():
+    if base.model.clock.has_drive and _swing(base, _interval(options)[1]).any():
         raise SpecError("normal modes need a system without drive; switch it off, such as by --undamped F=0.")
     return base
 
@@ -224,7 +224,7 @@ def _follow_modes(run: OpenRun, options: BackboneOptions, curves: list[Curve], l
         where = ", ".join(f"{name} {x:.4g}" for name, x in zip(model.state_names, state, strict=True))
         undamped = (values.imag > 0.0) & (np.abs(values.real) <= IMAGINARY * np.abs(values))
         low, high = _interval(options)
-        if model.autonomous and undamped.any():
+        if not model.clock.has_drive and undamped.any():
             lines = values.imag[undamped] / (2.0 * np.pi)
             low, high = options.low or lines.min() / WIDE, options.high or lines.max() * WIDE
         for k in np.flatnonzero(values.imag > 0.0)[np.argsort(values.imag[values.imag > 0.0])]:

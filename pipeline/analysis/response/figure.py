@@ -76,7 +76,7 @@ def plot_response(
         raise ValueError(f"harmonic {harmonic} was not computed; it must be at most {ds.sizes['harmonic']}")
     turns = str(ds["unit"].sel(channel=channel).values).startswith("rad")
     measure = labels.quantity_measure(ds, channel, degrees and turns)
-    has_phase = model_of(ds).crossing is None and not model_of(ds).autonomous
+    has_phase = model_of(ds).clock.has_drive
     fig = style.new_figure(
         5.2 if has_phase else 4.0, with_points(style.storable(ds, "frequency response"), points), frame
     )

@@ -43,7 +43,7 @@ class Orbit(NamedTuple):
     @property
     def is_driven(self) -> bool:
         """Whether harmonics are those of a drive."""
-        return not of_flow(self.parameters).model.autonomous
+        return self.parameters.model.clock.has_drive
 
     @property
     def frequency_hz(self) -> float:

@@ -122,7 +122,7 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
 
 def refuse_map(model: Model, channel: str) -> None:
     """Raise ValueError if the model is a map: its series has one value per iterate and no course between them."""
-    if model.is_map:
+    if not model.clock.is_continuous:
         raise ValueError(
             f"channel {channel!r} has one value per iterate of the map {model.name}, and delay, maxima and neighbours "
             "of a series are those of a motion that is sampled in between. Of a run of the map, analyse chaos measures "

@@ -70,7 +70,7 @@ def needs_channel(run: OpenRun, options: SpectraOptions) -> None:
 def needs_axis(run: OpenRun, options: SpectrumFigureOptions | WaterfallOptions) -> None:
     """Raise ValueError unless the run has what a figure of spectra shows: one parameter point, or one axis."""
     needs_channel(run, options)
-    if options.axis == "order" and run.model.autonomous:
+    if options.axis == "order" and not run.model.clock.has_drive:
         raise ValueError("axis order: the model has no drive whose multiples orders could be; take Hz.")
     if isinstance(options, WaterfallOptions):
         free = [d for d in split_dims(run.cube()["status"])[0] if run.cube().sizes[d] > 1 and d not in options.at]
@@ -161,7 +161,7 @@ def _row(
     row |= {"estimate": AVERAGE, "rate_hz": rate}
     row["kept"] = found.power_below(n, options.scaling) / found.variance if found.variance else np.nan
     if motion.kind == TORUS:
-        drive = None if motion.parameters.model.autonomous else rate
+        drive = rate if motion.parameters.model.clock.has_drive else None
         own = frequencies_of(values, rate * n_samples, drive)
         row |= {"first_hz": own.first_hz, "explained": own.share}
         row["second_hz"] = own.second_hz if own.share >= ALL else np.nan
@@ -200,7 +200,7 @@ def _dataset(
         "frequency_hz": (both, table["frequency_hz"]),
         "attractor": (over, np.array([m.attractor for m in motions], np.int32)),
     }
-    if not model.autonomous:
+    if model.clock.has_drive:
         coords["order"] = (both, table["frequency_hz"] / rate[:, None])
     coords |= {str(k): v for k, v in cube.coords.items() if not v.ndim and v.dtype.kind == "f"}
     for name in motions[0].where:

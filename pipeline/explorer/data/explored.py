@@ -141,7 +141,7 @@ class ExploredRun(RunDirectory):
         swept = tuple(Axis(a.dim, a.parameter, a.values) for a in parameter_axes(self.spec))
         if swept:
             return swept
-        if self.spec.frequency_hz is not None and self.model.clock_hz is None:
+        if self.spec.frequency_hz is not None and self.model.clock.hertz is None:
             return (Axis(FREQUENCY_DIM, "frequency_hz", np.array([self.spec.frequency_hz]), False),)
         first = self.parameters.names[0]
         return (Axis(first, first, np.array([self.parameters[first]]), False),)

@@ -18,17 +18,7 @@ from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    BRANCH,
-    EVIDENCE,
-    KINDS,
-    PENDING,
-    STABILITIES,
-    UNSTABLE,
-    grid_dim,
-    samples_per_period,
-)
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
 from pipeline.plots.palette import motion_codes, motions_of
 from pipeline.results.outcomes import share_interval
 from pipeline.results.ragged import dense, dims_of, isel
@@ -111,7 +101,7 @@ def orbit_series(
     atol: float = 1e-9,
 ) -> dict[str, np.ndarray]:
     """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
-    n = max(1, min(n_periods * samples_per_period(parameters.model, SAMPLES), 65_536))
+    n = max(1, min(n_periods * parameters.model.clock.samples(SAMPLES), 65_536))
     times = seconds * np.arange(n + 1) / n
     return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)
 
@@ -264,7 +254,7 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
         "cell": cell.number,
         "at": {a.name: cell.index.get(a.name, 0) for a in run.axes},
         "parameters": cell.parameters.as_dict(),
-        "frequency": cell.clock_hz if run.model.clock_hz is None else None,
+        "frequency": cell.clock_hz if run.model.clock.hertz is None else None,
         "status": cell.status.name.lower().replace("_", " "),
         "status_meaning": cell.status.sentence,
         "motion": names.words[code] if names.told and code > 0 else None,

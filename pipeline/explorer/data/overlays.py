@@ -23,17 +23,7 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import finite, parts_of, share_bounds, shown
 from pipeline.explorer.data.verticals import vertical
 from pipeline.explorer.data.view import can_have
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    BRANCH,
-    FREQUENCY_DIM,
-    KINDS,
-    PERIODIC_ORBIT,
-    letter,
-    model_of,
-    periods_of,
-    time_unit,
-)
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, KINDS, PERIODIC_ORBIT, letter, model_of
 from pipeline.plots import palette
 from pipeline.plots.labels import state_measure
 from pipeline.results.outcomes import share_interval
@@ -84,7 +74,7 @@ def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Itera
         yield {
             "name": f"lyapunov{k + 1}",
             "title": f"Lyapunov exponent {k + 1}, mean over the starts",
-            "unit": f"1/{time_unit(run.model)}",
+            "unit": f"1/{run.model.clock.unit}",
             "group": "exponents",
             "colour": rgb(EXPONENT_COLOURS[k % len(EXPONENT_COLOURS)]),
             **{
@@ -113,7 +103,7 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
             yield {
                 "name": f"exponent {letter(number)}",
                 "title": f"largest exponent of {name}",
-                "unit": f"1/{time_unit(run.model)}",
+                "unit": f"1/{run.model.clock.unit}",
                 "group": "exponents",
                 "colour": colour,
                 "attractor": number,
@@ -262,7 +252,7 @@ def _set(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> 
         **shown(one),
         "period": int(one["orbit_period"]) or None,
         "period_s": finite(one["period_s"]),
-        "periods": periods_of(run.model),
+        "periods": run.model.clock.periods,
         "motion": classifier.words[side] if classifier is not None and side > 0 else None,
         "share": finite(one["share"]),
         **share_bounds(run, one),
@@ -349,7 +339,7 @@ def _shock(run: ExploredRun, one: xr.Dataset, name: str) -> dict[str, Any] | Non
         "high": finite(one[f"{name}_high"]),
         "phase": phase,
         # the motion of a flow from a state does not depend on the time
-        "startable": phase == 0.0 or run.model.autonomous,
+        "startable": phase == 0.0 or not run.model.clock.has_drive,
         "from": before.tolist(),
         "jump": jump.tolist(),
         "to": to,

@@ -149,7 +149,7 @@ def _attrs(
     return {
         **unknown,
         "parameters": parameters.as_dict(),
-        "frequency": clock_hz if run.model.clock_hz is None else None,
+        "frequency": clock_hz if run.model.clock.hertz is None else None,
         "status": "periodic",
         "status_meaning": f"an orbit at a bifurcation: {kind}",
         "kind": f"{kind}, period {period}",

@@ -15,16 +15,7 @@ from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import Axis, ExploredRun
 from pipeline.explorer.data.orbits import fixed_points
 from pipeline.explorer.data.verticals import plain, verticals
-from pipeline.layout.vocabulary import (
-    DIVERGED,
-    FAILED,
-    FREQUENCY_DIM,
-    PENDING,
-    grid_dim,
-    period_of,
-    section_name,
-    time_unit,
-)
+from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import AnalysedRun, prepared
 from pipeline.specification.problems import SpecError
@@ -106,9 +97,9 @@ def _model(run: ExploredRun) -> dict[str, Any]:
         "name": model.name,
         "title": model.title,
         "section": _section(model),
-        "period": period_of(model),
-        "time": time_unit(model),
-        "forced": not (model.autonomous or model.is_map),
+        "period": model.clock.period,
+        "time": model.clock.unit,
+        "forced": model.clock.has_drive,
         "states": [_named(s, s.on_circle, s.scale, s.rate or None) for s in model.states],
         "quantities": [_named(q, False, 1.0, None) for q in model.quantities],
         "parameters": [_parameter(run, p) for p in model.parameters],
@@ -123,8 +114,7 @@ def _named(one: Any, angle: bool, scale: float, rate: str | None) -> dict[str, A
 
 
 def _section(model: Model) -> str:
-    where = model.section if model.crossing is None else model.crossing.sentence
-    return f"{section_name(model)} at {where}"
+    return f"{model.clock.section} at {model.section}"
 
 
 def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
@@ -173,7 +163,7 @@ def _drawing(run: ExploredRun) -> dict[str, Any] | None:
 def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
     factor = 1.0  # by which the page multiplies what it shows
     if axis.name == FREQUENCY_DIM:
-        label = meaning = "strobe frequency" if run.model.autonomous else run.spec.motion.frequency_meaning
+        label = meaning = run.spec.motion.frequency_meaning
         unit = "Hz"
         if run.spec.rate == "omega":
             rate = RATES["omega"]

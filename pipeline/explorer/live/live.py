@@ -241,8 +241,8 @@ class LiveRun:
         return Place(parameters, hertz, index)
 
     def _frequency(self, given: float | None) -> float:
-        if self.model.clock_hz is not None:
-            return self.model.clock_hz
+        if self.model.clock.hertz is not None:
+            return self.model.clock.hertz
         axis = self.spec.axes.get(FREQUENCY)
         own = self.spec.frequency_hz
         if given is None:
@@ -337,7 +337,7 @@ class LiveRun:
         block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
         inputs = cells.inputs(block)
         values = dict(zip(self.spec.values.names, map(float, inputs.parameters[0, 0]), strict=True))
-        frequency = None if self.model.clock_hz is not None else float(inputs.frequency_hz[0, 0])
+        frequency = None if self.model.clock.hertz is not None else float(inputs.frequency_hz[0, 0])
         return self.place(values, frequency), inputs.initial_states[0]
 
 
@@ -391,14 +391,14 @@ class Warming:
         place, start = live.first_start()
         flight = LiveFlight(place, live.integration, start[None], lambda: None)
         flight.advance(1)
-        if live.model.autonomous:  # where it rests is told at its end
+        if live.model.clock.has_equilibria:  # where it rests is told at its end
             newton_steps(live.model.system, start[None], place.parameters.pack())
 
     def _series(self) -> None:
         live = self._live
         place, start = live.first_start()
         rtol, atol = live.integration.rtol, live.integration.atol
-        seconds = 1.0 if live.model.is_map else 0.01 / place.frequency
+        seconds = 0.01 / place.frequency if live.model.clock.is_continuous else 1.0
         orbit_series(place.parameters, place.frequency, start, 1, seconds, rtol=rtol, atol=atol)
 
     def _maps(self) -> None:

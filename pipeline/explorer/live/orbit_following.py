@@ -89,7 +89,7 @@ class Follower:
         """Follow the orbit that a job names to another parameter value, and send the orbit that was reached."""
         request = job.request
         assert isinstance(request, FollowRequest)
-        if self._live.model.autonomous and self._live.model.crossing is None:
+        if self._live.model.clock.n_neutral:
             raise RequestError(
                 f"{self._live.model.name} is a flow seen at even times, where orbits are no points; make a "
                 "run with a [section] to follow them."
@@ -136,7 +136,7 @@ class Follower:
     def _name(self, given: str) -> str:
         name = axis_name(given)
         model = self._live.model
-        if name == FREQUENCY and not model.autonomous:
+        if name == FREQUENCY and model.clock.has_drive:
             return name
         if name not in model.parameter_names:
             known = ", ".join(model.parameter_names)
@@ -146,7 +146,7 @@ class Follower:
     def _place_at(self, place: Place, name: str, value: float) -> Place:
         if name == FREQUENCY:
             return self._live.place(place.parameters, value)
-        frequency = None if self._live.model.clock_hz is not None else place.frequency
+        frequency = None if self._live.model.clock.hertz is not None else place.frequency
         return self._live.place({**place.parameters, name: value}, frequency)
 
     def _family(self, held: Held, name: str, target: float) -> Family:
@@ -290,7 +290,7 @@ def described(
     attrs: dict[str, Any] = {
         "cell": None,
         "parameters": {k: v for k, v in place.parameters.items()},
-        "frequency": place.frequency if model.clock_hz is None else None,
+        "frequency": place.frequency if model.clock.hertz is None else None,
         "status": Status.PERIODIC.name.lower(),
         "period": family.period,
         "seconds": seconds,

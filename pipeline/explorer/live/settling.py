@@ -120,7 +120,7 @@ class LiveFlight(Flight):
         """Return the catalog number of the orbit that each trajectory has reached; -1 if it is not decided yet."""
         no_turns = np.zeros((len(self.rows), sum(ends.model.is_angle)), np.int64)
         block = self.block(self.section, no_turns, self.closed(self.section))
-        if ends.model.autonomous:  # an equilibrium is told at the end alone
+        if ends.model.clock.has_equilibria:  # an equilibrium is told at the end alone
             return ends.on_orbits(block)
         return ends.conclude(block, final=False, strictly=strictly)
 

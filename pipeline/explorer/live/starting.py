@@ -22,7 +22,7 @@ from pipeline.explorer.data.orbits import SAMPLES, fixed_points, series
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import StartRequest
 from pipeline.explorer.live.settling import LiveFlight, Place, conclude, run_start, system_at
-from pipeline.layout.vocabulary import ABSENT, samples_per_period
+from pipeline.layout.vocabulary import ABSENT
 from pipeline.specification.noise import STEPS
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class _NoisyPath:
 
     def __init__(self, live: LiveRun, place: Place, state: np.ndarray, strength: float, seed: int) -> None:
         model, self.states = live.model, noisy_states(live.model)
-        if model.is_map:
+        if not model.clock.is_continuous:
             raise RequestError(f"noise: {model.name} is a map, and noise acts on the rates of a flow.")
         if model.crossing is not None:
             raise RequestError("noise: sections of this run are crossings, and a noisy state crosses infinitely often.")
@@ -164,7 +164,7 @@ def start(live: LiveRun, job: Job) -> None:
     path.show(FIRST_PERIODS)
     sections = _Sections(job)
     flight = LiveFlight(place, live.integration, state[None], job.check)
-    if not live.model.autonomous:
+    if not live.model.clock.has_equilibria:
         path.show(PERIODS - FIRST_PERIODS)
     block = run_start(flight, live.integration, sections.take, request.periods)
     sections.flush()
@@ -230,7 +230,7 @@ class _Path:
     def show(self, n_periods: int) -> None:
         """Integrate the first `n_periods` periods and send them; send nothing if the integration fails."""
         live, place = self._live, self._place
-        samples = samples_per_period(live.model, SAMPLES)
+        samples = live.model.clock.samples(SAMPLES)
         times = self._period * np.arange(n_periods * samples + 1) / samples
         try:
             found = series(

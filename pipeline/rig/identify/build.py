@@ -201,7 +201,7 @@ def drive_problems(
 
 def _clock_problems(model: Model, table: RecordingTable, ds: xr.Dataset, where: str) -> list[str]:
     """Return problems with a drive of known frequency."""
-    if model.autonomous:
+    if not model.clock.has_drive:
         return [f'{where}.drive = "known": {model.name} has no drive; use drive = "none".']
     assert table.frequency_hz is not None
     rate = 1.0 / float(np.median(np.diff(ds["time"].values)))

@@ -165,7 +165,7 @@ def _read(spec: IdentificationSpec, table: OrbitsTable, where: str) -> xr.Datase
 def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
     """Return the fitted model. A model without a drive gets the Poincare section that the table or its file gives."""
     model, section = spec.model, table.section
-    if not model.autonomous:
+    if model.clock.has_drive:
         if section is not None:
             raise SpecError(f"{where}.section: {model.name} has a drive; its sections are once per drive period.")
         return model
@@ -199,13 +199,13 @@ def _parameter_problems(
     is_frequency = parameter == FREQUENCY_DIM
     if not parameter:
         problems.append(f"{where}.parameter: missing; name the parameter along which was measured.")
-    elif model.autonomous if is_frequency else parameter not in model.parameter_names:
+    elif not model.clock.has_drive if is_frequency else parameter not in model.parameter_names:
         problems.append(f"{where}.parameter = {parameter!r}: is not a parameter of {model.name}.")
     if parameter in (*spec.names, *spec.tied):
         problems.append(
             f"{where}: the orbits were measured along {parameter}, which is identified; fix it or drop the table."
         )
-    if not model.autonomous and not is_frequency and table.frequency_hz is None:
+    if model.clock.has_drive and not is_frequency and table.frequency_hz is None:
         problems.append(f"{where}.frequency_hz: missing; the orbits were measured along {parameter} at one frequency.")
     if table.range is not None and not table.range[0] < table.range[1]:
         problems.append(f"{where}.range = {list(table.range)}: must rise.")
@@ -219,7 +219,7 @@ def _orbits(
     found: list[Datum] = []
     if measured is None:
         return found
-    wanted = [q for q in table.quantities if q != "frequency" or model.autonomous]
+    wanted = [q for q in table.quantities if q != "frequency" or not model.clock.has_drive]
     for k in range(measured.sizes["orbit"]):
         one = measured.isel(orbit=k)
         name = str(one["name"].item())

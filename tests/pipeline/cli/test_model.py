@@ -54,7 +54,7 @@ def test_show__text_of_a_specification(main, tmp_path, own):
     assert "checks: passed" in out
     found = json.loads(main("model", "show", "spec.toml", "--json")[1])
     assert found["equations"] == {"x": "v", "v": "drive - d*v - x**3"}
-    assert found["autonomous"] is False
+    assert (found["kind"], found["has_drive"]) == ("flow", True)
     code, out, _ = main("model", "show", "spec.toml", "--latex")
     assert out.startswith("\\begin{align}\n")
     assert r"\frac{\mathrm{d}\dot{x}}{\mathrm{d}t} &= \mathrm{drive} - d \, \dot{x} - x^{3}" in out

@@ -13,27 +13,18 @@ from magpend_core import load_model, model_names
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.layout.conventions import conventional, readable_unit, unit_remarks
-from pipeline.layout.vocabulary import (
-    frequency_of,
-    model_attribute,
-    model_of,
-    once,
-    period_of,
-    section_attributes,
-    section_name,
-    told_by,
-)
+from pipeline.layout.vocabulary import frequency_of, model_attribute, model_of, section_attributes, told_by
 from pipeline.plots.section import section_pair
 from pipeline.specification.models import load_model as load_given
 from tests.core.flows import ROSSLER, VAN_DER_POL, flow
 
 
-def test_period_of__each_way_to_look():
+def test_clock__each_way_to_look():
     whole = flow(VAN_DER_POL)
     seen = sectioned(whole, Crossing("v", 0.5, "down"))
-    assert [period_of(m) for m in (load_model(), whole, seen)] == ["drive period", "strobe period", "return"]
-    assert once(seen) == "crossing of v = 0.5 going down"
-    assert section_name(seen) == "Poincar\u00e9 section"
+    assert [m.clock.period for m in (load_model(), whole, seen)] == ["drive period", "strobe period", "return"]
+    assert seen.clock.once == "crossing of v = 0.5 going down"
+    assert seen.clock.section == "Poincar\u00e9 section"
 
 
 def test_model_of__section():

@@ -307,8 +307,7 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
         return None
     flow_of, rate = of_flow(point.parameters), LEG / seconds
     for n in STRETCHES:
-        whole = point.parameters.model.is_map
-        times = np.arange(n * seconds + 1.0) if whole else np.linspace(0.0, n * seconds, n * SAMPLES)
+        times = point.parameters.model.clock.instants(n * seconds, n * SAMPLES)
         paths = [trajectory(flow_of, rate, states[i], times, **tolerances_at(PORTRAIT_RTOL)) for i in [0, *(kept + 1)]]
         turns = np.asarray(geometry.is_angle) & (np.ptp(paths[0], axis=0) >= TWO_PI)
         first, *others = (_ranges(path, geometry)[:, ~turns] for path in paths)

@@ -78,8 +78,8 @@ class Dynamics:
 
     @property
     def can_rest(self) -> bool:
-        """Whether to search for equilibria: the model is autonomous, and its equations may be integrated."""
-        return self.model is not None and self.model.autonomous and self.system is not None
+        """Whether to search for equilibria: the model can have some, and its equations may be integrated."""
+        return self.model is not None and self.model.clock.has_equilibria and self.system is not None
 
     @property
     def is_flow(self) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from magpend_core.models import ModelError, load_model, model_names
+from magpend_core.models.clock import DRIVEN, STROBED
 from magpend_core.models.model import Mirror, State
 from magpend_core.models.parameters import NON_NEGATIVE, POSITIVE
 from magpend_core.models.presets import Preset
@@ -73,7 +74,7 @@ def test_read_model__fills_in_what_a_short_text_leaves_out():
     assert dict(model.load()) == {"d": 0.08, "A": 0.2}
     assert model.preset_names == ("default",)
     assert model.preset().provenance["d"]
-    assert not model.autonomous
+    assert model.clock is DRIVEN
     assert model.text == DUFFING == model.reference
     model = read_model(PENDULUM)
     assert (model.title, model.name) == ("a pendulum", "pendulum1")
@@ -193,11 +194,11 @@ def test_read_model__tells_all_problems_at_once():
 
 def test_autonomous__is_what_knows_no_time():
     table = {"name": "vdp", "states": {"x": "1", "y": "1"}, "equations": {"x": "y", "y": "(1 - x**2)*y - x"}}
-    assert read_model(table).autonomous
+    assert read_model(table).clock is STROBED
     for needed in ("t", "f", "phase", "a1"):
         define = {"a1": "sin(a2)", "a2": "phase"}
-        assert not read_model({**table, "define": define, "equations": {"x": "y", "y": needed}}).autonomous
-    assert read_model({**table, "define": {"a1": "t"}}).autonomous  # not needed by an equation
+        assert read_model({**table, "define": define, "equations": {"x": "y", "y": needed}}).clock is DRIVEN
+    assert read_model({**table, "define": {"a1": "t"}}).clock is STROBED  # not needed by an equation
 
 
 # ---- references and digests --------------------------------------------------------------------

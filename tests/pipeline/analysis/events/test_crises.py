@@ -34,7 +34,7 @@ LINE = Geometry((False,), (1.0,))
 def section_map(model, parameter, value, frequency_hz=None, **fixed):
     """The section map of a model along a parameter."""
     packed = model.load(**{parameter: value}, **fixed).pack()
-    family = family_of(model.system, 1, frequency_hz or model.clock_hz, packed, parameter, 1.0)
+    family = family_of(model.system, 1, frequency_hz or model.clock.hertz, packed, parameter, 1.0)
     return SectionMap(family, Geometry.of(model), 1e-9)
 
 
