@@ -39,9 +39,6 @@ class Drifting(Steady):
     def needed(self) -> str:
         return "a run with constant parameters, without [drift]"
 
-    def overview(self, *, is_swept: bool) -> str:
-        return "drift"
-
     @cached_property
     def drift(self) -> Drift:
         """The motion of the parameters, in the form that the numerical core takes."""

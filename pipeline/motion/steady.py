@@ -10,8 +10,6 @@ import numpy as np
 
 from magpend_core.models.model import Model
 from magpend_core.status import Status
-from pipeline.products.product import Analysis
-from pipeline.products.registry import ANALYSES
 from pipeline.specification.tables import Integration
 
 if TYPE_CHECKING:
@@ -59,16 +57,6 @@ RTOL_OF_RULE = 1e-8
 ROOT = 6
 """The time is proportional to (1/rtol)^(1/6)."""
 
-NEEDS = {
-    "drifting": "whose parameters move; add a table [drift.NAME] to its specification",
-    "noisy": "with noise; add a table [noise] to its specification",
-}
-"""What a run at constant parameters lacks for the analyses of each other kind of motion."""
-
-
-NOT_OF_MAPS = ("response", "spectrum", "series")
-"""Analyses of the motion between sections, which a map has not."""
-
 
 @dataclass(frozen=True)
 class Steady:
@@ -103,24 +91,6 @@ class Steady:
         empty if the motion allows it.
         """
         return self.obstacle and f"{self.obstacle}; {what} needs {self.needed}."
-
-    def unsuited(self, analysis: Analysis) -> str:
-        """Return the sentences that refuse an analysis that is for another kind of motion; empty if it suits."""
-        if not self.model.clock.is_continuous and analysis.name in NOT_OF_MAPS:
-            return f"{analysis.name} follows the motion over a period; {self.model.name} is a map, of iterates alone."
-        if self.kind in analysis.motions:
-            return ""
-        if not self.obstacle:
-            return f"{analysis.name} needs a run {NEEDS[analysis.motions[0]]}."
-        own = [f"analyse {name}" for name, other in ANALYSES.items() if self.kind in other.motions]
-        commands = ", ".join([*own, f"plot {self.overview(is_swept=True)}", "plot section"])
-        return f"{self.refusal(analysis.name)} Of this run: magpend {commands}."
-
-    def overview(self, *, is_swept: bool) -> str:
-        """Return the name of the figure that gives the best overview; empty if that depends on the run's results."""
-        if not self.obstacle:  # else cells cannot be integrated further: no attractors
-            return ""
-        return "bifurcation" if is_swept else "section"
 
     def seconds_per_period(self, frequency_hz: np.ndarray) -> np.ndarray:
         """Estimate the computing time per drive period of one trajectory on one core [s], by a rule of thumb."""

@@ -69,4 +69,5 @@ EXTREMES = CellProduct(
     settle=_settled,
     coordinates=_names,
     watches=_watched,
+    follows_motion=True,
 )

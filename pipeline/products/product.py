@@ -243,6 +243,8 @@ class CellProduct:
         ``watches(options)`` returns the names of the quantities to watch while cells are integrated.
     shortest : callable
         ``shortest(options)`` returns the options with the least work, for compiling ahead.
+    follows_motion : bool
+        Whether it follows the motion between section points, which a map has not.
     version : int
         Number of its results, see `magpend_core.versions`.
     """
@@ -258,7 +260,12 @@ class CellProduct:
     coordinates: Callable[[Any, Any], dict[str, Sequence[Any]]] = lambda options, model: {}
     watches: Callable[[Any], Sequence[str]] = lambda options: ()
     shortest: Callable[[Any], Any] = lambda options: options
+    follows_motion: bool = False
     version: int = 1
+
+
+Motion = Literal["steady", "recorded", "drifting", "noisy"]
+"""Kind of motion of a run, see `pipeline.motion`."""
 
 
 @dataclass(frozen=True)
@@ -297,7 +304,9 @@ class Analysis:
     ignores : tuple of str
         Options that do not change the result.
     motions : tuple of str
-        Kinds of motion that its runs may have: ``"steady"``, ``"drifting"``, ``"noisy"``; see `pipeline.motion`.
+        Kinds of motion that its runs may have; see `pipeline.motion`.
+    follows_motion : bool
+        Whether it follows the motion between section points, which a map has not.
     by_point : bool
         Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
         results `pipeline.results.ragged.joined` joins.
@@ -319,7 +328,8 @@ class Analysis:
     builds_on: tuple[str, ...] = ()
     figure: str = ""
     ignores: tuple[str, ...] = ()
-    motions: tuple[Literal["steady", "drifting", "noisy"], ...] = ("steady",)
+    motions: tuple[Motion, ...] = ("steady",)
+    follows_motion: bool = False
     by_point: bool = False
     finish: str = ""
     version: int = 1
@@ -420,6 +430,8 @@ class Figure:
         Number of panels: ``one``, ``several``, or ``either``, which depends on the run.
     unless : tuple, optional
         Option and value that turn one panel into several, or several into one.
+    motions, follows_motion
+        See `Analysis`; a figure of an analysis is refused with that.
     """
 
     name: str
@@ -429,6 +441,8 @@ class Figure:
     needs: str = ""
     panels: Literal["one", "several", "either"] = "one"
     unless: tuple[str, Any] | None = None
+    motions: tuple[Motion, ...] = ("steady", "recorded", "drifting", "noisy")
+    follows_motion: bool = False
 
     def panels_with(self, options: FigureOptions) -> Literal["one", "several", "either"]:
         """Return the number of panels that the figure has with some options."""

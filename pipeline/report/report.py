@@ -30,6 +30,7 @@ from pipeline.runs.derive import AnalysedRun, changed_options, is_current, shown
 from pipeline.runs.drawing import figure
 from pipeline.runs.naming import options_in_own_words
 from pipeline.runs.status import state
+from pipeline.runs.suitability import unsuited
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.tables import RATES
 from pipeline.store.errors import DamagedError
@@ -294,7 +295,7 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 
 def _suits(shown: Shown, name: str) -> bool:
-    if shown.run.spec.motion.unsuited(ANALYSES[name]):
+    if unsuited(shown.run.spec.motion, ANALYSES[name]):
         return False
     if name == "hysteresis":
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"

@@ -32,13 +32,14 @@ from pipeline.layout.columns import described
 from pipeline.layout.conventions import conventional
 from pipeline.layout.own_words import in_own_words, rate_attribute, rate_of, with_own_names, with_plain_names
 from pipeline.layout.vocabulary import axis_name, model_attribute, overrides_attribute, parameter_name
-from pipeline.products.product import Analysis, Options, Table, function_of
+from pipeline.products.product import Analysis, Figure, Options, Table, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import silent
 from pipeline.runs.choices import Choices, branches_in_words, changed_branches, chosen_options, is_choice
 from pipeline.runs.extend import refine
 from pipeline.runs.naming import named
 from pipeline.runs.progress import bar_in_notebook
+from pipeline.runs.suitability import unsuited
 from pipeline.runs.versions import current, key_of
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
@@ -174,8 +175,6 @@ def _validated(name: str, options: Mapping[str, Any]) -> Options:
 
 def _derived(run: AnalysedRun, name: str, wanted: Options) -> xr.Dataset:
     analysis = ANALYSES[name]
-    if reason := run.spec.motion.unsuited(analysis):
-        raise SpecError(f"{run.name}: {reason}")
     is_given, wanted = is_choice(wanted), prepared(run, analysis, wanted)
     if name == "branches" and not is_given:
         for line in branches_in_words(changed_branches(run, wanted.plain()["parameter"]), run.spec.rate):
@@ -314,7 +313,7 @@ def options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
+def prepared(run: AnalysedRun, product: Analysis | Figure, options: Options) -> Options:
     """Complete the options of an analysis or figure from the run: full names, missing values, and the run's choice of
     attractors and branches.
 
@@ -324,6 +323,8 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
         If the run does not suit the product; the message names the directory.
     """
     with refused(run.name):
+        if reason := unsuited(run.spec.motion, product):
+            raise ValueError(reason)
         options = chosen_options(run, named(run, options))
         if product.needs:
             function_of(product.needs)(run, options)

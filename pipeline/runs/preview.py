@@ -13,9 +13,11 @@ from pipeline.layout.extents import size_remarks
 from pipeline.layout.own_words import dims_in_own_words
 from pipeline.layout.plan import Plan, check_space, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
+from pipeline.products.registry import FIGURES
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here, ready
+from pipeline.runs.suitability import overview, unsuited
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
 from pipeline.store.checking import whole_records
@@ -31,7 +33,7 @@ def first_figure(run: RunDirectory) -> str:
     """Return the name of the figure that gives the best overview of a run; the run can draw it."""
     plan = run.plan
     swept, grid = _long(plan)
-    if name := run.spec.motion.overview(is_swept=bool(swept)):
+    if name := overview(run.spec.motion, is_swept=bool(swept)):
         return name
     if any(v.name == "lyapunov" for v in plan.variables):
         return "lyapunov" if swept else "convergence"
@@ -45,7 +47,7 @@ def first_figure(run: RunDirectory) -> str:
         return "section"
     if any(not is_start_dim(d) for d in plan.dims):
         return "bifurcation"
-    return "gallery" if run.model.clock.is_continuous else "section"
+    return "section" if unsuited(run.spec.motion, FIGURES["gallery"]) else "gallery"
 
 
 def figure_command(run: RunDirectory) -> str:

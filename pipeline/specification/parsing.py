@@ -363,8 +363,9 @@ def _map_problems(model: Model, data: Mapping[str, Any]) -> list[str]:
     fields = Integration.model_fields
     steps = [k for k in ("rtol", "atol", "method", "max_steps_per_period") if given.get(k, d := fields[k].default) != d]
     problems += [f"integration.{key}: {what}, whose iterations have no steps; drop the key." for key in steps]
-    if "extremes" in data.get("products", {}):
-        problems.append(f"products.extremes: {what}, without motion between its iterations; drop the product.")
+    between = [name for name, product in CELL_PRODUCTS.items() if product.follows_motion]
+    for name in (n for n in between if n in data.get("products", {})):
+        problems.append(f"products.{name}: {what}, without motion between its iterations; drop the product.")
     return problems
 
 

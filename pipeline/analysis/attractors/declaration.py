@@ -159,4 +159,5 @@ GALLERY_FIGURE = Figure(
     FigureOptions,
     "pipeline.analysis.attractors.figure:draw",
     panels="several",
+    follows_motion=True,
 )

@@ -218,8 +218,6 @@ def draw(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     from pipeline.analysis.attractors.portraits import portraits
 
     at, notes = values_of(run, options)
-    if not run.model.clock.is_continuous:
-        raise ValueError(f"{run.model.name} is a map, without motion between its iterations; draw its section.")
     found = run.derive("attractors")
     figure = plot_gallery(found, portraits(found, at=at), degrees=options.degrees, frame=frame_of(options))
     return noted(figure, notes)

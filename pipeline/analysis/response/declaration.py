@@ -75,6 +75,7 @@ RESPONSE = Analysis(
     settle="pipeline.analysis.branches.intervals:settle_along",
     builds_on=("branches",),
     figure="response",
+    follows_motion=True,
     version=2,
 )
 
@@ -130,6 +131,7 @@ BACKBONE = Analysis(
     settle="pipeline.analysis.response.backbone:settle_backbone",
     builds_on=("branches", "response"),
     figure="backbone",
+    follows_motion=True,
 )
 
 

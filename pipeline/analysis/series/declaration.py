@@ -65,6 +65,7 @@ SERIES = Analysis(
     settle=f"{_MOTIONS}:settle_motion",
     builds_on=("attractors",),
     figure="series",
+    follows_motion=True,
 )
 
 

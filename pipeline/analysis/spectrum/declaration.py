@@ -91,6 +91,7 @@ SPECTRUM = Analysis(
     settle=f"{_MOTIONS}:settle_motion",
     builds_on=("attractors",),
     figure="spectrum",
+    follows_motion=True,
 )
 
 

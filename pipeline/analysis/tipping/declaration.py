@@ -138,4 +138,5 @@ DRIFT_FIGURE = Figure(
     "Draw sections over a parameter that moves, coloured by the swept number, over the diagram of another run.",
     DriftFigureOptions,
     "pipeline.analysis.tipping.figure:draw",
+    motions=("drifting",),
 )

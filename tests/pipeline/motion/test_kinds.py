@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.motion.steady import Steady
-from pipeline.products.registry import ANALYSES
+from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.runs.suitability import unsuited
 from pipeline.specification.spec import Spec
 
 DUFFING: dict[str, Any] = {
@@ -38,7 +39,7 @@ def motion(folder: Path, kind: str, **more: Any) -> Steady:
 def test_unsuited__all_analyses_but_those_of_the_kind(tmp_path: Path, kind: str) -> None:
     own = motion(tmp_path, kind)
     assert own.kind == kind
-    suited = {name for name, analysis in ANALYSES.items() if not own.unsuited(analysis)}
+    suited = {name for name, analysis in ANALYSES.items() if not unsuited(own, analysis)}
     assert suited == {name for name, analysis in ANALYSES.items() if kind in analysis.motions}
     assert ("basins" in suited) == (kind == "steady")
 
@@ -69,10 +70,20 @@ def test_unsuited__says_what_a_run_allows_and_what_it_lacks(tmp_path: Path) -> N
         ("noisy", "analyse transfer, analyse escapes, analyse density, plot bifurcation, plot section"),
         ("recorded", "plot bifurcation, plot section"),
     ):
-        assert motion(tmp_path, kind).unsuited(ANALYSES["basins"]).endswith(f" Of this run: magpend {own}.")
+        assert unsuited(motion(tmp_path, kind), ANALYSES["basins"]).endswith(f" Of this run: magpend {own}.")
     steady = motion(tmp_path, "steady")
-    assert steady.unsuited(ANALYSES["escapes"]).startswith("escapes needs a run with noise; add a table [noise]")
-    assert steady.unsuited(ANALYSES["delay"]).startswith("delay needs a run whose parameters move; add a table [drift")
+    assert unsuited(steady, ANALYSES["escapes"]).startswith("escapes needs a run with noise; add a table [noise]")
+    assert unsuited(steady, ANALYSES["delay"]).startswith("delay needs a run whose parameters move; add a table [drift")
+
+
+def test_unsuited__what_follows_the_motion_of_a_map(tmp_path: Path) -> None:
+    plain = {"parameters": {}, "initial_conditions": {"kind": "random", "n": 2, "x": [-0.1, 0.1], "y": 0.0}}
+    iterated = motion(tmp_path, "steady", model="henon", **plain)
+    refused = {
+        name for name, one in {**FIGURES, **ANALYSES}.items() if unsuited(iterated, one) and "steady" in one.motions
+    }
+    assert refused == {"response", "backbone", "spectrum", "series", "gallery"}
+    assert unsuited(iterated, FIGURES["gallery"]).endswith("and henon is a map, of iterates alone; draw its section.")
 
 
 def test_obstacle__of_two_parameters(tmp_path: Path) -> None:

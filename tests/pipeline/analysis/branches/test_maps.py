@@ -231,7 +231,7 @@ def test_refusals__one_sentence_each(henon, tmp_path, command):
     for words in (("simulate", "--model", "henon"), ("animate", henon), ("plot", "gallery", henon, "--at", "a=0.5")):
         with pytest.raises(AssertionError, match="henon is a map"):
             command(tmp_path, *words)
-    with pytest.raises(SpecError, match="response follows the motion over a period"):
+    with pytest.raises(SpecError, match="response follows the motion between section points, and"):
         derive(henon, "response", {})
     tables = {
         "section": {"of": "x"},
