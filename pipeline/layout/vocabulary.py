@@ -99,6 +99,11 @@ def parameter_name(axis: str) -> str:
     return FREQUENCY if axis in (FREQUENCY, FREQUENCY_DIM) else axis
 
 
+def axes_of(model: Model) -> tuple[str, ...]:
+    """Return the axes along which orbits of a model can change: its parameters, and the frequency of its drive."""
+    return (*model.parameter_names, *((FREQUENCY_DIM,) if model.clock.has_drive else ()))
+
+
 def parameter_units(parameter: str, model: Model | None) -> str:
     """Return the unit of a parameter or of the drive frequency; an empty text if there is no model."""
     if axis_name(parameter) == FREQUENCY_DIM:

@@ -265,9 +265,8 @@ def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
         return 0.0
     if kind != PERIODIC_ORBIT:
         return math.nan
-    if parameters.model.clock.has_drive:
-        return periods / frequency
-    return float(one["period_s"]) if "period_s" in one else math.nan
+    seconds = parameters.model.clock.orbit_seconds(periods, frequency)
+    return seconds if math.isfinite(seconds) else float(one.get("period_s", math.nan))
 
 
 def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
@@ -313,9 +312,9 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
             problems.append(f"--cell {number}: has no sections to start from ({status.sentence}).")
             continue
         parameters, frequency = _at_point(cube, one)
-        periods = int(one["orbit_period"]) if parameters.model.clock.has_drive else 0
+        seconds = parameters.model.clock.orbit_seconds(int(one["orbit_period"]), frequency)
         name = f"cell {number}: {_where(one)}"
-        moving.append(Moving(name, colour, parameters, frequency, points[0], points, periods / frequency or math.nan))
+        moving.append(Moving(name, colour, parameters, frequency, points[0], points, seconds or math.nan))
     if problems:
         raise SpecError(problems)
     return moving

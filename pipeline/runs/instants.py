@@ -105,9 +105,8 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
 
 def _cycle(one: Moving) -> float:
     """Return the time unit of a motion [s]: the drive period or, without a drive, the period of the orbit."""
-    if one.parameters.model.clock.has_drive:
-        return 1.0 / one.frequency_hz
-    return one.period_s if one.period_s > 0.0 else 2.0
+    periods = (one.parameters.model.clock.orbit_seconds(1, one.frequency_hz), one.period_s)
+    return next((seconds for seconds in periods if seconds > 0.0), 2.0)
 
 
 def _nice(value: float) -> float:

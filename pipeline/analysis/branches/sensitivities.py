@@ -26,7 +26,7 @@ from pipeline.analysis.branches.kinds import BRANCH_POINTS, FOLD, HOPF, LABELS
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, Family, hopf_test
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import axis_name, frequency_of, parameter_name, parameter_units, parameters_of
+from pipeline.layout.vocabulary import axes_of, axis_name, frequency_of, parameter_name, parameter_units, parameters_of
 from pipeline.products.product import Table
 from pipeline.products.reporting import track
 from pipeline.results.run import OpenRun
@@ -187,8 +187,7 @@ def _polished(located: Located) -> Located | None:
 
 def _moving(model: Model, first: str) -> list[str]:
     """Return the names of the parameters that may move a bifurcation along the first one, with the drive frequency."""
-    names = [*model.parameter_names, *([FREQUENCY] if model.clock.has_drive else [])]
-    return [name for name in names if name not in (first, LEVEL)]
+    return [name for name in axes_of(model) if name not in (first, LEVEL)]
 
 
 def located_in(branches: xr.Dataset, base: Parameters) -> list[Located]:

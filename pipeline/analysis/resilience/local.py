@@ -92,7 +92,7 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
     else:
         slopes = [jacobian(p * period, x, own, 1.0 / period) for p, x in zip(bases.phase, bases.states, strict=True)]
         reactivity = _growth(_scaled(np.array(slopes), scales))
-    back = _return_time(one, bool(model.clock.n_neutral)) * period * (1 if is_cycle else n_points)
+    back = _return_time(one, model.clock.n_neutral) * period * (1 if is_cycle else n_points)
     return Local(reactivity, grown, late * period / n_phases, back)
 
 
@@ -184,11 +184,11 @@ def _growth(matrices: np.ndarray) -> float:
     return float(np.linalg.eigvalsh(0.5 * (matrices + np.swapaxes(matrices, -1, -2))).max())
 
 
-def _return_time(one: xr.Dataset, has_trivial: bool) -> float:
+def _return_time(one: xr.Dataset, n_neutral: int) -> float:
     """Return 1/|ln |mu|| of the leading multiplier mu of an orbit, in its periods."""
     multipliers = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
     multipliers = multipliers[np.isfinite(multipliers)]
-    if has_trivial and len(multipliers):
+    if n_neutral and len(multipliers):
         multipliers = np.delete(multipliers, np.argmin(np.abs(multipliers - 1.0)))
     modulus = np.abs(multipliers).max(initial=0.0)
     if not len(multipliers) or modulus >= 1.0:

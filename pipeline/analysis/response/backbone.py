@@ -79,7 +79,7 @@ def settle_backbone(run: OpenRun, options: BackboneOptions) -> BackboneOptions:
         found["low"], found["high"] = interval_of(run, FREQUENCY, *(a if b is None else b for a, b in bounds))
     elif (options.low or 0.0) >= (options.high or np.inf):
         raise SpecError(f"--from {options.low:g}: must be less than --to {options.high:g}.")
-    driven = model.clock.has_drive and _swing(base, found["high"]).any()
+    driven = _is_driven(base, found.get("high", np.inf))
     if driven:
         found |= _settled_force(base, options, found["high"])
     if options.undamped or not driven:
@@ -104,6 +104,11 @@ def _swing(base: Parameters, frequency_hz: float) -> Array:
     found = rates(np.tile(INSTANTS / frequency_hz, (3, 1)), states, base, frequency_hz)
     swing = found - found[:, :1]
     return np.where(np.abs(swing) > 1e-12 * np.abs(found).max(), swing, 0.0)
+
+
+def _is_driven(base: Parameters, frequency_hz: float) -> bool:
+    """Return whether the rates change with time at these parameters."""
+    return base.model.clock.has_drive and bool(_swing(base, frequency_hz).any())
 
 
 def _settled_force(base: Parameters, options: BackboneOptions, frequency_hz: float) -> dict[str, Any]:
@@ -141,7 +146,7 @@ def _undamped(run: OpenRun, options: BackboneOptions) -> Parameters:
     swept = [n for n in base.names if n not in options.undamped and swept_axis(run, n) is not None]
     if swept:
         raise SpecError(f"the run sweeps {swept[0]}; give its value for normal modes, such as --undamped {swept[0]}=0.")
-    if base.model.clock.has_drive and _swing(base, _interval(options)[1]).any():
+    if _is_driven(base, _interval(options)[1]):
         raise SpecError("normal modes need a system without drive; switch it off, such as by --undamped F=0.")
     return base
 

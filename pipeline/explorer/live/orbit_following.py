@@ -29,7 +29,7 @@ from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import CellPoint, FollowRequest
 from pipeline.explorer.live.settling import Place, system_at
 from pipeline.layout.cells import parameter_axes
-from pipeline.layout.vocabulary import PERIODIC_ORBIT, axis_name
+from pipeline.layout.vocabulary import PERIODIC_ORBIT, axes_of, axis_name
 
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
@@ -136,9 +136,7 @@ class Follower:
     def _name(self, given: str) -> str:
         name = axis_name(given)
         model = self._live.model
-        if name == FREQUENCY and model.clock.has_drive:
-            return name
-        if name not in model.parameter_names:
+        if name not in axes_of(model):
             known = ", ".join(model.parameter_names)
             raise RequestError(f"parameter: {given!r} is no parameter of {model.name}; it has {known}.")
         return name

@@ -17,7 +17,7 @@ from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.carrying import ORBIT, PARAMETER, Along, Array, Datum, OrbitData, Solution, settled
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, KINDS, TORUS
-from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axes_of, axis_name
 from pipeline.layout.writing import json_value
 from pipeline.results.tabular import words_of
 from pipeline.rig.identify.specification import OrbitsTable, setting_problems
@@ -199,7 +199,7 @@ def _parameter_problems(
     is_frequency = parameter == FREQUENCY_DIM
     if not parameter:
         problems.append(f"{where}.parameter: missing; name the parameter along which was measured.")
-    elif not model.clock.has_drive if is_frequency else parameter not in model.parameter_names:
+    elif parameter not in axes_of(model):
         problems.append(f"{where}.parameter = {parameter!r}: is not a parameter of {model.name}.")
     if parameter in (*spec.names, *spec.tied):
         problems.append(

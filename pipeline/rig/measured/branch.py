@@ -16,7 +16,7 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import spelling_of
-from pipeline.layout.vocabulary import FREQUENCY_DIM, model_attribute, model_of, parameter_name, parameter_units
+from pipeline.layout.vocabulary import axes_of, model_attribute, model_of, parameter_name, parameter_units
 from pipeline.products.product import Table
 from pipeline.results.points import OWN, PointFile
 from pipeline.results.tabular import Row, Words, aligned, counted, number, values, words_of
@@ -261,7 +261,7 @@ def _words_of_rows(file: PointFile, places: Mapping[str, int], own: np.ndarray) 
 
 def _name_problems(model: Model, axis: str, state: str, parameter: str) -> list[str]:
     """Return problems of the axis, which the table calls `parameter`, and of the state."""
-    names = (*model.parameter_names, *(() if model.crossing is not None else (FREQUENCY_DIM,)))
+    names = axes_of(model)
     found = [] if axis in names else [unknown_name("parameter", parameter, names)]
     return found + ([] if state in model.state_names else [unknown_name("state", state, model.state_names)])
 
