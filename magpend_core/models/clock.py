@@ -25,8 +25,8 @@ class Clock:
         When section points are taken.
     meaning : str
         What the equations give.
-    system : str
-        Word for the system: ``flow`` or ``map``.
+    kind : str
+        Kind of system: ``flow`` or ``map``.
     unit : str
         Unit of times and, inverted, of rates.
     hertz : float, optional
@@ -48,7 +48,7 @@ class Clock:
     section: str
     instant: str
     meaning: str
-    system: str = "flow"
+    kind: str = "flow"
     unit: str = "s"
     hertz: float | None = None
     frequency: str = "drive frequency"
@@ -116,7 +116,7 @@ MAP = Clock(
     "iterates",
     "every iteration",
     "a map: the equations give the next states",
-    system="map",
+    kind="map",
     unit="iteration",
     hertz=1.0,
     is_continuous=False,

@@ -111,7 +111,7 @@ def _latex(model: Model, found: Description) -> None:
 def _as_dict(model: Model, found: Description) -> dict[str, Any]:
     return {
         **described(model),
-        "kind": model.clock.system,
+        "kind": model.clock.kind,
         "has_drive": model.clock.has_drive,
         "section": model.section,
         "digest": model.digest,

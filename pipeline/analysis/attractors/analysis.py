@@ -200,7 +200,7 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
     out.
     """
-    lines, what = _growing_lines(ds), f"the {model_of(ds).clock.system}"
+    lines, what = _growing_lines(ds), f"the {model_of(ds).clock.kind}"
     lines += ds.attrs.get(WITHOUT_DIGITS, "").splitlines()
     if any(row["evidence"] == "volume" for row in rows):
         if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
