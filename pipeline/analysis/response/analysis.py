@@ -167,9 +167,7 @@ def _jumps(located: xr.Dataset, base: Parameters, events: Sequence[Orbit], step:
         _orbit(located, base, int(located["of_branch"].values[k]), value, events[k].state, events[k].seconds)
         for (k, _), value in zip(ends, beyond, strict=True)
     ]
-    hertz = [orbit.frequency_hz for orbit in starts]
-    if base.model.crossing is not None:
-        hertz = [base.model.crossing.frequency_hz for _ in starts]  # the longest wait for a return
+    hertz = [base.model.clock.hertz or orbit.frequency_hz for orbit in starts]
     landed = _landed(starts, beyond if name == FREQUENCY_DIM else hertz)
     closed = [orbit for _, orbit in landed if orbit is not None]
     measured = iter(measures_of(closed, 1).amplitude)

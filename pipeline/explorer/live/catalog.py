@@ -143,7 +143,7 @@ class Catalog:
         cells count as closed within a small distance, however loosely the run's own do.
         """
         numbers = np.full(len(block.status), -1, np.int64)
-        if self.model.clock.has_equilibria:
+        if self._point.can_rest:
             block = self._rest(block, numbers)
         numbers = np.where(numbers < 0, self.on_orbits(block), numbers)
         if strictly or self.tolerance <= STRICT:

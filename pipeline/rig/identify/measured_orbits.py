@@ -110,7 +110,7 @@ def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> 
     if problems:
         raise SpecError(problems)
     low, high = table.range or _range(data)
-    frequency = model.crossing.frequency_hz if model.crossing is not None else table.frequency_hz or math.nan
+    frequency = model.clock.hertz or table.frequency_hz or math.nan
     return MeasuredTable(
         Along(model, parameter, low, high, frequency, 2 * max([1, *(d.period for d in data)])),
         "" if measured is None else str(measured.attrs["state"]),
