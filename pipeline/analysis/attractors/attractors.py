@@ -141,7 +141,7 @@ def identify(
         for points in slabs(ds, dynamics, block_bytes):
             if dynamics.can_rest:
                 tell_rest(points.values(), tolerance, dynamics.geometry)
-            if dynamics.can_rest and not dynamics.is_flow and options.polish:
+            if dynamics.can_rest and not dynamics.has_returns and options.polish:
                 tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
             works = {index: analyse(point, search) for index, point in points.items()}
             own = answer_all(works, points, settings)

@@ -132,7 +132,7 @@ def follow(found: Mapping[tuple[int, ...], Found], points: Mapping[tuple[int, ..
         for x in one.features
         if x.is_polished and x.orbit_period and point.parameters is not None
     ]
-    returns = search.dynamics.is_flow
+    returns = search.dynamics.has_returns
     clocks = [x.orbit_period / x.period_s if returns else frequency for x, _, frequency in orbits]
     feature.follow_orbits([(x, p, clock) for (x, p, _), clock in zip(orbits, clocks, strict=True)], search.geometry)
     for x, parameters, frequency in orbits:
@@ -466,7 +466,7 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
     if one.growth is not None:
         # at crossings the section map lacks the exponent along the flow, which is 0
         rates = np.array([one.growth.rate, one.growth.low, one.growth.high]) / cells.mean_seconds
-        rates = np.maximum(rates, 0.0) if point.is_flow else rates
+        rates = np.maximum(rates, 0.0) if point.has_returns else rates
         found.lyapunov_max, found.lyapunov_low, found.lyapunov_high = rates.tolist()
     return found
 
@@ -487,7 +487,7 @@ def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Featu
     if point.parameters is not None:
         found.side = cells.side(point.parameters, point.frequency)
     if orbit.is_polished:
-        _fill_orbit(found, orbit, search.dynamics.is_flow)
+        _fill_orbit(found, orbit, search.dynamics.has_returns)
     if point.parameters is None or not search.options.polish:
         return found
     if not found.is_polished:
@@ -495,7 +495,7 @@ def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Featu
     return found
 
 
-def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
+def _fill_orbit(found: Features, orbit: Orbit, has_returns: bool) -> None:
     found.multipliers, found.residual, found.is_polished = orbit.multipliers, orbit.residual, True
     found.multiplier_error = orbit.multiplier_error
     modulus = float(np.abs(orbit.multipliers).max())
@@ -506,7 +506,7 @@ def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
     found.evidence = stability.BY_APPROACH if orbit.approached_within else stability.BY_MULTIPLIERS
     if found.stability == NEUTRAL and orbit.multiplier_error > stability.TELLING:
         found.stability, found.evidence = NOT_SETTLED, stability.BY_NOTHING
-    exponents = orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)
+    exponents = orbit_exponents(orbit.multipliers, orbit.seconds, has_returns)
     found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])
     found.period_s = orbit.seconds
     # round to whole turns per period: the mean over cells has not closed to the last digit

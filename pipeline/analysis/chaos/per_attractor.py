@@ -87,7 +87,7 @@ class _Cells:
     """Variables of the cells of one parameter point, as arrays with the cells on the first axis."""
 
     values: dict[str, npt.NDArray[Any]]
-    is_flow: bool
+    has_returns: bool
 
     @classmethod
     def of(cls, cells: xr.Dataset, starts: Sequence[str]) -> _Cells:
@@ -188,7 +188,7 @@ def _counts(cells: _Cells, is_own: npt.NDArray[np.bool_], options: ChaosOptions)
 def _exponents(one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_states: int) -> dict[str, Any]:
     real, imaginary = one["multiplier_real"].values, one["multiplier_imag"].values
     if int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(real).all():
-        rate = orbit_exponents(real + 1j * imaginary, float(one["period_s"]), cells.is_flow)
+        rate = orbit_exponents(real + 1j * imaginary, float(one["period_s"]), cells.has_returns)
         zero = np.zeros(n_states)
         return {
             "exponents_from": 1,

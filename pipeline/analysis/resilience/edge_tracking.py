@@ -154,7 +154,7 @@ class Tracking:
                 before, pair.ends = pair.ends[0], own
                 if self._width(pair) > WIDEST * self._options.farthest:
                     pair.reason = PARTED
-                    if self._there.point.is_flow:
+                    if self._there.point.has_returns:
                         self._pass(pair, before, float(flight.seconds[2 * i, 0]))
                 continue
             pair.reason = LOST
@@ -281,7 +281,7 @@ def orbits_on(
     paths come near. Paths are section points of shape (n, state).
     """
     point = there.point
-    if not paths or not max_period or (point.can_rest and not point.is_flow):
+    if not paths or not max_period or point.n_neutral:
         return []
     starts = [_starts(paths, period, there) for period in range(1, max_period + 1)]
     periods = np.repeat(np.arange(1, max_period + 1), [len(own) for own in starts])

@@ -272,10 +272,10 @@ class Catalog:
     def _motion_of(self, orbit: Orbit) -> int:
         if self.model.classifier is None:
             return 0
-        is_flow = self.model.crossing is not None
+        has_returns = self.model.crossing is not None
         known = np.isfinite(orbit.seconds)
         seconds = orbit.seconds if known else orbit.period / self.place.frequency
-        clock = orbit.period / seconds if is_flow and known else self.place.frequency
+        clock = orbit.period / seconds if has_returns and known else self.place.frequency
         states = orbit_series(self.place.parameters, clock, orbit.points[0], orbit.period, seconds)["states"]
         angles = np.flatnonzero(self._geometry.is_angle)
         turns = np.round((states[-1] - states[0])[angles] / (2.0 * np.pi)).astype(np.int64)
@@ -294,7 +294,7 @@ class Catalog:
             sum(self._geometry.is_angle),
             BLOCK_CELLS,
             self.model.system,
-            is_flow=self.model.crossing is not None,
+            has_returns=self.model.crossing is not None,
             can_rest=self.model.clock.has_equilibria,
         )
 

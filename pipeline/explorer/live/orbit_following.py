@@ -271,10 +271,10 @@ def described(
     live: LiveRun, place: Place, family: Family, point: Point
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return a followed orbit for the page, with its multipliers, stability and exponents."""
-    model, is_flow = live.model, live.model.crossing is not None
+    model, has_returns = live.model, live.model.crossing is not None
     seconds = point.value.seconds
     images = point.value.images
-    clock = family.period / seconds if is_flow else place.frequency
+    clock = family.period / seconds if has_returns else place.frequency
     arrays = orbit_series(place.parameters, clock, images[-1], family.period, seconds)
     arrays["section"] = np.ascontiguousarray(images)
     angles = np.flatnonzero(model.is_angle)
@@ -297,7 +297,7 @@ def described(
         "share": None,
         "stable": bool(np.abs(multipliers).max() < 1.0),
         "multipliers": parts_of(multipliers),
-        "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, is_flow)],
+        "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, has_returns)],
         "seeds": [],
         "at": None,
         "start": None,

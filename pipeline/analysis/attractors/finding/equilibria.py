@@ -159,7 +159,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
 
 def _seconds(point: Point) -> float:
     """Return the order of magnitude of the time in which the flow changes the states [s]."""
-    return 1.0 / (point.frequency * (RATES if point.is_flow else 1.0))
+    return 1.0 / (point.frequency * (RATES if point.has_returns else 1.0))
 
 
 def _settled(point: Point, path: np.ndarray, waits: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:

@@ -82,7 +82,7 @@ class Dynamics:
         return self.model is not None and self.model.clock.has_equilibria and self.system is not None
 
     @property
-    def is_flow(self) -> bool:
+    def has_returns(self) -> bool:
         """Whether the section points are crossings of a Poincare section by an autonomous flow."""
         return self.model is not None and self.model.crossing is not None
 
@@ -121,7 +121,7 @@ class Point:
     # `Status` with which Newton's method ended in vain, by the key of the guess (its box of section points)
     unpolished: dict[int, int] = field(default_factory=dict)
     n_periods: int = 0  # drive periods or returns that the run integrated here, summed over cells
-    is_flow: bool = False  # whether sections are crossings of a flow
+    has_returns: bool = False  # whether sections are crossings of a flow
     can_rest: bool = False  # whether equilibria are searched
     # variables of all cells, shapes (cell, ...), if they fit the memory; else they are read from the cube
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -132,7 +132,7 @@ class Point:
         """Number of Lyapunov exponents that are 0 because the flow is autonomous: 1 if it is sampled at equal times,
         else 0.
         """
-        return int(self.can_rest and not self.is_flow)
+        return int(self.can_rest and not self.has_returns)
 
     def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Compute the logarithm of the factor by which the flow changes phase volume from each section point to the
@@ -282,7 +282,7 @@ def _point(
     block_cells: int,
 ) -> Point:
     frequency, base = frequency_of(dynamics.model, values), dynamics.parameters
-    own: dict[str, Any] = {"is_flow": dynamics.is_flow, "can_rest": dynamics.can_rest}
+    own: dict[str, Any] = {"has_returns": dynamics.has_returns, "can_rest": dynamics.can_rest}
     if isinstance(base, Parameters):
         parameters = base.replace(**{name: value for name, value in values.items() if name in base})
         return Point(
