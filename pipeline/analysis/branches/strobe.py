@@ -43,7 +43,7 @@ def other_side(
     shares = (1e-5, 1e-4, 1e-3, 1e-2)
     # least scaled jump that is an impact, and the largest error of the extrapolated state in units of the jump
     least_jump, unsure = 1e-4, 0.1
-    if not system.n_impacts or system.is_map or crossed_state(system) is not None:
+    if not system.n_impacts or crossed_state(system) is not None:
         return None
     drive = Drive(np.full(period, 1.0 / frequency_hz))
     for share in shares:
