@@ -19,3 +19,6 @@ CLOSURE = 1e-6
 
 LONGEST_PERIOD = 16
 """Longest orbit period that is detected [drive periods or returns]."""
+
+DRIVE_HZ = 2.2
+"""Drive frequency of a single trajectory, if none is given [Hz]."""

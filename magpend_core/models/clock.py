@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magpend_core.defaults import DRIVE_HZ
+
 if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
 
@@ -97,7 +99,7 @@ DRIVEN = Clock(
     "stroboscopic section",
     "the start of the drive's period",
     "period 1/f, f the drive's frequency [Hz]",
-    default_hz=2.2,
+    default_hz=DRIVE_HZ,
     has_drive=True,
 )
 """A drive's periods."""

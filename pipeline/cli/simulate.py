@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from magpend_core.defaults import ATOL, RTOL
-from magpend_core.models.clock import DRIVEN
+from magpend_core.defaults import ATOL, DRIVE_HZ, RTOL
 from pipeline.cli import console
 from pipeline.cli.common import PresetName, Set, read_pairs
 from pipeline.cli.models import DEFAULT, names
@@ -33,7 +32,7 @@ Frequency = Annotated[
     typer.Option(
         "--frequency-hz",
         "--frequency",
-        help=f"Drive frequency [Hz]; by default {DRIVEN.default_hz:g}. Without a drive a period is 1 s.",
+        help=f"Drive frequency [Hz]; by default {DRIVE_HZ:g}. Without a drive a period is 1 s.",
     ),
 ]
 
