@@ -23,7 +23,7 @@ import numpy as np
 
 from magpend_core import Crossing, load_model, sections
 from pipeline.analysis.attractors.extension.clouds import OTHER, group, mixing
-from pipeline.analysis.attractors.extension.extending import LEAST_STAY
+from pipeline.analysis.attractors.finding.requests import Effort
 from pipeline.results.sets import Geometry
 
 UEDA = {
@@ -34,7 +34,7 @@ UEDA = {
 }
 """Ueda, J. Stat. Phys. 20, 181 (1979)."""
 
-KEPT = (20, 60, 300, LEAST_STAY)
+KEPT = (20, 60, 300, Effort.least_stay)
 GAP = 0.02
 """Distance of two sets in units of their extent."""
 
@@ -73,7 +73,9 @@ def cells_of(case: Case, n: int) -> tuple[np.ndarray, Geometry]:
     model = load_model(case.model)
     parameters = model.load(**case.changes)
     starts = 0.1 + case.spread * np.random.default_rng(1).uniform(-1.0, 1.0, (n, len(model.states)))
-    found = sections(parameters, case.frequency_hz, starts, n_transient=500, n_keep=LEAST_STAY, section=case.section)
+    found = sections(
+        parameters, case.frequency_hz, starts, n_transient=500, n_keep=Effort.least_stay, section=case.section
+    )
     return found.section[found.status == 2], Geometry(model.is_angle, model.scales)
 
 

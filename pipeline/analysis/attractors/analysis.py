@@ -41,8 +41,6 @@ from pipeline.results.tabular import (
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
 
-MOST_STATES = 2
-"""Most states of a model whose places are printed; the CSV table has those of all models."""
 
 RUN_AWAY = {"diverged", "growing", "not settled"}
 """What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
@@ -281,8 +279,9 @@ def _attractor_words(row: Row, n_points: int, model: Model) -> Words:
 
 def _place(row: Row, model: Model) -> Words:
     """Return the section point and, where it moves, the range of a set in each state, if the states are few."""
+    most = 2  # states of a model whose places are printed; the CSV table has those of all models
     words = {}
-    for x, scale in zip(model.state_names, model.scales, strict=True) if len(model.states) <= MOST_STATES else ():
+    for x, scale in zip(model.state_names, model.scales, strict=True) if len(model.states) <= most else ():
         point, low, high = (in_scale(row[f"{part}_{x}"], scale) for part in ("section", "min", "max"))
         words[x] = point if low == high else f"{point} ({low} to {high})"
     return words

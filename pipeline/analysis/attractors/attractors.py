@@ -63,7 +63,7 @@ from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
-from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
 from pipeline.analysis.attractors.finding.requests import Settings, answer_all
 from pipeline.analysis.attractors.finding.searching import Search
 from pipeline.analysis.attractors.labelling import Found, analyse, follow
@@ -84,7 +84,7 @@ def identify(
     *,
     parameters: Parameters | np.ndarray | None = None,
     system: System | None = None,
-    block_bytes: int = BUDGET,
+    block_bytes: int = SLAB_BYTES,
     **changes: Any,
 ) -> xr.Dataset:
     """Find the attractors at each parameter point of a run's result cube, and assign each trajectory (cell) to one of

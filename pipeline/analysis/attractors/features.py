@@ -37,12 +37,6 @@ from pipeline.results.tolerances import PORTRAIT_RTOL
 ENERGY = "energy"
 """Name of the model's quantity whose range is computed for each attractor."""
 
-SAMPLES = 256
-"""Times per drive period or return at which a polished orbit is sampled for its ranges; even."""
-
-MOST_SAMPLES = 2**20
-"""Most states of orbits that are held at once."""
-
 
 @dataclass
 class Cells:
@@ -168,7 +162,9 @@ def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameter
     return np.where(np.isfinite(section).all(axis=(1, 2)), code, UNKNOWN).astype(np.int64)
 
 
-def follow_orbits(orbits: Sequence[tuple[Features, Parameters, float]], geometry: Geometry) -> None:
+def follow_orbits(
+    orbits: Sequence[tuple[Features, Parameters, float]], geometry: Geometry, n_samples: int = 256
+) -> None:
     """Integrate periodic orbits over their periods, and store their ranges, exact rotations, energy ranges and mirror
     images.
 
@@ -178,17 +174,22 @@ def follow_orbits(orbits: Sequence[tuple[Features, Parameters, float]], geometry
         Features of each orbit, its parameters, and the drive frequency or the mean frequency of the returns [Hz].
     geometry
         Geometry of the states.
+    n_samples
+        Times per drive period or return at which an orbit is sampled for its ranges; even.
     """
+    most = 2**20  # states of orbits that are held at once
     by_period = rows_by_number(np.array([found.orbit_period for found, _, _ in orbits], np.int64))
     for period, rows in by_period.items():
-        n = max(1, MOST_SAMPLES // (period * SAMPLES))
+        n = max(1, most // (period * n_samples))
         for begin in range(0, len(rows), n):
-            _follow([orbits[row] for row in rows[begin : begin + n]], period, geometry)
+            _follow([orbits[row] for row in rows[begin : begin + n]], period, geometry, n_samples)
 
 
-def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry) -> None:
+def _follow(
+    orbits: Sequence[tuple[Features, Parameters, float]], period: int, geometry: Geometry, n_samples: int
+) -> None:
     flows = [of_flow(parameters) for _, parameters, _ in orbits]
-    per = flows[0].model.clock.samples(SAMPLES)
+    per = flows[0].model.clock.samples(n_samples)
     times = [np.arange(period * per + 1) / (per * frequency) for _, _, frequency in orbits]
     paths = sample(
         flows[0].model.system,
@@ -213,7 +214,7 @@ def _follow(orbits: Sequence[tuple[Features, Parameters, float]], period: int, g
         _fill_energy(found, times[row], paths.states[row], flows[row], frequency)
         mirror = parameters.model.mirror
         if mirror is not None:
-            first = SAMPLES // 2 if mirror.half_period else 0
+            first = n_samples // 2 if mirror.half_period else 0
             found.image = paths.states[row, first : period * per : per] * np.array(mirror.signs)
 
 

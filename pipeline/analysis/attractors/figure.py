@@ -20,13 +20,7 @@ from pipeline.results.ragged import dense, dims_of, isel
 from pipeline.results.run import OpenRun
 from pipeline.results.selection import place
 
-MAX_ROWS = 8
-LONE_MM = 110.0
-"""Width of a figure with a single panel: a wider one would be half empty."""
-
 _PANEL_IN, _LABEL_IN, _LINE_IN = 0.9, 0.44, 0.17
-_PATH_IN = 0.14
-"""Further room for the tick labels of a path, which are long."""
 
 
 @style.drawn
@@ -50,28 +44,31 @@ def plot_gallery(
     -------
     DataFigure
         Lines are the motion, dots its section. The portrait of an angle that turns over is
-        drawn on the circle, from -pi to pi. The `MAX_ROWS` attractors with the largest share are
+        drawn on the circle, from -pi to pi. The 8 attractors with the largest share are
         drawn, in the order of their ids; where there are fewer, also sets that do not attract, in grey. The
         heading counts the cells that end elsewhere, with the reason. A figure with a single panel is at most
-        `LONE_MM` wide. Its `data` are the portraits drawn.
+        110 mm wide. Its `data` are the portraits drawn.
 
     Raises
     ------
     ValueError
         If there is no attractor, or if degrees are asked for of a model without angles.
     """
+    # most attractors that are shown, and the width of a figure with a single panel [mm]: a wider one would be half
+    # empty
+    most_rows, lone_mm = 8, 110.0
     model = model_of(attractors)
     labels.some_angle(model, degrees, "portraits")
     n = portraits.sizes["attractor"]
     if n == 0:
         raise ValueError("there is no attractor at this parameter point: nothing to draw")
-    ranked = np.argsort(-portraits["share"].values, kind="stable")[:MAX_ROWS]
+    ranked = np.argsort(-portraits["share"].values, kind="stable")[:most_rows]
     data = portraits.isel(attractor=np.sort(ranked)).assign_attrs(told_by(attractors.attrs))
     here = _described(attractors, portraits)
     cast = palette.cast_of(attractors, here)
     each = len(model.portraits) + (model.drawing is not None)
     if each * data.sizes["attractor"] == 1:
-        frame = replace(frame, width=min(frame.width, LONE_MM))
+        frame = replace(frame, width=min(frame.width, lone_mm))
     head = style.folded(_told(data, portraits, here), frame.width_in - 0.2, style.sizes().legend)
     layout = _Layout.of(frame, data.sizes["attractor"], each, model.drawing is not None, head.count("\n") + 1)
     titles = [_title(data.isel(attractor=k), cast, layout) for k in range(data.sizes["attractor"])]
@@ -125,10 +122,11 @@ class _Layout:
         return _LINE_IN * (self.lines + 1) + 0.08 + self.rows * self.row
 
     def axes(self, fig: style.DataFigure, k: int, column: int) -> Axes:
+        path_in = 0.14  # further room for the tick labels of a path, which are long
         width, height = self.panel
         x = self.left + ((k % self.beside) * self.each + column) * self.pitch
         if self.drawing and column == self.each - 1:
-            room = 0.0 if self.frame.compact else _PATH_IN
+            room = 0.0 if self.frame.compact else path_in
             x, width = x + room, width - room
         y = (self.rows - 1 - k // self.beside) * self.row + _LABEL_IN
         size = fig.get_size_inches()

@@ -49,10 +49,6 @@ from pipeline.results.sets import Geometry, looked_up, order_by_points, rows_by_
 from pipeline.results.sides import UNKNOWN
 from pipeline.results.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 
-MOST_PROBES = 8
-"""Most degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories."""
-
-
 ENDLESS = (DIVERGES, GROWS)
 """Decisions on cells that end on no set."""
 
@@ -222,8 +218,9 @@ def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -
 
 
 def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
+    most = 8  # degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories
     neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
-    for i in neutral[:MOST_PROBES]:
+    for i in neutral[:most]:
         within = yield from probe_orbit(state.orbits[i], search.geometry)
         if within:
             state.orbits[i] = replace(state.orbits[i], approached_within=within)
@@ -232,7 +229,7 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
                 near = is_approaching(block.section[rows], state.orbits[i], search.geometry)
                 labels.put(rows[near] + block.cells.start, i, APPROACHING)
     degenerate = [k for k, one in enumerate(point.equilibria) if one.stability == NEUTRAL]
-    for k in degenerate[:MOST_PROBES]:
+    for k in degenerate[:most]:
         point.equilibria[k] = yield from probe_equilibrium(point.equilibria[k], search.geometry)
     if any(one.approached_within for one in point.equilibria):
         put_at_rest(point, search.geometry)
@@ -496,15 +493,18 @@ def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Featu
 
 
 def _fill_orbit(found: Features, orbit: Orbit, has_returns: bool) -> None:
+    # largest excess of a multiplier over 1 that rounding errors leave to an orbit which trajectories approach; and
+    # largest error of a multiplier with which one on the unit circle says that an orbit is neutral
+    above, telling = 0.01, 0.1
     found.multipliers, found.residual, found.is_polished = orbit.multipliers, orbit.residual, True
     found.multiplier_error = orbit.multiplier_error
     modulus = float(np.abs(orbit.multipliers).max())
-    if orbit.is_stable and modulus > 1.0 + stability.ABOVE:
+    if orbit.is_stable and modulus > 1.0 + above:
         raise AssertionError(
             f"an orbit with a multiplier of modulus {modulus:g} is said to attract: a fault of magpend."
         )
     found.evidence = stability.BY_APPROACH if orbit.approached_within else stability.BY_MULTIPLIERS
-    if found.stability == NEUTRAL and orbit.multiplier_error > stability.TELLING:
+    if found.stability == NEUTRAL and orbit.multiplier_error > telling:
         found.stability, found.evidence = NOT_SETTLED, stability.BY_NOTHING
     exponents = orbit_exponents(orbit.multipliers, orbit.seconds, has_returns)
     found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])

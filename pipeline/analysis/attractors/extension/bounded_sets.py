@@ -35,30 +35,6 @@ from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTL
 from pipeline.results.sets import TWO_PI, Geometry
 from pipeline.results.tolerances import PORTRAIT_RTOL, ROUGH_SLOPE_RTOL, SLOPE_RTOL
 
-SLOPES = (1024, 4096)
-"""Most derivatives of the section map for the exponents of a set: at first, and if the first are too few."""
-
-MOST_ASKED = 4
-"""Most trajectories of a set whose neighbours show whether it is a torus or a family."""
-
-MOST_SHAPED = 1024
-"""Most section points that the test for a torus uses."""
-
-ASIDE, KEPT = 0.2, 0.25
-"""Scaled distance at which neighbours start, and the share of it from which they have kept their distance."""
-
-ALIKE = 0.2
-"""Largest difference of the ranges of two trajectories that differ in phase alone, in units of `ASIDE`."""
-
-LEGS = 8
-"""Legs after which neighbours have approached the family: exponents that are not 0 are below -`GROWN` over them."""
-
-SAMPLES, STRETCHES = 8192, (1, 4, 16)
-"""States along each trajectory whose range is compared, per leg, and the legs until it is known."""
-
-LINKS, HALVINGS, TOGETHER = 16, 6, 0.1
-"""States on a segment, how often its widest gap is divided, and the share of the segment's length that remains."""
-
 
 @dataclass(frozen=True, eq=False)
 class BoundedSet:
@@ -117,11 +93,11 @@ def describe(
     paths = [course.stayed for course in own]
     pooled = np.concatenate(paths)
     growth, kind = None, BOUNDED_SET
-    for most in SLOPES if has_stayed else ():
+    for most in settings.effort.slopes if has_stayed else ():
         growth = yield from _growth(own, point, settings, most)
         if growth is None:
             break
-        kind = kind_of(growth, thinned(pooled, MOST_SHAPED), settings.geometry)
+        kind = kind_of(growth, thinned(pooled, settings.effort.shaped), settings.geometry)
         if kind != BOUNDED_SET or growth.contracts or growth.preserves_volume:
             break
     verdict, evidence = _verdict(left, growth, has_stayed)
@@ -131,7 +107,7 @@ def describe(
     in_phase, is_doubtful = None, growth is not None and growth.may_preserve_volume
     if verdict == ATTRACTS and _is_in_family(pooled, dimension, point, settings):
         # neighbours of one phase may come nearer for a while
-        for course in own[:MOST_ASKED]:
+        for course in own[: settings.effort.asked]:
             in_phase = yield from differs_in_phase(course, point, settings.geometry)
             if in_phase is not None:
                 break
@@ -290,10 +266,16 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
     """Return whether the neighbours of a trajectory that keep their distance run through the same ranges of states;
     None if all come nearer, one fails, or a range is not known.
     """
+    # scaled distance at which neighbours start, the share of it from which they have kept their distance, and the
+    # largest difference of the ranges of two trajectories that differ in phase alone, in units of it
+    size, share, alike = 0.2, 0.25, 0.2
+    legs = 8  # after which neighbours have approached the family: exponents that are not 0 are below -`GROWN` over them
+    # states along each trajectory whose range is compared, per leg, and the legs until it is known
+    samples, stretches = 8192, (1, 4, 16)
     assert point.parameters is not None
-    aside = ASIDE * np.diag(geometry.scales)
+    aside = size * np.diag(geometry.scales)
     states, seconds = course.state + np.concatenate([np.zeros((1, len(aside))), aside]), 0.0
-    for _ in range(LEGS):
+    for _ in range(legs):
         leg = yield from _leg(states)
         if leg is None:
             return None
@@ -302,20 +284,20 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
     if point.n_neutral:
         flow = rates_at(point.integrates, states[:1], point.packed)[0] / np.asarray(geometry.scales)
         away -= np.outer(away @ flow, flow) / max(float(flow @ flow), 1e-300)
-    kept = np.flatnonzero(np.abs(away).max(axis=1) >= KEPT * ASIDE)
+    kept = np.flatnonzero(np.abs(away).max(axis=1) >= share * size)
     if not len(kept):
         return None
     flow_of, rate = of_flow(point.parameters), LEG / seconds
-    for n in STRETCHES:
-        times = point.parameters.model.clock.instants(n * seconds, n * SAMPLES)
+    for n in stretches:
+        times = point.parameters.model.clock.instants(n * seconds, n * samples)
         paths = [trajectory(flow_of, rate, states[i], times, **tolerances_at(PORTRAIT_RTOL)) for i in [0, *(kept + 1)]]
         turns = np.asarray(geometry.is_angle) & (np.ptp(paths[0], axis=0) >= TWO_PI)
         first, *others = (_ranges(path, geometry)[:, ~turns] for path in paths)
-        if max(np.abs(other - first).max(initial=0.0) for other in others) <= ALIKE * ASIDE:
+        if max(np.abs(other - first).max(initial=0.0) for other in others) <= alike * size:
             return True
         # a range that still grows shows no difference
         early, late = (_ranges(half, geometry)[:, ~turns] for half in np.array_split(paths[0], 2))
-        if np.abs(late - early).max(initial=0.0) <= 0.5 * ALIKE * ASIDE:
+        if np.abs(late - early).max(initial=0.0) <= 0.5 * alike * size:
             return False
     return None
 
@@ -327,21 +309,24 @@ def _ranges(path: np.ndarray, geometry: Geometry) -> np.ndarray:
 
 def is_one_torus(a: Course, b: Course, geometry: Geometry) -> Work[bool]:
     """Return whether the states between two trajectories, on one torus or on two, end between them."""
+    legs = 8  # after which neighbours have approached the family: exponents that are not 0 are below -`GROWN` over them
+    # states on a segment, how often its widest gap is divided, and the share of the segment's length that remains
+    links, halvings, together = 16, 6, 0.1
     near = np.argmin(geometry.distance(b.extension, a.state))
     start, step = a.state, geometry.difference(b.extension[near], a.state) * np.asarray(geometry.scales)
-    along = np.linspace(0.0, 1.0, LINKS + 1)
+    along = np.linspace(0.0, 1.0, links + 1)
     length = float(np.abs(step / np.asarray(geometry.scales)).max())
-    for _ in range(HALVINGS):
+    for _ in range(halvings):
         leg = yield from _leg(start + along[:, None] * step)
-        for _ in range(LEGS - 1):
+        for _ in range(legs - 1):
             leg = (yield from _leg(leg.state)) if leg is not None else None
         if leg is None:
             return False
         gaps = geometry.distance(leg.state[1:], leg.state[:-1])
         widest = int(np.argmax(gaps))
-        if gaps[widest] <= TOGETHER * length:
+        if gaps[widest] <= together * length:
             return True
-        along = np.linspace(along[widest], along[widest + 1], LINKS + 1)
+        along = np.linspace(along[widest], along[widest + 1], links + 1)
     return False
 
 

@@ -27,7 +27,7 @@ from pipeline.results.sets import Geometry, nearest_distances
 SAME, OTHER = 0.25, 0.05
 """Share of neighbours in the other sample from which two samples are one set, and below which two sets."""
 
-MOST_POINTS = 4096
+MOST_COMPARED = 4096
 """Most points per sample in a comparison."""
 
 INSIDE, REACHED = 0.9, 3.0
@@ -70,7 +70,7 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0,
     float
         About 0.5 for samples of one set, 0 for distant ones; NaN if either has fewer than 4 points.
     """
-    n = min(len(a), len(b), MOST_POINTS) // 2
+    n = min(len(a), len(b), MOST_COMPARED) // 2
     if n < 2:
         return float("nan")
     a, b = (geometry.scaled(thinned(points, 2 * n)) for points in (a, b))
@@ -129,7 +129,7 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
 
 
 def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
-    each = max(4, MOST_POINTS // len(samples))
+    each = max(4, MOST_COMPARED // len(samples))
     if len({len(sample) for sample in samples}) == 1:
         return thinned(np.stack(samples, axis=1), each).reshape(-1, samples[0].shape[1])
     parts = [thinned(sample, each) for sample in samples]

@@ -18,22 +18,12 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, slopes_along
 from pipeline.analysis.attractors.extension.clouds import Cloud, group, members
 from pipeline.analysis.attractors.extension.courses import FAILED, GROWS, Course
-from pipeline.analysis.attractors.extension.extending import LEAST_BUDGET, LEAST_STAY, ROUNDS, sample_cells
+from pipeline.analysis.attractors.extension.extending import sample_cells
 from pipeline.analysis.attractors.extension.growth import Escape, Growth, growth_of
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Settings, Work
 from pipeline.layout.vocabulary import CHAOTIC_SET
 from pipeline.results.tolerances import SLOPE_RTOL
-
-MOST_LEVELS = 32
-"""Most values of constant quantities whose cells get rows of their own."""
-
-APART = 100.0
-"""Least ratio of the range of a quantity over all cells to its largest range along one, if it is constant along cells;
-and its least gap between cells of different values, in units of the latter."""
-
-SEEN = 16
-"""Last kept sections of each cell at which quantities are compared."""
 
 
 def conservative_sets(
@@ -78,13 +68,15 @@ def conservative_sets(
 
 def levels_of(point: Point) -> np.ndarray:
     """Return for each cell a number that differs where a constant quantity of the model does; -1 for failed cells."""
+    most_levels = 32  # most values of constant quantities whose cells get rows of their own
+    seen = 16  # last kept sections of each cell at which quantities are compared
     level = np.full(point.n_cells, -1)
     names = [q.name for q in point.parameters.model.quantities] if point.parameters is not None else []
-    values = np.full((point.n_cells, SEEN, len(names)), np.nan)
+    values = np.full((point.n_cells, seen, len(names)), np.nan)
     for block in point.blocks():
         rows = np.flatnonzero(block.is_closed | block.is_bounded)
         level[rows + block.cells.start] = 0
-        states = block.section[rows, -SEEN:]
+        states = block.section[rows, -seen:]
         if names and len(rows):
             assert point.parameters is not None
             found = evaluate(names, 0.0, states.reshape(-1, states.shape[2]), point.parameters, point.frequency)
@@ -92,20 +84,23 @@ def levels_of(point: Point) -> np.ndarray:
     known = np.flatnonzero(level >= 0)
     for one in np.moveaxis(values[known], 2, 0):
         level[known] = _split(level[known], one)
-    return level if level.max(initial=0) < MOST_LEVELS else np.minimum(level, 0)
+    return level if level.max(initial=0) < most_levels else np.minimum(level, 0)
 
 
 def _split(level: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Divide the levels of cells by a quantity (cell, section), if it is constant along each cell."""
+    # least ratio of the range of a quantity over all cells to its largest range along one, if it is constant along
+    # cells; and its least gap between cells of different values, in units of the latter
+    apart = 100.0
     ranges = np.nanmax(values, axis=1) - np.nanmin(values, axis=1) if values.size else np.zeros(0)
     mean = np.nanmean(values, axis=1) if values.size else np.zeros(0)
     # the rounding of values is no difference
     within = max(float(ranges.max(initial=0.0)), 1e-12 * float(np.abs(mean).max(initial=0.0)))
-    if not np.isfinite(within) or np.ptp(mean) < APART * within or within == 0.0 == np.ptp(mean):
+    if not np.isfinite(within) or np.ptp(mean) < apart * within or within == 0.0 == np.ptp(mean):
         return level
     order = np.argsort(mean, kind="stable")
     number = np.empty(len(mean), np.int64)
-    number[order] = np.concatenate([[0], np.cumsum(np.diff(mean[order]) > APART * within)])
+    number[order] = np.concatenate([[0], np.cumsum(np.diff(mean[order]) > apart * within)])
     return np.unique(np.stack([level, number]), axis=1, return_inverse=True)[1].reshape(-1)
 
 
@@ -115,13 +110,13 @@ def _extended(point: Point, settings: Settings, n_sample: int) -> Work[tuple[lis
     """
     courses: list[Course] = []
     growths: list[Growth | None] = []
-    for _ in range(ROUNDS):
-        left = max(LEAST_BUDGET // LEAST_STAY - len(courses), 0)
+    for _ in range(settings.effort.rounds):
+        left = max(settings.effort.least_budget // settings.effort.least_stay - len(courses), 0)
         known = np.array([course.key for course in courses], np.uint64)
         chosen = sample_cells(point, np.arange(point.n_cells), min(n_sample, left), settings, known) if left else []
         if not chosen:
             break
-        yield from _advance(chosen)
+        yield from _advance(chosen, settings)
         for course in chosen:
             if course.goes_on and Escape.of(course.extension, settings.geometry) is not None:
                 course.end = GROWS
@@ -131,8 +126,8 @@ def _extended(point: Point, settings: Settings, n_sample: int) -> Work[tuple[lis
     return courses, growths
 
 
-def _advance(courses: Sequence[Course]) -> Work[None]:
-    for _ in range(LEAST_STAY // LEG):
+def _advance(courses: Sequence[Course], settings: Settings) -> Work[None]:
+    for _ in range(settings.effort.least_stay // LEG):
         going = [course for course in courses if course.goes_on]
         if not going:
             return

@@ -6,9 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-LEAST_SEEN = 8
-"""Fewest section points on a set for a cell to count as having left it."""
-
 ON_SET, FAILED, DIVERGED, GROWS, AT_REST = -1, -2, -3, -4, -5
 """Ends of extended cells other than orbits; `AT_REST` minus k is the equilibrium number k."""
 
@@ -49,8 +46,9 @@ class Course:
 
     @property
     def has_left(self) -> bool:
-        """Whether the trajectory has left a set after at least `LEAST_SEEN` section points on it."""
-        return not self.goes_on and not self.is_leaving and len(self.stayed) >= LEAST_SEEN
+        """Whether the trajectory has left a set after a least number of section points on it."""
+        least = 8  # section points on a set for a cell to count as having left it
+        return not self.goes_on and not self.is_leaving and len(self.stayed) >= least
 
     @property
     def length(self) -> int:

@@ -7,7 +7,7 @@ has stayed long enough and no set is in doubt, or when the budget is spent. Then
 compared with the points of the sets. Cells that match none are sampled again, in the next round.
 
 The budget is `options.budget` times the periods that the run integrated at the parameter point, and at least
-`LEAST_BUDGET` periods. Nothing here depends on the clock, so the same run gives the same verdicts.
+`Effort.least_budget` periods. Nothing here depends on the clock, so the same run gives the same verdicts.
 
 Reading order: `extend` has the rounds, `_Extension.run` a round, `_take` one leg, `_tell_sets` the verdicts.
 """
@@ -44,34 +44,6 @@ from pipeline.results.intervals import lifetime_interval
 from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import REACH
 
-LEAST_BUDGET = 16_384
-"""Least budget of a parameter point [periods], however short the run was."""
-
-LEAST_PATHS, MOST_PATHS = 8, 64
-"""Fewest trajectories that must stay on a chaotic set before it is said to attract, for a budget of 1; and the most
-that a larger budget asks for, in proportion.
-
-Beside too few cells neighbours are drawn. A single cell can outlive the bound on a set that most cells leave before.
-"""
-
-ASIDE = 1e-6
-"""Largest scaled distance of a neighbour from its cell: chaos separates them, and they start on the same set."""
-
-LEAST_STAY = 512
-"""Least extension of a cell [sections]: enough points to separate two sets, and chaos from a torus."""
-
-DOUBLINGS = 3
-"""Most doublings of the extension while a set is in doubt."""
-
-ROUNDS = 6
-"""Most samples of a parameter point; each is twice as large as the one before."""
-
-SEARCH_EACH = 32
-"""Orbits are searched after 1, 2, 4, ... legs and every `SEARCH_EACH` legs: Newton steps are expensive."""
-
-LOOK_BACK = 4
-"""Legs searched for a period: four legs show periods of up to two legs."""
-
 
 @dataclass
 class Outcome:
@@ -107,7 +79,7 @@ def extend(
     """
     work = _Extension(point, list(orbits), settings, budget)
     loose = np.flatnonzero(label < 0)
-    for _ in range(ROUNDS):
+    for _ in range(settings.effort.rounds):
         chosen = work.sample(loose, n_sample) if len(loose) else []
         if not chosen:
             break
@@ -159,10 +131,11 @@ class _Extension:
     def __init__(self, point: Point, orbits: list[Orbit], settings: Settings, budget: float) -> None:
         self.point, self.orbits, self.settings = point, orbits, settings
         self.geometry: Geometry = settings.geometry
-        self.paths = int(np.clip(LEAST_PATHS * budget, LEAST_PATHS, MOST_PATHS))
+        effort = settings.effort
+        self.paths = int(np.clip(effort.least_paths * budget, effort.least_paths, effort.most_paths))
         # whatever the run's length, a budget of 1 suffices for the trajectories of one set
-        needed = min(budget, MOST_PATHS) * LEAST_PATHS * stability.TIMES_LONGEST * settings.seen
-        self.budget = int(max(budget * point.n_periods, LEAST_BUDGET, needed)) if budget > 0.0 else 0
+        needed = min(budget, effort.most_paths) * effort.least_paths * effort.times_longest * settings.seen
+        self.budget = int(max(budget * point.n_periods, effort.least_budget, needed)) if budget > 0.0 else 0
         self.courses: list[Course] = []
         self.sets: list[BoundedSet] = []
         self.spent, self.ran_out = 0, False
@@ -215,8 +188,8 @@ class _Extension:
 
     def run(self) -> Work[None]:
         """Integrate the sampled trajectories further, until it is decided for each of them whether its set attracts."""
-        target = LEAST_STAY
-        for _ in range(DOUBLINGS + 1):
+        target = self.settings.effort.least_stay
+        for _ in range(self.settings.effort.doublings + 1):
             in_doubt = yield from self._extend_and_tell(target)
             if self.has_budget and self._draw_neighbours():
                 in_doubt = yield from self._extend_and_tell(target)
@@ -265,7 +238,7 @@ class _Extension:
         least = min(course.length for course in going)
         if least < target:
             return False
-        longest = stability.TIMES_LONGEST * self._longest_transient()
+        longest = self.settings.effort.times_longest * self._longest_transient()
         if any(course.is_neighbour for course in going):
             return least >= longest
         at_risk = float(sum(course.length for course in going))
@@ -295,7 +268,7 @@ class _Extension:
         block = leg.take(rows)
         own = [going[i] for i in rows.tolist()]
         n = len(own[0].legs)
-        if n.bit_count() == 1 or n % SEARCH_EACH == 0:
+        if n.bit_count() == 1 or n % self.settings.effort.search_each == 0:
             yield from self._search(own, block)
         label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
         for course, number in zip(own, label.tolist(), strict=True):
@@ -320,7 +293,7 @@ class _Extension:
         closed = ClosedCells(self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2]))
         closed.add(block.take(np.array(rest, np.int64)))
         found = closed.guesses
-        depths = [min(LOOK_BACK, len(own[i].legs)) for i in rest]
+        depths = [min(self.settings.effort.look_back, len(own[i].legs)) for i in rest]
         for depth in set(depths):
             rows = [i for i, d in zip(rest, depths, strict=True) if d == depth and block.is_bounded[i]]
             if rows:
@@ -377,6 +350,8 @@ class _Extension:
 
     def _draw_neighbours(self) -> bool:
         """Draw neighbours of the cells on each chaotic set with too few cells; return whether any were drawn."""
+        # largest scaled distance of a neighbour from its cell: chaos separates them, and they start on the same set
+        size = 1e-6
         random, scales = np.random.default_rng(0), np.asarray(self.geometry.scales)
         n_before = len(self.courses)
         for one in self.sets:
@@ -385,13 +360,15 @@ class _Extension:
             on_set = [course for course in self.courses if course.goes_on and course.cell in one.cells]
             for i in range(self.paths - len(on_set)):
                 near = on_set[i % len(on_set)]
-                aside = ASIDE * random.uniform(-1.0, 1.0, len(scales)) * scales
+                aside = size * random.uniform(-1.0, 1.0, len(scales)) * scales
                 self.courses.append(Course(near.cell, near.key, near.kept, near.state + aside, is_neighbour=True))
         return len(self.courses) > n_before
 
     def _are_enough(self, own: Sequence[Course]) -> bool:
         """Return whether the trajectories on a chaotic set, neighbours included, are enough to say that it attracts."""
-        stayed = not any(course.is_neighbour for course in own) or self._has_stayed(own, LEAST_STAY)
+        stayed = not any(course.is_neighbour for course in own) or self._has_stayed(
+            own, self.settings.effort.least_stay
+        )
         return len(own) >= self.paths and stayed
 
     # ---- sets ----------------------------------------------------------------------------------
@@ -407,7 +384,7 @@ class _Extension:
         if not going:
             return True
         cells = [course for course in going if not course.is_neighbour]
-        has_stayed = bool(cells) and bool(cells[0].legs) and self._has_stayed(cells, LEAST_STAY)
+        has_stayed = bool(cells) and bool(cells[0].legs) and self._has_stayed(cells, self.settings.effort.least_stay)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
         groups = [
             [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)

@@ -32,30 +32,12 @@ N_SIGMA = 3.0
 GROWN = 5.0
 """Least logarithm of the growth of a small distance over a cell's extension that shows chaos."""
 
-N_BLOCKS, LEAST_BLOCKS = 4, 16
-"""Blocks per cell for the error of an exponent, and least number of blocks in total."""
 
 ZERO = 1e-4
 """Largest modulus of an exponent that counts as 0 on a torus [per section]."""
 
-NEIGHBOURS, THIN, ON_CURVE = 10, 0.2, 0.95
-"""Neighbours tested for a line, their largest relative scatter about it, and the least share of points."""
-
-GONE = -660.0
-"""Logarithm of the growth of a direction or a volume that shrinks to zero."""
-
-CLEAR = 1e-2
-"""Smallest modulus of an exponent and of a change of volumes that an integration at a loose tolerance shows."""
-
-WINDOWS, KEEPS_ON, BEYOND = 8, 0.9, 2.0
-"""Windows of a trajectory that is tested for growth, the least ratio of its late to its early gains, and the factor by
-which it must pass the unit of distances and the size of its first window."""
 
 Rates = Callable[[np.ndarray], np.ndarray]
-
-LOST, LOST_ERROR = 1e-6, 1e-3
-"""Largest mean change of a volume's logarithm [per section] that counts as 0; and the largest error at which
-an interval around 0 counts as 0."""
 
 
 @dataclass(frozen=True)
@@ -69,15 +51,18 @@ class Escape:
     @classmethod
     def of(cls, path: np.ndarray, geometry: Geometry) -> Escape | None:
         """Return how section points (n, state) grow; None if they do not, or come to lie no farther than others do."""
+        # windows of the trajectory, the least ratio of its late to its early gains, and the factor by which it must
+        # pass the unit of distances and the size of its first window
+        n_windows, least_ratio, beyond = 8, 0.9, 2.0
         straight = ~np.asarray(geometry.is_angle)
-        if len(path) < 4 * WINDOWS or not straight.any():
+        if len(path) < 4 * n_windows or not straight.any():
             return None
         scaled = path[:, straight] / np.asarray(geometry.scales)[straight]
-        windows = np.array_split(scaled, WINDOWS)
+        windows = np.array_split(scaled, n_windows)
         size = np.array([np.abs(window - windows[0].mean(axis=0)).max() for window in windows])
-        gained, half = np.diff(size), WINDOWS // 2
-        keeps_on = gained.min() > 0.0 and gained[half:].mean() >= KEEPS_ON * gained[:half].mean()
-        if not keeps_on or size[-1] < BEYOND * max(1.0, size[0]):
+        gained, half = np.diff(size), n_windows // 2
+        keeps_on = gained.min() > 0.0 and gained[half:].mean() >= least_ratio * gained[:half].mean()
+        if not keeps_on or size[-1] < beyond * max(1.0, size[0]):
             return None
         rate = float(np.log(size[-1] / size[-2])) / len(windows[-1])
         return cls(float(size[-1] / max(size[0], 1e-300)), rate, len(path))
@@ -113,7 +98,9 @@ class Growth:
         """Whether the set is chaotic and volumes change, both by far more than an integration at a loose tolerance can
         err.
         """
-        return bool(self.is_chaotic and self.low > CLEAR and abs(self.volume) > CLEAR)
+        # smallest modulus of an exponent and of a change of volumes that an integration at a loose tolerance shows
+        clear = 1e-2
+        return bool(self.is_chaotic and self.low > clear and abs(self.volume) > clear)
 
     @property
     def contracts(self) -> bool:
@@ -141,8 +128,11 @@ class Growth:
         """Whether the section map preserves phase volume: the mean logarithm of the volume's change is 0 within its
         error.
         """
-        near = self.may_preserve_volume and self.volume_error <= LOST_ERROR
-        return bool(near or abs(self.volume) <= LOST)
+        # largest mean change of a volume's logarithm [per section] that counts as 0; and the largest error at which an
+        # interval around 0 counts as 0
+        no_change, largest_error = 1e-6, 1e-3
+        near = self.may_preserve_volume and self.volume_error <= largest_error
+        return bool(near or abs(self.volume) <= no_change)
 
 
 def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Growth:
@@ -157,8 +147,9 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
     volumes
         Logarithm of the change of a volume per section, shape (cell, section); see `volumes_of`.
     """
-    sizes, volumes = stretched(derivatives), np.maximum(volumes, GONE)
-    steps = np.log(sizes, out=np.full(sizes.shape, GONE), where=sizes > 1e-286)
+    gone = -660.0  # logarithm of the growth of a direction or a volume that shrinks to zero
+    sizes, volumes = stretched(derivatives), np.maximum(volumes, gone)
+    steps = np.log(sizes, out=np.full(sizes.shape, gone), where=sizes > 1e-286)
     n = steps.shape[1]
     # drop the first quarter, in which the basis aligns with the growing directions
     steps = steps[:, n // 4 :]
@@ -207,8 +198,9 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
     The error of few blocks is itself uncertain. Student's distribution widens it, so that `N_SIGMA` errors
     keep the confidence that they have for a normal distribution.
     """
+    per_cell, least = 4, 16  # blocks per cell, and least number of blocks in total
     n_cells, n_sections = values.shape
-    n_blocks = min(max(N_BLOCKS, -(-LEAST_BLOCKS // n_cells)), n_sections)
+    n_blocks = min(max(per_cell, -(-least // n_cells)), n_sections)
     each = n_sections // n_blocks
     blocks = values[:, : each * n_blocks].reshape(n_cells, n_blocks, each).mean(axis=2).ravel()
     wider = stdtrit(len(blocks) - 1, ndtr(N_SIGMA)) / N_SIGMA
@@ -267,16 +259,18 @@ def on_closed_curves(points: np.ndarray, geometry: Geometry) -> bool:
     geometry
         Geometry of the states.
     """
-    if len(points) < 8 * NEIGHBOURS:
+    # neighbours tested for a line, their largest relative scatter about it, and the least share of points
+    neighbours, scatter, least = 10, 0.2, 0.95
+    if len(points) < 8 * neighbours:
         return False
-    _, near = geometry.tree(points).query(geometry.scaled(points), k=NEIGHBOURS + 1, p=np.inf)
+    _, near = geometry.tree(points).query(geometry.scaled(points), k=neighbours + 1, p=np.inf)
     away = geometry.difference(points[near[:, 1:]], points[:, None])
     _, size, directions = np.linalg.svd(away, full_matrices=False)
     second = size[:, 1] if size.shape[1] > 1 else np.zeros(len(size))
     along = np.einsum("nks,ns->nk", away, directions[:, 0])
     two_sided = (along.max(axis=1) > 0.0) & (along.min(axis=1) < 0.0)
-    thin = second <= THIN * np.maximum(size[:, 0], 1e-300)
-    return bool((thin & two_sided).mean() >= ON_CURVE)
+    thin = second <= scatter * np.maximum(size[:, 0], 1e-300)
+    return bool((thin & two_sided).mean() >= least)
 
 
 def kind_of(growth: Growth, points: np.ndarray, geometry: Geometry) -> int:

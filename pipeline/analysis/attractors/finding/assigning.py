@@ -16,9 +16,6 @@ from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import LOOSE_SHARE, REACH, STRICT
 
-MOST_PAIRS = 2**18
-"""Most distances between cells and points of orbits that are held at once."""
-
 
 @dataclass(frozen=True)
 class _Metric:
@@ -119,13 +116,14 @@ def _nearest(
     section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
 ) -> Iterator[tuple[np.ndarray, int, int]]:
     """Yield the cells near each point of the orbits, with the index of the orbit and of the orbit point."""
+    most = 2**18  # distances between cells and points of orbits that are held at once
     if not orbits or not len(cells):
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
     phase = np.concatenate([np.arange(o.period) for o in orbits])
     points = np.concatenate([o.points for o in orbits])
     near = np.full(len(cells), -1)
-    for rows in np.array_split(np.arange(len(cells)), -(-len(cells) * len(points) // MOST_PAIRS)):
+    for rows in np.array_split(np.arange(len(cells)), -(-len(cells) * len(points) // most)):
         away = geometry.distance(section[cells[rows], None, -1], points)
         nearest = away.argmin(axis=1)
         near[rows] = np.where(away[np.arange(len(rows)), nearest] < REACH, nearest, -1)

@@ -33,12 +33,6 @@ from pipeline.results.tolerances import (
     SAME_ORBIT,
 )
 
-NEAR_STEPS = 8
-"""Most Newton steps of the first polish."""
-
-RUN_ON_PERIODS = 2000
-"""Most drive periods for which a guess is integrated until it closes."""
-
 
 @dataclass(frozen=True)
 class Orbit:
@@ -153,6 +147,7 @@ def polish(
         An orbit per guess; None where Newton's method did not converge. An orbit depends on its guess
         alone.
     """
+    most_steps = 8  # most Newton steps of the first polish
     if not len(points):
         return []
     known = {} if known is None else known
@@ -162,7 +157,7 @@ def polish(
         points,
         period,
         tolerance=NEAR_RESIDUAL,
-        max_iterations=NEAR_STEPS,
+        max_iterations=most_steps,
         rtol=NEAR_RTOL,
         least_period=False,
         system=system,
@@ -256,15 +251,16 @@ def run_on(
     points : ndarray, (n, state)
         Last sections.
     period : ndarray of int64, (n,)
-        Drive periods; 0 for points that have not closed after `RUN_ON_PERIODS`.
+        Drive periods; 0 for points that have not closed after a largest number.
     """
+    most_periods = 2000  # most drive periods for which a guess is integrated until it closes
     if not len(points):
         return points, np.zeros(0, np.int64)
     result = run_branches(
         packed[:, None],
         frequency[:, None],
         points,
-        n_transient=RUN_ON_PERIODS,
+        n_transient=most_periods,
         n_keep=1,
         **limits_at(EXTEND_RTOL),
         stop_when_closed=True,

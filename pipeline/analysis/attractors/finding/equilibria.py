@@ -28,20 +28,12 @@ from pipeline.results.tolerances import AT_EQUILIBRIUM, NEAR_REST, SAME_EQUILIBR
 WAITS = 16
 """Most repetitions of the wait for a return, for cells that are near no equilibrium yet."""
 
-MOST = 64
-"""Most equilibria of a parameter point: a line of equilibria has infinitely many."""
-
-ITERATIONS = 100
-"""Most Newton steps: near a degenerate equilibrium convergence is only linear."""
 
 NOISE = 0.01
 """Error of a section, in units of the distance within which a closed cell is on a set."""
 
-RATES = 30.0
+FLOW_RATES = 30.0
 """Rates of a flow per rate of its section, roughly: a section is often given some ten times as long as it needs."""
-
-GUESSES, GUESS_BOX = 64, 0.1
-"""Most far states from which Newton's method starts, and the side of the boxes with one start each."""
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
@@ -120,6 +112,7 @@ def _waited(point: Point, path: np.ndarray) -> np.ndarray:
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
     """Find the equilibria near the cells' last states by Newton's method, in canonical order."""
+    most, box = 64, 0.1  # far states from which Newton's method starts, and the side of the boxes with one start each
     if not len(states):
         return []
     steps, _, _ = newton_steps(point.integrates, states, point.packed)
@@ -130,8 +123,8 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
         near |= ways(point, states, _seconds(point), geometry) <= reach
     near = np.flatnonzero(near)
     _, first = np.unique(geometry.boxes(states[near], SAME_EQUILIBRIUM), axis=0, return_index=True)
-    _, other = np.unique(hashes(geometry.boxes(states, GUESS_BOX)), return_index=True)
-    guesses = states[np.concatenate([near[first], other[:GUESSES]])]
+    _, other = np.unique(hashes(geometry.boxes(states, box)), return_index=True)
+    guesses = states[np.concatenate([near[first], other[:most]])]
     return equilibria_near(point, guesses, geometry)
 
 
@@ -139,18 +132,20 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
     """Find the distinct equilibria to which Newton's method converges from given states (n, state), up to a fixed
     number.
     """
-    found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
-    scales, rate = np.asarray(geometry.scales), RATES * point.frequency
+    most = 64  # equilibria of a parameter point: a line of equilibria has infinitely many
+    iterations = 100  # most Newton steps: near a degenerate equilibrium convergence is only linear
+    found = find_equilibria(point.integrates, states, point.packed, max_iterations=iterations)
+    scales, rate = np.asarray(geometry.scales), FLOW_RATES * point.frequency
     kept: list[Equilibrium] = []
     for i in np.flatnonzero(found.converged):
         if all(geometry.distance(found.states[i], other.state) > SAME_EQUILIBRIUM for other in kept):
             jacobian = found.jacobians[i] * scales / scales[:, None]
             residual = float(found.residual[i])
             kept.append(Equilibrium(found.states[i], found.eigenvalues[i], residual, jacobian, rate=rate))
-        if len(kept) == MOST:
+        if len(kept) == most:
             break
     for one in held_near(point, states, _seconds(point), geometry):
-        if len(kept) < MOST and all(geometry.distance(one.state, other.state) > SAME_EQUILIBRIUM for other in kept):
+        if len(kept) < most and all(geometry.distance(one.state, other.state) > SAME_EQUILIBRIUM for other in kept):
             kept.append(one)
     if not kept:
         return []
@@ -159,7 +154,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
 
 def _seconds(point: Point) -> float:
     """Return the order of magnitude of the time in which the flow changes the states [s]."""
-    return 1.0 / (point.frequency * (RATES if point.has_returns else 1.0))
+    return 1.0 / (point.frequency * (FLOW_RATES if point.has_returns else 1.0))
 
 
 def _settled(point: Point, path: np.ndarray, waits: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:

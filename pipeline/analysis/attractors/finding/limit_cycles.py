@@ -25,15 +25,6 @@ from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.results.sets import Geometry, hashes
 from pipeline.results.tolerances import BRANCH_RTOL, CROSSING_RTOL, REACH, SAME_ORBIT, SAME_RETURN, SAME_SECONDS
 
-RETURNS = 32
-"""Most crossings of the level per period."""
-
-TRIES = 3
-"""Cells without a cycle after which the search at a parameter point ends."""
-
-ROUNDS = 8
-"""Most times that a cell which comes nearer to a cycle is integrated over `RETURNS` crossings."""
-
 
 class _Crossings:
     """Upward crossings of a fixed level by one state variable, for the trajectories of one parameter point."""
@@ -47,13 +38,14 @@ class _Crossings:
         """Integrate each start state over a fixed number of upward crossings; return (cell, crossing, state), padded
         with NaN.
         """
+        returns = 32  # most crossings of the level per period
         n = len(states)
         found = run_branches(
             np.tile(np.append(self._packed, level), (n, 1, 1)),
             np.full((n, 1), self._rate),
             states,
             n_transient=0,
-            n_keep=RETURNS,
+            n_keep=returns,
             **limits_at(rtol),
             system=self._system,
         )
@@ -81,8 +73,9 @@ class _Crossings:
 
     def reach(self, states: np.ndarray, where: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
         """Return which trajectories reach a cycle, given by its crossings of a level (crossing, state)."""
+        rounds = 8  # most times that a cell which comes nearer to a cycle is integrated
         reached, rows, before = np.zeros(len(states), bool), np.arange(len(states)), np.full(len(states), REACH)
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             # compare last crossings: the first ones may still show the cell's distance from the cycle
             last = self.of(states[rows], float(where[0, self.state]))[:, -1]
             away = np.nan_to_num(geometry.distance(last[:, None], where).min(axis=1), nan=np.inf)
@@ -159,6 +152,7 @@ def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residua
 
 
 def _tell(point: Point, tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
+    tries = 3  # cells without a cycle after which the search at a parameter point ends
     states, is_closed = _ends(point)
     rows = np.flatnonzero(np.isfinite(states).all(axis=1))
     if not len(rows):
@@ -171,7 +165,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
     on_cycle = np.full(point.n_cells, -1, np.int64)
     cycles: list[Cycle] = []
     failures = 0
-    while len(left) and failures < TRIES:
+    while len(left) and failures < tries:
         found = crossings.cycle_of(states[left[0]], geometry, residual)
         if found is None:
             failures, left = failures + 1, left[1:]

@@ -9,7 +9,7 @@ nearer, those of the other leave.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,73 +19,87 @@ from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Work
 from pipeline.results.sets import Geometry
 
-DISTANCES = (0.5, 0.05, 0.01)
-"""Scaled distances at which trajectories start, tried in turn until one shows an approach."""
 
-LEGS, FALL, GONE, WHOLE = 32, 0.7, 10.0, 1.0
-"""Number of legs, the largest share of the distance left after them that shows an approach, and the share, or the
-scaled distance, beyond which a trajectory has left, even if it comes back from the other side."""
+@dataclass(frozen=True)
+class ProbeSettings:
+    """Numbers of the probes of a degenerate orbit or equilibrium by trajectories."""
+
+    # scaled distances at which trajectories start, tried in turn until one shows an approach; smaller ones show weaker
+    # approaches, and take more legs
+    distances: tuple[float, ...] = (0.5, 0.05, 0.01)
+    legs: int = 32  # number of legs; more show slower approaches
+    fall: float = 0.7  # largest share of the distance left after them that shows an approach
+    # a trajectory that is further away than this share of its distance, or than `whole`, has left, even if it comes
+    # back from the other side
+    gone: float = 10.0
+    whole: float = 1.0
 
 
-def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
+def probe_orbit(orbit: Orbit, geometry: Geometry, settings: ProbeSettings = ProbeSettings()) -> Work[float]:
     """Find the scaled distance from which trajectories on both sides approach an orbit; 0 if they do not approach
     it.
     """
     matrix = scaled_derivative(orbit, geometry)
     values, vectors = np.linalg.eig(matrix)
     critical = vectors[:, np.abs(np.abs(values) - 1.0) <= orbit.multiplier_error]
-    return (yield from _probe(orbit.points, critical, geometry))
+    return (yield from _probe(orbit.points, critical, geometry, settings))
 
 
-def probe_equilibrium(one: Equilibrium, geometry: Geometry) -> Work[Equilibrium]:
+def probe_equilibrium(
+    one: Equilibrium, geometry: Geometry, settings: ProbeSettings = ProbeSettings()
+) -> Work[Equilibrium]:
     """Return the equilibrium with the scaled distance from which trajectories approach it, on both sides or on one; 0
     if they do not approach it.
     """
     values, vectors = np.linalg.eig(one.jacobian)
     critical = vectors[:, np.abs(values.real) <= one.eigenvalue_error]
-    within = yield from _probe(one.state[None], critical, geometry)
+    within = yield from _probe(one.state[None], critical, geometry, settings)
     if within or critical.shape[1] != 1:
         return replace(one, approached_within=within)
-    return (yield from _probe_sides(one, critical[:, 0].real, geometry))
+    return (yield from _probe_sides(one, critical[:, 0].real, geometry, settings))
 
 
-def _probe_sides(one: Equilibrium, direction: np.ndarray, geometry: Geometry) -> Work[Equilibrium]:
+def _probe_sides(
+    one: Equilibrium, direction: np.ndarray, geometry: Geometry, settings: ProbeSettings
+) -> Work[Equilibrium]:
     """Test whether trajectories approach an equilibrium on one side of its only critical direction and leave it on the
     other.
     """
     values, left = np.linalg.eig(one.jacobian.T)
     across = left[:, np.argmin(np.abs(values))].real
     direction = direction / np.abs(direction).max()
-    for size in DISTANCES:
+    for size in settings.distances:
         offset = size * direction * np.asarray(geometry.scales)
         for side in (1.0, -1.0):
             near, far = one.state[None] + side * offset, one.state[None] - side * offset
-            if (yield from _falls(near, one.state[None], size, geometry)) and (
-                yield from _leaves(far, one.state, size, geometry)
+            if (yield from _falls(near, one.state[None], size, geometry, settings)) and (
+                yield from _leaves(far, one.state, size, geometry, settings)
             ):
                 return replace(one, approached_within=size, side=side * across / float(across @ direction))
     return one
 
 
-def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work[float]:
+def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry, settings: ProbeSettings) -> Work[float]:
     directions = np.concatenate([critical.T.real, critical.T.imag])
     length = np.abs(directions).max(axis=1, initial=0.0)
     directions = directions[length > 1e-6] / length[length > 1e-6, None]
     if not len(directions):
         return 0.0
-    for size in DISTANCES:
+    for size in settings.distances:
         offset = size * np.concatenate([directions, -directions]) * np.asarray(geometry.scales)
-        if (yield from _falls(points[0] + offset, points, size, geometry)):
+        if (yield from _falls(points[0] + offset, points, size, geometry, settings)):
             return size
     return 0.0
 
 
-def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
+def _falls(
+    state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry, settings: ProbeSettings
+) -> Work[bool]:
     """Return whether trajectories that start at the distance `size` from an orbit or equilibrium come steadily nearer
     to it.
     """
     step, before = np.zeros(len(state)), np.full(len(state), np.inf)
-    for _ in range(LEGS):
+    for _ in range(settings.legs):
         leg = yield Leg(state, step)
         waits = leg.status == Status.NO_RETURN
         if not (np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED)) | waits).all():
@@ -93,20 +107,22 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
         state, step = leg.state, np.where(waits, 0.0, leg.step)
         sections = np.where(waits[:, None, None], leg.state[:, None], leg.section[:, LEG // 2 :])
         away = _distance(sections, points, geometry)
-        if (_distance(leg.section, points, geometry) > min(GONE * size, WHOLE))[~waits].any():
+        if (_distance(leg.section, points, geometry) > min(settings.gone * size, settings.whole))[~waits].any():
             return False
         if (away > np.minimum(before, 2.0 * size) + 1e-9).any():
             return False
         before = away
-    return bool(before.max() <= FALL * size)
+    return bool(before.max() <= settings.fall * size)
 
 
-def _leaves(state: np.ndarray, point: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
+def _leaves(
+    state: np.ndarray, point: np.ndarray, size: float, geometry: Geometry, settings: ProbeSettings
+) -> Work[bool]:
     """Return whether a trajectory that starts at the distance `size` from an equilibrium comes to twice this
     distance.
     """
     step = np.zeros(len(state))
-    for _ in range(LEGS):
+    for _ in range(settings.legs):
         leg = yield Leg(state, step)
         if (leg.status == Status.DIVERGED).all():
             return True

@@ -32,9 +32,6 @@ FINDING, EXTENDING = "finding attractors", "extending cells"
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
 
-MOST_SLOPES = 16_384
-"""Most derivatives of the section map in one call of the engine."""
-
 
 @dataclass(frozen=True)
 class Leg:
@@ -77,6 +74,30 @@ Work = Generator[Request, Any, T]
 
 
 @dataclass(frozen=True)
+class Effort:
+    """Numbers of the extension of cells on no known orbit: more of each decides more sets, and takes longer."""
+
+    least_budget: int = 16_384  # least budget of a parameter point [periods], however short the run was
+    # Fewest trajectories that must stay on a chaotic set before it is said to attract, for a budget of 1; and the most
+    # that a larger budget asks for, in proportion. Beside too few cells neighbours are drawn. A single cell can outlive
+    # the bound on a set that most cells leave before.
+    least_paths: int = 8
+    most_paths: int = 64
+    # least extension of a cell [sections]: enough points to separate two sets, and chaos from a torus
+    least_stay: int = 512
+    times_longest: float = 10.0  # a sample has stayed long enough after this many times the longest transient seen
+    doublings: int = 3  # most doublings of the extension while a set is in doubt
+    rounds: int = 6  # most samples of a parameter point; each is twice as large as the one before
+    # orbits are searched after 1, 2, 4, ... legs and every `search_each` legs: Newton steps are expensive
+    search_each: int = 32
+    look_back: int = 4  # legs searched for a period: four legs show periods of up to two legs
+    # most derivatives of the section map for the exponents of a set: at first, and if the first are too few
+    slopes: tuple[int, ...] = (1024, 4096)
+    asked: int = 4  # most trajectories of a set whose neighbours show whether it is a torus or a family
+    shaped: int = 1024  # most section points that the test for a torus uses
+
+
+@dataclass(frozen=True)
 class Settings:
     """Settings with which trajectories of a run are integrated further: tolerances, limits, system and method."""
 
@@ -93,6 +114,7 @@ class Settings:
     geometry: Geometry  # geometry of the states
     # orbits that were polished before, see `closed_orbits.polish`
     known: dict[bytes, Orbit | None] = field(default_factory=dict, compare=False, repr=False)
+    effort: Effort = Effort()
 
     @classmethod
     def of(cls, ds: xr.Dataset, system: System | None, geometry: Geometry, **asked: Any) -> Settings:
@@ -252,6 +274,7 @@ def _each_once(
 def _slopes(
     asked: Mapping[tuple[int, ...], Slopes], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+    most = 16_384  # derivatives of the section map in one call of the engine
     assert settings.system is not None
     found: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
     for rtol in {request.rtol for request in asked.values()}:
@@ -261,8 +284,8 @@ def _slopes(
         start = np.concatenate([request.point for request in own.values()])
         images, derivatives = np.empty_like(start), np.empty((*start.shape, start.shape[1]))
         # some at a time: the map needs far more memory than its results
-        for begin in range(0, len(start), MOST_SLOPES):
-            some = slice(begin, begin + MOST_SLOPES)
+        for begin in range(0, len(start), most):
+            some = slice(begin, begin + most)
             ways = section_map(packed[some], frequency[some], start[some], 1, rtol=rtol, system=settings.system)
             images[some], derivatives[some] = ways.images[:, -1], ways.derivatives
         for index, rows in _slices(own, sizes, ends):

@@ -18,12 +18,9 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, 
 from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Dynamics, Point
 from pipeline.analysis.attractors.finding.requests import Polish, Settings, Work
-from pipeline.analysis.attractors.finding.spirals import MAX_GUESSES, beside, near_closed
+from pipeline.analysis.attractors.finding.spirals import beside, near_closed
 from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import LOOSE_SHARE, STRICT
-
-ROUNDS, ROUNDS_LOOSE = 3, 6
-"""Most rounds of guessing and polishing, with a strict and with a loose tolerance."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +31,8 @@ class Search:
     tolerance: float  # tolerance of the options, or the default that follows from the run
     dynamics: Dynamics  # model, parameters and system
     settings: Settings  # settings by which trajectories are extended
+    # most guesses of a point from cells that are not closed; more find more orbits, and take longer
+    most_guesses: int = 64
 
     @property
     def geometry(self) -> Geometry:
@@ -70,6 +69,7 @@ class State:
 
 def search_orbits(point: Point, search: Search) -> Work[State]:
     """Find the closed orbits that the cells of a parameter point have reached or approach."""
+    rounds, rounds_loose = 3, 6  # most rounds of guessing and polishing, with a strict and with a loose tolerance
     n_states = len(search.geometry.scales)
     closed = ClosedCells(search.geometry, search.box, Guesses.none(n_states))
     for block in point.blocks():
@@ -80,8 +80,8 @@ def search_orbits(point: Point, search: Search) -> Work[State]:
         guesses = closed.guesses
         guesses = guesses.best(group[np.searchsorted(keys, guesses.key)].astype(np.uint64))
         if search.is_loose:
-            guesses = guesses.least(MAX_GUESSES)
-        for _ in range(ROUNDS_LOOSE if search.is_loose else ROUNDS):
+            guesses = guesses.least(search.most_guesses)
+        for _ in range(rounds_loose if search.is_loose else rounds):
             if len(guesses.key):
                 polished = moving((yield Polish(guesses)), point, search.geometry)
                 more = distinct([*orbits, *(o for o in polished if o is not None)], search.geometry)
@@ -141,8 +141,8 @@ def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses
     own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
     if search.is_loose:
         # the observed period may be half the true one, or the orbit unstable: try without a period as well
-        own = closed.guesses.least(MAX_GUESSES)
+        own = closed.guesses.least(search.most_guesses)
         own = own.followed_by(own.without_period())
     if len(near.key):
         own = own.followed_by(beside(orbits, search.longest, search.geometry))
-    return own.followed_by(near.least(MAX_GUESSES))
+    return own.followed_by(near.least(search.most_guesses))

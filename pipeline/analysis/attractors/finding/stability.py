@@ -33,18 +33,6 @@ from pipeline.layout.vocabulary import ATTRACTS, EVIDENCE, NEUTRAL, UNSTABLE
 (BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING, BY_VOLUME, BY_ONE_SIDE) = range(8)
 """Values of `evidence`."""
 
-TIMES_LONGEST = 10.0
-"""A sample has stayed long enough after this many times the longest transient seen."""
-
-ABOVE = 0.01
-"""Largest excess of a multiplier over 1 that rounding errors leave to an orbit which trajectories approach."""
-
-TELLING = 0.1
-"""Largest error of a multiplier with which one on the unit circle says that an orbit is neutral; beyond it nothing is
-known."""
-
-_TRIALS = 8
-
 
 def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> float:
     """Estimate the error of the leading eigenvalue of a matrix whose entries have errors up to `size`.
@@ -75,7 +63,8 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 
 @cache
 def _signs(shape: tuple[int, ...]) -> np.ndarray:
-    return np.random.default_rng(0).choice([-1.0, 1.0], (_TRIALS, *shape))
+    trials = 8
+    return np.random.default_rng(0).choice([-1.0, 1.0], (trials, *shape))
 
 
 def by_failure(status: int) -> int:
