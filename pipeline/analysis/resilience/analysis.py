@@ -57,9 +57,6 @@ from pipeline.results.tabular import (
 )
 from pipeline.specification.tables import FREQUENCY
 
-MOST_SEEDS = 8
-"""Cells of other basins that start a search of the distance in any direction, for each base state."""
-
 _ENDS = {-1: "-", DIVERGED: "diverges", -3: "elsewhere"}
 
 _STABILITY, _WEIGHTED, _ARRIVED = (
@@ -156,10 +153,11 @@ def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> np.ndarray:
 
 def _nearest_seeds(there: Destinations, bases: Bases, states: np.ndarray, labels: np.ndarray, norm: Norm) -> Seeds:
     """Return the cells nearest to each base state, as shocks from it, with their labels."""
+    most = 8  # cells of other basins that start a search of the distance in any direction, for each base state
     base, shock, label = [], [], []
     for k, state in enumerate(bases.states):
         jumps = Geometry.in_units(there.point.integrates).difference(states, state)
-        nearest = np.argsort(sizes(jumps, norm), kind="stable")[:MOST_SEEDS]
+        nearest = np.argsort(sizes(jumps, norm), kind="stable")[:most]
         base.append(np.full(len(nearest), k))
         shock.append(jumps[nearest])
         label.append(labels[nearest])

@@ -45,9 +45,6 @@ from pipeline.results.sets import Geometry
 from pipeline.results.tabular import Row, Words, aligned, counted, plain, words_of
 from pipeline.results.tolerances import SAME_EQUILIBRIUM
 
-CANDIDATES = 4
-"""Pairs that are bisected for each that is tracked: between some of them a third basin lies."""
-
 PURPOSE = "edge states are tracked at one parameter point"
 
 
@@ -79,6 +76,7 @@ def _letters(names: tuple[str, str]) -> list[str]:
 
 def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     """Track the edge states between two attractors at a parameter point."""
+    each = 4  # pairs that are bisected for each that is tracked: between some of them a third basin lies
     whole = run.derive("attractors")
     cube, attractors = (select_points(ds, options.at, purpose=PURPOSE) for ds in (run.cube(), whole))
     dims, starts = split_dims(attractors["attractor_id"])
@@ -90,7 +88,7 @@ def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     if untold:
         raise ValueError(f"trajectories cannot be told to end on attractor {untold[0]}; track between two others.")
     labels = outcomes(here).transpose(*starts).values.ravel()
-    candidates = nearest_pairs(start_states(cube, starts), labels, between, CANDIDATES * options.pairs, there, options)
+    candidates = nearest_pairs(start_states(cube, starts), labels, between, each * options.pairs, there, options)
     tracking = Tracking(there, between, options)
     pairs = tracking.choose(candidates, options.pairs)
     tracking.run(pairs)

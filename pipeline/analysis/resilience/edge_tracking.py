@@ -38,32 +38,28 @@ REASONS = ("none", "third_attractor", "undecided", "lost", "not_settled", "parte
 NONE, THIRD, UNKNOWN, LOST, NOT_SETTLED, PARTED = range(len(REASONS))
 """Why a pair has no edge state."""
 
-PARTS = 8
-"""Parts into which a segment is divided at once."""
 
-MOST_DIVISIONS = 40
-"""Most divisions of a segment in one bisection."""
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Numbers of the tracking of an edge, and of the search for orbits on it."""
 
-CLOSE = 10.0
-"""Distance within which a path recurs, and from its edge state, in units of the pair's largest distance."""
+    parts: int = 8  # parts into which a segment is divided at once
+    most_divisions: int = 40  # most divisions of a segment in one bisection
+    # distance within which a path recurs, and from its edge state, in units of the pair's largest distance
+    close: float = 10.0
+    # distance of a pair after one section, in units of the largest distance, beyond which it no longer shows where the
+    # boundary is: the segment between its states may cross other parts of it
+    widest: float = 100.0
+    instants: int = 1024  # instants between two sections at which it is seen where a trajectory is slow
+    # points of the paths from which Newton's method starts, for each period: those that recur most closely, and others
+    # drawn at random; more find more orbits, and take longer
+    most_recurrences: int = 64
+    n_starts: int = 336
+    # scaled standard deviation by which the random ones are moved: strongly unstable orbits attract Newton's method
+    # from a narrow strip, which few points of a path hit
+    beside: float = 0.05
+    rounds: int = 6  # most rounds of the search in which known orbits are deflated
 
-WIDEST = 100.0
-"""Distance of a pair after one section, in units of the largest distance, beyond which it no longer shows where the
-boundary is: the segment between its states may cross other parts of it."""
-
-INSTANTS = 1024
-"""Instants between two sections at which it is seen where a trajectory is slow."""
-
-MOST_RECURRENCES, N_STARTS = 64, 336
-"""Points of the paths from which Newton's method starts, for each period: those that recur most closely, and others
-drawn at random."""
-
-BESIDE = 0.05
-"""Scaled standard deviation by which the random ones are moved: strongly unstable orbits attract Newton's method from a
-narrow strip, which few points of a path hit."""
-
-ROUNDS = 6
-"""Most rounds of the search in which known orbits are deflated."""
 
 SHIFTS = 10.0 ** np.arange(-8.0, -3.0, 0.25)
 """Scaled distances from an orbit at which both basins are looked for."""
@@ -92,7 +88,14 @@ class Pair:
 class Tracking:
     """The tracking of pairs between two attractors, whose ids are in the order of each pair's states."""
 
-    def __init__(self, there: Destinations, between: tuple[int, int], options: EdgeOptions) -> None:
+    def __init__(
+        self,
+        there: Destinations,
+        between: tuple[int, int],
+        options: EdgeOptions,
+        settings: TrackingSettings = TrackingSettings(),
+    ) -> None:
+        self.settings = settings
         self._there, self._between, self._options, self._geometry = there, between, options, there.geometry
 
     def choose(self, candidates: Sequence[Pair], n: int) -> list[Pair]:
@@ -152,7 +155,7 @@ class Tracking:
         for i, (pair, own, codes) in enumerate(zip(pairs, states, status, strict=True)):
             if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all() and (own[0] != own[1]).any():
                 before, pair.ends = pair.ends[0], own
-                if self._width(pair) > WIDEST * self._options.farthest:
+                if self._width(pair) > self.settings.widest * self._options.farthest:
                     pair.reason = PARTED
                     if self._there.point.has_returns:
                         self._pass(pair, before, float(flight.seconds[2 * i, 0]))
@@ -165,9 +168,9 @@ class Tracking:
 
     def _bisect(self, pairs: Sequence[Pair]) -> None:
         """Divide the segments between pairs until their states are close, in place."""
-        shares = np.arange(PARTS + 1) / PARTS
+        shares = np.arange(self.settings.parts + 1) / self.settings.parts
         due = {id(pair) for pair in pairs}
-        for _ in range(MOST_DIVISIONS):
+        for _ in range(self.settings.most_divisions):
             going = [p for p in pairs if p.goes_on and (id(p) in due or self._width(p) > self._options.closest)]
             if not going:
                 return
@@ -188,7 +191,7 @@ class Tracking:
         first, second = (np.flatnonzero(label == number) for number in self._between)
         if not len(first) or not len(second):
             pair.ends = self._between_ends(pair, np.array([-1.0, 2.0]))
-            if not self._width(pair) <= CLOSE * self._options.farthest:
+            if not self._width(pair) <= self.settings.close * self._options.farthest:
                 pair.reason = LOST
             return False
         steps = [
@@ -196,7 +199,7 @@ class Tracking:
             for i, j in product(first.tolist(), second.tolist())
         ]
         has_third, length, i, j = min(steps)
-        if length == PARTS:
+        if length == self.settings.parts:
             pair.reason = THIRD if has_third else UNKNOWN
             return False
         pair.ends = states[[i, j]]
@@ -207,7 +210,7 @@ class Tracking:
     def _settle(self, pair: Pair) -> None:
         """Find the orbit or the equilibrium to which a pair's path has come, if there is one."""
         path = np.array(pair.path)
-        near = CLOSE * self._options.farthest
+        near = self.settings.close * self._options.farthest
         most = min(self._there.options.max_orbit_period, len(path) - 1)
         if most < 2:
             return
@@ -226,7 +229,7 @@ class Tracking:
 
     def _rest(self, pair: Pair, states: np.ndarray) -> bool:
         """Take the equilibrium near the end of a pair's path as its edge state, if there is one."""
-        near = CLOSE * self._options.farthest
+        near = self.settings.close * self._options.farthest
         for one in equilibria_near(self._there.point, states, self._geometry):
             unstable = one.eigenvalues.real > one.eigenvalue_error
             if unstable.sum() == 1 and self._geometry.distance(states, one.state).min() <= near:
@@ -238,7 +241,7 @@ class Tracking:
         """Take the saddle that a parting pair passes between two sections as its edge state, if it is one."""
         assert self._there.point.parameters is not None
         parameters = of_flow(self._there.point.parameters)
-        states = flown(parameters, state[None], np.linspace(0.0, seconds, INSTANTS)).states[0]
+        states = flown(parameters, state[None], np.linspace(0.0, seconds, self.settings.instants)).states[0]
         speed = self._geometry.distance(states[1:], states[:-1])
         slow = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
         for one in equilibria_near(self._there.point, states[slow], self._geometry) if len(slow) else ():
@@ -275,7 +278,11 @@ def nearest_pairs(
 
 
 def orbits_on(
-    paths: Sequence[np.ndarray], there: Destinations, between: tuple[int, int], max_period: int
+    paths: Sequence[np.ndarray],
+    there: Destinations,
+    between: tuple[int, int],
+    max_period: int,
+    settings: TrackingSettings = TrackingSettings(),
 ) -> list[Orbit]:
     """Return the saddle orbits on the boundary that Newton's method finds from points of paths along it, and that the
     paths come near. Paths are section points of shape (n, state).
@@ -283,7 +290,7 @@ def orbits_on(
     point = there.point
     if not paths or not max_period or point.n_neutral:
         return []
-    starts = [_starts(paths, period, there) for period in range(1, max_period + 1)]
+    starts = [_starts(paths, period, there, settings) for period in range(1, max_period + 1)]
     periods = np.repeat(np.arange(1, max_period + 1), [len(own) for own in starts])
     found = search_orbits(
         np.concatenate(starts),
@@ -291,7 +298,7 @@ def orbits_on(
         point.frequency,
         point.packed,
         point.integrates,
-        settings=DeflationSettings(rounds=ROUNDS),
+        settings=DeflationSettings(rounds=settings.rounds),
     )
     polished = there.polished(
         np.array([one.points[0] for one in found]).reshape(len(found), point.n_states),
@@ -308,14 +315,14 @@ def orbits_on(
     return [one for one in distinct(near, there.geometry) if is_on_boundary(one, there, between)]
 
 
-def _starts(paths: Sequence[np.ndarray], period: int, there: Destinations) -> np.ndarray:
+def _starts(paths: Sequence[np.ndarray], period: int, there: Destinations, settings: TrackingSettings) -> np.ndarray:
     """Return points of the paths that nearly recur after a period, and states beside others."""
     lags = np.concatenate([there.geometry.distance(path[period:], path[:-period]) for path in paths])
     recurring = np.concatenate([path[:-period] for path in paths])
-    closest = recurring[np.argsort(lags, kind="stable")[:MOST_RECURRENCES]]
+    closest = recurring[np.argsort(lags, kind="stable")[: settings.most_recurrences]]
     every, rng = np.concatenate(paths), np.random.default_rng(0)
-    drawn = every[rng.integers(len(every), size=N_STARTS)]
-    moved = drawn + BESIDE * np.asarray(there.geometry.scales) * rng.standard_normal(drawn.shape)
+    drawn = every[rng.integers(len(every), size=settings.n_starts)]
+    moved = drawn + settings.beside * np.asarray(there.geometry.scales) * rng.standard_normal(drawn.shape)
     return np.concatenate([closest, moved])
 
 

@@ -30,22 +30,6 @@ from pipeline.analysis.resilience.shocks import Bases, bases_of
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.results.tolerances import PORTRAIT_RTOL
 
-PHASES, MOST_PHASES, MOST_ROWS = 64, 512, 4096
-"""Phases of a drive period, or of a flow's orbit, at which an orbit is sampled, most of a whole orbit, and most of
-these times the number of states: the matrices between all pairs of phases are then within 128 MiB.
-"""
-
-MOST_PERIODS = 4096
-"""Most periods of an orbit until no disturbance is larger than it was."""
-
-N_TIMES, MOST_DOUBLINGS, LARGEST = 64, 60, 1e12
-"""At an equilibrium: times at which the amplification is computed in each of a doubling series of intervals, most
-intervals, and amplification beyond which it is not sought.
-"""
-
-CONVERGED = 1e-6
-"""Relative change of the fundamental matrix over a period below which it has come to its limit."""
-
 
 class Local(NamedTuple):
     """Stability of an attractor against small disturbances; NaN where it is not known."""
@@ -61,9 +45,12 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
 
     It is given by the variables of `match` without parameter dims and `attractor`, with the parameters and the drive
     frequency [Hz] of its point, and the sizes of the states that count as 1. All is NaN for a set that is no
-    equilibrium and no periodic orbit. Of an orbit the maxima are over `PHASES` phases of a period, fewer of a long
+    equilibrium and no periodic orbit. Of an orbit the maxima are over 64 phases of a period, fewer of a long
     orbit, so they are lower bounds.
     """
+    # phases of a drive period, or of a flow's orbit, at which an orbit is sampled, most of a whole orbit, and most of
+    # these times the number of states: the matrices between all pairs of phases are then within 128 MiB
+    usual, most_phases, most_rows = 64, 512, 4096
     kind, model = int(one["kind"]), parameters.model
     if kind == EQUILIBRIUM:
         state, flow = bases_of(one, parameters, frequency, 1).states, of_flow(parameters)
@@ -74,13 +61,13 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
         slowest = float(np.linalg.eigvals(matrix).real.max())
         return Local(_growth(matrix), *amplification_at_rest(matrix), -1.0 / slowest if slowest < 0.0 else np.inf)
     n_points = int(one["orbit_period"])
-    most = min(MOST_PHASES, MOST_ROWS // len(scales))
+    most = min(most_phases, most_rows // len(scales))
     if kind != PERIODIC_ORBIT or n_points > most:
         return Local()
     is_cycle = model.clock.has_equilibria
     own = of_flow(parameters) if is_cycle else parameters
     period = float(one["period_s"]) if is_cycle else 1.0 / frequency
-    bases = bases_of(one, parameters, frequency, PHASES if is_cycle else min(PHASES, most // n_points))
+    bases = bases_of(one, parameters, frequency, usual if is_cycle else min(usual, most // n_points))
     steps = _steps(own, bases, period, scales)
     if steps is None:
         return Local()
@@ -98,19 +85,22 @@ def local_stability(one: xr.Dataset, parameters: Parameters, frequency: float, s
 
 def amplification_at_rest(matrix: np.ndarray) -> tuple[float, float]:
     """Return the largest norm of exp(matrix t) over t >= 0, and its time; NaN if it has not fallen to 1 at last."""
+    # times at which the amplification is computed in each of a doubling series of intervals, most intervals, and
+    # amplification beyond which it is not sought
+    n_times, most_doublings, largest = 64, 60, 1e12
 
     def size(t: float) -> float:
         return float(np.linalg.norm(expm(t * matrix), 2))
 
     # exp(A (t + T)) = exp(A t) exp(A T): once the norm is 1 or less at T, no later one is larger than all before
     last = 1e-3 / max(float(np.linalg.norm(matrix, 2)), 1e-300)
-    share, best, at, spacing = expm(last / N_TIMES * matrix), 1.0, 0.0, 0.0
-    for _ in range(MOST_DOUBLINGS):
-        powers = np.array(list(accumulate([share] * N_TIMES, np.matmul)))
+    share, best, at, spacing = expm(last / n_times * matrix), 1.0, 0.0, 0.0
+    for _ in range(most_doublings):
+        powers = np.array(list(accumulate([share] * n_times, np.matmul)))
         sizes = np.linalg.norm(powers, 2, axis=(1, 2))
         if sizes.max() > best:
-            best, at, spacing = float(sizes.max()), (1 + int(np.argmax(sizes))) * last / N_TIMES, last / N_TIMES
-        if sizes[-1] <= 1.0 or not sizes[-1] < LARGEST:
+            best, at, spacing = float(sizes.max()), (1 + int(np.argmax(sizes))) * last / n_times, last / n_times
+        if sizes[-1] <= 1.0 or not sizes[-1] < largest:
             break
         last, share = 2.0 * last, share @ share
     if not sizes[-1] <= 1.0:
@@ -127,8 +117,11 @@ def amplification_of_orbit(steps: np.ndarray) -> tuple[float, int]:
 
     Steps are scaled derivatives from each phase to the next, shape (phase, state, state); the last leads to the first.
     (1, 0) if no product is larger than 1; NaN if the products have not fallen to 1, or come to a limit, in
-    `MOST_PERIODS` periods.
+    many periods.
     """
+    # most periods of an orbit until no disturbance is larger than it was, and the relative change of the fundamental
+    # matrix over a period below which it has come to its limit
+    most_periods, converged = 4096, 1e-6
     n, dim = steps.shape[:2]
     within = np.empty((n, n, dim, dim))  # after r + 1 steps from phase k
     product = np.broadcast_to(np.eye(dim), (n, dim, dim))
@@ -139,16 +132,16 @@ def amplification_of_orbit(steps: np.ndarray) -> tuple[float, int]:
     if first.max() > 1.0:
         best, at = float(first.max()), 1 + int(np.argmax(first.max(axis=1)))
     whole, power = within[-1], within[-1]
-    for m in range(1, MOST_PERIODS):
+    for m in range(1, most_periods):
         size = np.linalg.norm(power, 2, axis=(1, 2))
         if size.max() <= 1.0:
             return best, at
         rows = np.flatnonzero(first.max(axis=0) * size > best)
         later = np.linalg.norm(within[:, rows] @ power[rows], 2, axis=(2, 3))
-        if later.max(initial=0.0) > best * (1.0 + CONVERGED):
+        if later.max(initial=0.0) > best * (1.0 + converged):
             best, at = float(later.max()), m * n + 1 + int(np.argmax(later.max(axis=1)))
         power, before = whole @ power, power
-        if np.abs(power - before).max() <= CONVERGED * np.abs(power).max():
+        if np.abs(power - before).max() <= converged * np.abs(power).max():
             return best, at
     return np.nan, 0
 

@@ -38,41 +38,27 @@ from pipeline.results.outcomes import DIVERGED
 Norm = Literal["euclidean", "largest"]
 K = TypeVar("K", bound=Hashable)
 
-RATIO = 2.0 ** (1.0 / 3.0)
-"""Ratio of the sizes of neighbouring shells."""
 
-SHELLS = 25
-"""Number of shells: the least is 2**-8 of the largest."""
+@dataclass(frozen=True)
+class ShockSettings:
+    """Numbers of the search for the smallest shock that leads away."""
 
-PARTS = 8
-"""Parts into which a ray's interval is divided at once."""
-
-COARSE = 1e-2
-"""Relative length to which rays are divided before the best are chosen for the descent."""
-
-MOST_RAYS, MOST_DESCENTS = 64, 4
-"""Most rays that are divided, and most descents."""
-
-LADDER = ((0.5, 1), (0.1, 1), (1.0, 2), (0.1, 2))
-"""Relative decreases of the size that a descent tries: factors and powers of its angle."""
-
-LAST_ANGLE = 2e-3
-"""Angle [rad] at which a descent ends: its size is then within 1e-6 of a smooth minimum."""
-
-MOST_STEPS, N_RANDOM = 80, 4
-"""Most steps of a descent, and random directions in each."""
-
-ROUNDS = 20
-"""Most rounds of confirmation."""
-
-BESIDE = (-5.0, -0.3)
-"""Decimal logarithms of the least and largest relative distance from the best ray at which shocks are tried."""
-
-PRECISION = 1e-6
-"""Relative length to which the last ray is divided."""
-
-MOST_POINTS = 8
-"""Most section points of a set that does not close from which shocks start."""
+    ratio: float = 2.0 ** (1.0 / 3.0)  # ratio of the sizes of neighbouring shells
+    shells: int = 25  # number of shells: the least is 2**-8 of the largest; more find smaller shocks, and take longer
+    parts: int = 8  # parts into which a ray's interval is divided at once
+    coarse: float = 1e-2  # relative length to which rays are divided before the best are chosen for the descent
+    # most rays that are divided, and most descents; more find minima that others hide, and take longer
+    most_rays: int = 64
+    most_descents: int = 4
+    # relative decreases of the size that a descent tries: factors and powers of its angle
+    ladder: tuple[tuple[float, int], ...] = ((0.5, 1), (0.1, 1), (1.0, 2), (0.1, 2))
+    last_angle: float = 2e-3  # angle [rad] at which a descent ends: its size is then within 1e-6 of a smooth minimum
+    most_steps: int = 80  # most steps of a descent, and random directions in each
+    n_random: int = 4
+    rounds: int = 20  # most rounds of confirmation
+    # decimal logarithms of the least and largest relative distance from the best ray at which shocks are tried
+    beside: tuple[float, float] = (-5.0, -0.3)
+    precision: float = 1e-6  # relative length to which the last ray is divided
 
 
 @dataclass(frozen=True)
@@ -139,8 +125,15 @@ class ShockSearch:
     """
 
     def __init__(
-        self, own: int, n_bases: int, dim: int, options: ResilienceOptions, seeds: Seeds | None = None
+        self,
+        own: int,
+        n_bases: int,
+        dim: int,
+        options: ResilienceOptions,
+        seeds: Seeds | None = None,
+        settings: ShockSettings = ShockSettings(),
     ) -> None:
+        self.settings = settings
         self._own, self._n_bases, self._dim, self._options, self._seeds = own, n_bases, dim, options, seeds
         self._rng = np.random.default_rng([options.seed, dim])
         self._sizes: list[np.ndarray] = []
@@ -170,22 +163,22 @@ class ShockSearch:
         rays = yield from self._outer()
         if not len(rays.base):
             return self._found(None)
-        yield from self._narrow(rays, COARSE)
+        yield from self._narrow(rays, self.settings.coarse)
         best = self._best(rays)
         if self._dim > 1 or self._n_bases > 1:
             yield from self._descend(best)
-        for _ in range(ROUNDS):
+        for _ in range(self.settings.rounds):
             best = best.smallest(1)
-            yield from self._narrow(best, PRECISION)
+            yield from self._narrow(best, self.settings.precision)
             worse = yield from self._contradictions(best)
             if not len(worse.base):
                 break
-            worse = worse.smallest(MOST_RAYS)
-            yield from self._narrow(worse, COARSE)
+            worse = worse.smallest(self.settings.most_rays)
+            yield from self._narrow(worse, self.settings.coarse)
             best = self._best(worse)
             yield from self._descend(best)
         best = best.smallest(1)
-        yield from self._narrow(best, PRECISION)
+        yield from self._narrow(best, self.settings.precision)
         return self._found(best)
 
     # ---- trials --------------------------------------------------------------------------------
@@ -206,12 +199,12 @@ class ShockSearch:
         base, unit = np.repeat(np.arange(self._n_bases), len(units)), np.tile(units, (self._n_bases, 1))
         low = np.zeros(len(base))
         rays = _Rays(*(x[:0] for x in (base, unit, low, low, base)))
-        for size in self._options.largest * RATIO ** np.arange(1.0 - SHELLS, 1.0):
+        for size in self._options.largest * self.settings.ratio ** np.arange(1.0 - self.settings.shells, 1.0):
             label, code = yield from self._ask(base, size * unit)
             self._shells.append((float(size), bool((code == 0).all())))
             away = np.flatnonzero(code == 1)
             if len(away):
-                away = np.sort(away[self._rng.permutation(len(away))[:MOST_RAYS]])
+                away = np.sort(away[self._rng.permutation(len(away))[: self.settings.most_rays]])
                 rays = _Rays(base[away], unit[away], low[away], np.full(len(away), size), label[away])
                 break
             low = np.where(code == 0, size, low)
@@ -226,7 +219,7 @@ class ShockSearch:
     def _narrow(self, rays: _Rays, precision: float) -> Generator[Trials, np.ndarray, None]:
         """Divide the interval of each ray until it is short or holds undecided shocks only, in place."""
         going = np.arange(len(rays.base))
-        share = np.arange(1, PARTS) / PARTS
+        share = np.arange(1, self.settings.parts) / self.settings.parts
         while True:
             going = going[rays.high[going] - rays.low[going] > precision * rays.high[going]]
             if not len(going):
@@ -234,11 +227,13 @@ class ShockSearch:
             low, high = rays.low[going], rays.high[going]
             sizes = low[:, None] + (high - low)[:, None] * share
             shock = sizes[..., None] * rays.unit[going][:, None]
-            label, code = yield from self._ask(np.repeat(rays.base[going], PARTS - 1), shock.reshape(-1, self._dim))
-            label, code = label.reshape(-1, PARTS - 1), code.reshape(-1, PARTS - 1)
+            label, code = yield from self._ask(
+                np.repeat(rays.base[going], self.settings.parts - 1), shock.reshape(-1, self._dim)
+            )
+            label, code = label.reshape(-1, self.settings.parts - 1), code.reshape(-1, self.settings.parts - 1)
             for i, row in enumerate(going):
-                first = int(np.argmax(code[i] == 1)) if (code[i] == 1).any() else PARTS - 1
-                if first < PARTS - 1:
+                first = int(np.argmax(code[i] == 1)) if (code[i] == 1).any() else self.settings.parts - 1
+                if first < self.settings.parts - 1:
                     rays.high[row], rays.label[row] = sizes[i, first], label[i, first]
                 stays = np.flatnonzero(code[i, :first] == 0)
                 if len(stays):
@@ -251,7 +246,7 @@ class ShockSearch:
         kept: list[int] = []
         for row in np.argsort(rays.high, kind="stable").tolist():
             beside = np.linalg.norm(rays.unit[kept] - rays.unit[row], axis=1) < 4.0 * self._angle
-            if not (beside & (rays.base[kept] == rays.base[row])).any() and len(kept) < MOST_DESCENTS:
+            if not (beside & (rays.base[kept] == rays.base[row])).any() and len(kept) < self.settings.most_descents:
                 kept.append(row)
         return rays.take(np.array(kept))
 
@@ -265,8 +260,8 @@ class ShockSearch:
     def _descend(self, rays: _Rays) -> Generator[Trials, np.ndarray, None]:
         """Move each ray, in place, to nearby directions and base states from which smaller shocks lead away."""
         angle = np.full(len(rays.base), min(self._angle, 0.5))
-        for _ in range(MOST_STEPS):
-            going = np.flatnonzero(angle > LAST_ANGLE)
+        for _ in range(self.settings.most_steps):
+            going = np.flatnonzero(angle > self.settings.last_angle)
             if not len(going):
                 return
             asked = [self._near(rays, int(row), float(angle[row])) for row in going]
@@ -288,7 +283,7 @@ class ShockSearch:
         units, bases = [unit[None]], [np.array([base])]
         if self._dim > 1:
             plane = np.linalg.svd(unit[None])[2][1:]
-            drawn = self._rng.standard_normal((N_RANDOM, len(plane))) @ plane
+            drawn = self._rng.standard_normal((self.settings.n_random, len(plane))) @ plane
             drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
             turned = unit / np.linalg.norm(unit) + angle * np.concatenate([plane, -plane, drawn])
             units.append(self._unit(turned))
@@ -297,7 +292,7 @@ class ShockSearch:
             units.append(np.repeat(unit[None], 2, axis=0))
             bases.append(np.array([base - 1, base + 1]) % self._n_bases)
         every, numbers = np.concatenate(units), np.concatenate(bases)
-        sizes = rays.high[row] * (1.0 - np.array([factor * angle**power for factor, power in LADDER]))
+        sizes = rays.high[row] * (1.0 - np.array([factor * angle**power for factor, power in self.settings.ladder]))
         shock = sizes[:, None, None] * every
         return np.tile(numbers, len(sizes)), shock.reshape(-1, self._dim)
 
@@ -311,13 +306,13 @@ class ShockSearch:
         base = np.concatenate([self._rng.integers(self._n_bases, size=n), np.full(n, best.base[0])])
         drawn = self._rng.standard_normal((2 * n, dim))
         if dim > 1:
-            turned = 10.0 ** self._rng.uniform(*BESIDE, n)
+            turned = 10.0 ** self._rng.uniform(*self.settings.beside, n)
             turned[: n // 2] = 0.0
             drawn[n:] = best.unit[0] + turned[:, None] * drawn[n:]
         else:
             drawn[n:] = best.unit[0]
-        below = 10.0 ** self._rng.uniform(np.log10(PRECISION), BESIDE[1], n)
-        share = np.concatenate([self._rng.uniform(0.25, 1.0 - PRECISION, n), 1.0 - below])
+        below = 10.0 ** self._rng.uniform(np.log10(self.settings.precision), self.settings.beside[1], n)
+        share = np.concatenate([self._rng.uniform(0.25, 1.0 - self.settings.precision, n), 1.0 - below])
         unit, size = self._unit(drawn), least * share
         label, code = yield from self._ask(base, size[:, None] * unit)
         away = np.flatnonzero(code == 1)
@@ -362,6 +357,7 @@ def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases
 
     The attractor is given by the variables of `match` without parameter dims and `attractor`.
     """
+    most = 8  # section points of a set that does not close from which shocks start
     stored = one["attractor_points"].transpose("point", "state").values
     points = stored[np.isfinite(stored).all(axis=-1)]
     kind = int(one["kind"])
@@ -371,9 +367,9 @@ def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases
         if kind == PERIODIC_ORBIT:
             period = float(one["period_s"])
             return _sampled(of_flow(parameters), points[:1], period, n_phases)
-        points = points[:MOST_POINTS]
+        points = points[:most]
         return Bases(points, np.zeros(len(points)), np.ones(len(points), bool))
-    n = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else MOST_POINTS
+    n = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else most
     return _sampled(parameters, points[:n], 1.0 / frequency, parameters.model.clock.samples(n_phases))
 
 

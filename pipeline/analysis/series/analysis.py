@@ -43,21 +43,6 @@ from pipeline.results.run import OpenRun
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import Row, Words, aligned, number, plain
 
-MOST_VECTORS = 4000
-"""Most delay vectors that are kept for the figure."""
-
-PER_DELAY = 8
-"""Samples per delay that are kept: more are averaged."""
-
-DRIFT = 0.002
-"""Probability by chance below which a trend over the stretches counts as drift."""
-
-LEAST_DRIFT = 0.1
-"""Least range of level or size over the stretches that counts as drift, relative to the standard deviation."""
-
-FEWEST_SAMPLES = 6.0
-"""Samples to an oscillation below which maxima, delays and the paths of neighbours are not seen."""
-
 ORDERLY, DISORDERLY = 0.15, 0.85
 """Results of the 0-1 test up to which a motion is regular, and from which on it is not."""
 
@@ -132,10 +117,11 @@ def refuse_map(model: Model, channel: str) -> None:
 
 def _measured(series: Series, seed: int) -> xr.Dataset:
     """Return all results and curves of a series."""
+    per_delay = 8  # samples per delay that are kept: more are averaged
     rough, information, has_minimum = _delay_of(series)
     returns = returns_of(series, rough)
     delay = min(rough, max(1, round(returns.mean / series.step / 4))) if returns.mean > 0.0 else rough
-    coarse = series.averaged(max(1, delay // PER_DELAY))
+    coarse = series.averaged(max(1, delay // per_delay))
     delay = max(1, round(delay * series.step / coarse.step))
     period = max(4, round((returns.mean / coarse.step) if returns.mean > 0.0 else 4 * delay))
     false = false_neighbours(coarse, delay, period)
@@ -173,10 +159,11 @@ def _curves(
     embedding: Embedding, returns: Returns, parted: Divergence, sums: Sums, own: Recurrence | None
 ) -> xr.Dataset:
     """Return the curves of a series' figure."""
+    most = 4000  # delay vectors that are kept for the figure
     inside = (parted.time >= parted.fit[0]) & (parted.time <= parted.fit[1])
     line = np.where(inside, parted.offset + parted.value * parted.time, np.nan)
     firsts, series = returns.pairs(), embedding.series
-    starts = series.starts(embedding.delay)[:MOST_VECTORS]
+    starts = series.starts(embedding.delay)[:most]
     curves = {
         "divergence": ("elapsed", parted.curve),
         "fit_line": ("elapsed", line),
@@ -296,11 +283,14 @@ def _surrogate_result(noise: tuple[float, Floats]) -> Result:
 
 def _drift(series: Series) -> str:
     """Return why a series is not stationary: a trend of the level or the size over stretches; else an empty text."""
+    # probability by chance below which a trend over the stretches counts as drift, and its least range of level or
+    # size, relative to the standard deviation
+    by_chance, least = 0.002, 0.1
     pieces = series.pieces()
     parts = pieces if len(pieces) >= N_BLOCKS else np.array_split(series.values, N_BLOCKS)
     for name, values in (("level", [p.mean() for p in parts]), ("size", [p.std() for p in parts])):
         relative = np.ptp(values) / series.values.std()
-        if relative > LEAST_DRIFT and stats.kendalltau(np.arange(len(parts)), values).pvalue < DRIFT:
+        if relative > least and stats.kendalltau(np.arange(len(parts)), values).pvalue < by_chance:
             return f"not stationary: its {name} drifts by {relative:.0%}"
     return ""
 
@@ -310,14 +300,13 @@ def _leaps(series: Series) -> str:
 
     For a sine of n samples to a period, half of the mean squared difference of neighbours is var (1 - cos(2 pi / n)).
     """
+    fewest = 6.0  # samples to an oscillation below which maxima, delays and the paths of neighbours are not seen
     steps = np.concatenate([np.diff(piece) for piece in series.pieces()])
     angle = np.arccos(max(1.0 - 0.5 * float(np.mean(steps**2)) / float(series.values.var()), -1.0))
-    if angle * FEWEST_SAMPLES <= 2.0 * np.pi:
+    if angle * fewest <= 2.0 * np.pi:
         return ""
     n = 2.0 * np.pi / angle
-    return (
-        f"{n:.1f} samples to an oscillation, fewer than {FEWEST_SAMPLES:g}: one value per iterate or return, or noise"
-    )
+    return f"{n:.1f} samples to an oscillation, fewer than {fewest:g}: one value per iterate or return, or noise"
 
 
 def _motion(returns: Returns, results: dict[str, Result], parted: Divergence, drift: str) -> tuple[str, str]:

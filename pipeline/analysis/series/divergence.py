@@ -9,43 +9,30 @@ import numpy as np
 from pipeline.analysis.series.embedding import N_BLOCKS, Embedding, Floats, Ints, slope
 from pipeline.results.intervals import half_width
 
-N_REFERENCES = 1600
-"""Vectors whose neighbours are followed."""
 
-PERIODS = 12
-"""Mean periods for which neighbours are followed."""
+@dataclass(frozen=True)
+class DivergenceSettings:
+    """Numbers of the growth of distances between neighbours, and of the fit of the exponent."""
 
-SATURATED = 1.3
-"""Distance of the end of a range below passes at the same phase [nats]; nearer, the curve bends towards them."""
-
-LEAST_GROWTH = 1.2
-"""Least growth over a range for a positive exponent [nats]."""
-
-LEAST_PERIODS = 1.5
-"""Shortest range of a positive exponent [mean periods]."""
-
-STRAIGHT = 0.3
-"""Largest difference of the slopes of two halves of a range, relative to the slope of the whole."""
-
-FINITE = 0.25
-"""Error of a slope at finite distances, as a share of it.
-
-Distances that are not small part at another rate than the exponent's: for series of Roessler's and Lorenz's systems
-with 4000 samples the slope is 0.76 to 1.27 times the exponent.
-"""
-
-NO_GROWTH = 0.15
-"""Largest growth over all `PERIODS` that counts as none [nats]."""
-
-REPEATED, THIN = -1.0, -2.5
-"""Distance of passes at the same phase, below random pairs, from which on they coincide [nats]: of a closed orbit, and
-of any motion."""
-
-CLOSER = 1.3
-"""How much closer neighbours stay than passes at the same phase where a motion is regular [nats]."""
-
-FLOOR = 1e-9
-"""Least distance relative to the size of the set; below it is rounding."""
+    n_references: int = 1600  # vectors whose neighbours are followed; more err less, and take longer
+    periods: int = 12  # mean periods for which neighbours are followed
+    # distance of the end of a range below passes at the same phase [nats]; nearer, the curve bends towards them
+    saturated: float = 1.3
+    least_growth: float = 1.2  # least growth over a range for a positive exponent [nats]
+    least_periods: float = 1.5  # shortest range of a positive exponent [mean periods]
+    # largest difference of the slopes of two halves of a range, relative to the slope of the whole
+    straight: float = 0.3
+    # error of a slope at finite distances, as a share of it. Distances that are not small part at another rate than the
+    # exponent's: for series of Roessler's and Lorenz's systems with 4000 samples the slope is 0.76 to 1.27 times the
+    # exponent.
+    finite: float = 0.25
+    no_growth: float = 0.15  # largest growth over all `periods` that counts as none [nats]
+    # distance of passes at the same phase, below random pairs, from which on they coincide [nats]: of a closed orbit,
+    # and of any motion
+    repeated: float = -1.0
+    thin: float = -2.5
+    # how much closer neighbours stay than passes at the same phase where a motion is regular [nats]
+    closer: float = 1.3
 
 
 @dataclass(frozen=True)
@@ -68,7 +55,9 @@ class Divergence:
         return self.low > 0.0 and not self.reason
 
 
-def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence:
+def divergence(
+    embedding: Embedding, period: int, is_closed: bool, settings: DivergenceSettings = DivergenceSettings()
+) -> Divergence:
     """Follow nearest neighbours, and fit the rate at which they part.
 
     As Rosenstein, Collins and De Luca (Physica D 65, 117, 1993): the mean over pairs of the logarithm of their
@@ -76,15 +65,15 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
     velocity is left out. It neither grows nor shrinks, and would hide the growth of the rest in short series. The curve
     is averaged over a mean period, because growth varies along an orbit.
 
-    The range of the fit is the longest one that is straight (slopes of its halves differ by less than `STRAIGHT`) after
-    the first embedding window and before the distances come within `SATURATED` of those of passes at the same phase.
+    The range of the fit is the longest one that is straight (slopes of its halves differ by less than `straight`) after
+    the first embedding window and before the distances come within `saturated` of those of passes at the same phase.
     The interval is that of Student from `N_BLOCKS` stretches of the series, widened by the difference of the halves and
-    by `FINITE`. The period [samples] is the mean one. In a closed orbit, whose maxima repeat but for noise, neighbours
+    by `finite`. The period [samples] is the mean one. In a closed orbit, whose maxima repeat but for noise, neighbours
     may be as far apart as other passes.
     """
-    horizon = min(PERIODS * period, len(embedding.series.values) // 6)
+    horizon = min(settings.periods * period, len(embedding.series.values) // 6)
     side = max(1, embedding.delay // 3)
-    references, nearest, _ = embedding.neighbours(N_REFERENCES, horizon + side + period)
+    references, nearest, _ = embedding.neighbours(settings.n_references, horizon + side + period)
     there = (references >= side) & (nearest[:, 0] >= side)
     first, second = references[there], nearest[there, 0]
     n_steps = horizon - period
@@ -101,16 +90,18 @@ def divergence(embedding: Embedding, period: int, is_closed: bool) -> Divergence
     curve: Floats = np.asarray(smooth.mean(axis=0), np.float64)
     plain = Divergence(time, curve)
     start = min(int(np.ceil(max(embedding.span - 0.5 * period, 0) / stride)), len(time) // 4)
-    chosen = _range(time, curve, start, period * embedding.series.step, min(at_phase, 0.0) - SATURATED)
+    chosen = _range(
+        time, curve, start, period * embedding.series.step, min(at_phase, 0.0) - settings.saturated, settings
+    )
     if chosen is not None:
-        return _fitted(plain, smooth, *chosen)
+        return _fitted(plain, smooth, *chosen, settings=settings)
     growth = float(curve[-1] - curve[start])
-    if abs(growth) >= NO_GROWTH:
-        return replace(plain, reason=f"no straight range of {LEAST_GROWTH} nats below the size of the set")
-    is_closer = curve[-1] < min(at_phase, -0.5) - CLOSER
-    if not is_closer and at_phase > (REPEATED if is_closed else THIN):
+    if abs(growth) >= settings.no_growth:
+        return replace(plain, reason=f"no straight range of {settings.least_growth} nats below the size of the set")
+    is_closer = curve[-1] < min(at_phase, -0.5) - settings.closer
+    if not is_closer and at_phase > (settings.repeated if is_closed else settings.thin):
         return replace(plain, reason="neighbours are no closer than other passes: noise, or too few vectors")
-    return _fitted(plain, smooth, start, len(time) - 1)
+    return _fitted(plain, smooth, start, len(time) - 1, settings)
 
 
 def _across(embedding: Embedding, first: Ints, second: Ints, side: int) -> Floats:
@@ -122,7 +113,8 @@ def _across(embedding: Embedding, first: Ints, second: Ints, side: int) -> Float
 
 
 def _log(distance: Floats, size: float) -> Floats:
-    return np.asarray(np.log(np.maximum(distance / size, FLOOR)))
+    floor = 1e-9  # least distance relative to the size of the set; below it is rounding
+    return np.asarray(np.log(np.maximum(distance / size, floor)))
 
 
 def _sizes(embedding: Embedding, side: int, period: int) -> tuple[float, float]:
@@ -150,7 +142,9 @@ def _slopes(time: Floats, curve: Floats, start: int, end: int) -> tuple[float, f
     return whole, abs(early - late)
 
 
-def _range(time: Floats, curve: Floats, start: int, period: float, end: float) -> tuple[int, int] | None:
+def _range(
+    time: Floats, curve: Floats, start: int, period: float, end: float, settings: DivergenceSettings
+) -> tuple[int, int] | None:
     """Return the ends of the longest straight range of growth; None if there is none."""
     high = np.flatnonzero(curve >= end)
     last = int(high[0]) if len(high) else len(curve) - 1
@@ -160,20 +154,20 @@ def _range(time: Floats, curve: Floats, start: int, period: float, end: float) -
         for b in range(last, a, -step):
             if best is not None and b - a <= best[1] - best[0]:
                 break
-            if curve[b] - curve[a] < LEAST_GROWTH or time[b] - time[a] < LEAST_PERIODS * period:
+            if curve[b] - curve[a] < settings.least_growth or time[b] - time[a] < settings.least_periods * period:
                 break
             whole, bend = _slopes(time, curve, a, b)
-            if bend <= STRAIGHT * whole:
+            if bend <= settings.straight * whole:
                 best = (a, b)
                 break
     return best
 
 
-def _fitted(plain: Divergence, blocks: Floats, start: int, end: int) -> Divergence:
+def _fitted(plain: Divergence, blocks: Floats, start: int, end: int, settings: DivergenceSettings) -> Divergence:
     """Return a curve with the slope of a range, and its interval."""
     time, curve, inside = plain.time, plain.curve, slice(start, end + 1)
     value, bend = _slopes(time, curve, start, end)
-    half = half_width([slope(time[inside], block[inside]) for block in blocks]) + bend + FINITE * abs(value)
+    half = half_width([slope(time[inside], block[inside]) for block in blocks]) + bend + settings.finite * abs(value)
     offset = float(curve[inside].mean() - value * time[inside].mean())
     ends = (float(time[start]), float(time[end]))
     return replace(plain, value=value, low=value - half, high=value + half, fit=ends, offset=offset)

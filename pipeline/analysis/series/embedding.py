@@ -10,8 +10,6 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-BINS = 16
-"""Bins of equal share on each side of the histogram for mutual information."""
 
 MOST_DIMENSIONS = 8
 """Largest embedding dimension that is tried."""
@@ -19,14 +17,9 @@ MOST_DIMENSIONS = 8
 FEW_FALSE = 0.01
 """Share of false nearest neighbours from which on an embedding dimension suffices."""
 
-FALSE_RATIO, FALSE_SIZE = 15.0, 2.0
-"""A neighbour is false if one more coordinate parts it by so many times its distance, or standard deviations."""
 
 N_BLOCKS = 8
 """Stretches of a series that are compared, and from whose scatter intervals are taken."""
-
-AT_ONCE = 4_000_000
-"""Most distances that are held at a time."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +74,7 @@ class Embedding:
         Vectors are given by their first samples, shapes (vector,) and (vector, n_nearest), and can be followed for
         `ahead` more samples in their pieces. Empty if there are too few.
         """
+        at_once = 4_000_000  # most distances that are held at a time
         starts = self.series.starts(self.span + ahead)
         if len(starts) < 2 * self.theiler + 4 * n_nearest + 2:
             return np.empty(0, np.int64), np.empty((0, n_nearest), np.int64), np.empty((0, n_nearest))
@@ -88,7 +82,7 @@ class Embedding:
         points = self.vectors(starts)
         size = (points**2).sum(axis=1)
         nearest, distance = [], []
-        for part in np.array_split(references, max(1, len(references) * len(starts) // AT_ONCE)):
+        for part in np.array_split(references, max(1, len(references) * len(starts) // at_once)):
             own = self.vectors(part)
             square = size + (own**2).sum(axis=1)[:, None] - 2.0 * own @ points.T
             square[np.abs(part[:, None] - starts) <= self.theiler] = np.inf
@@ -112,22 +106,23 @@ def slope(x: Floats, y: Floats) -> float:
 def mutual_information(series: Series, n_lags: int) -> Floats:
     """Return the mutual information of values and values some samples later, for lags from 0 on [nats].
 
-    From a histogram with `BINS` bins of equal shares on both sides, as Fraser and Swinney (Phys. Rev. A 33, 1134,
+    From a histogram with 16 bins of equal shares on both sides, as Fraser and Swinney (Phys. Rev. A 33, 1134,
     1986), less the bias of its counts (Miller and Madow).
     """
+    n_bins = 16  # bins of equal share on each side of the histogram
     ranks = np.empty(len(series.values), np.int64)
     ranks[np.argsort(series.values, kind="stable")] = np.arange(len(ranks))
-    bins = ranks * BINS // len(ranks)
+    bins = ranks * n_bins // len(ranks)
     found = np.zeros(n_lags + 1)
     for lag in range(n_lags + 1):
         first = series.starts(lag)
-        if len(first) < BINS**2:
+        if len(first) < n_bins**2:
             return found[:lag]
-        counts = np.bincount(bins[first] * BINS + bins[first + lag], minlength=BINS**2).reshape(BINS, BINS)
+        counts = np.bincount(bins[first] * n_bins + bins[first + lag], minlength=n_bins**2).reshape(n_bins, n_bins)
         share = counts / counts.sum()
         apart = share.sum(axis=1)[:, None] * share.sum(axis=0)
         there = share > 0.0
-        bias = (there.sum() - 2 * BINS + 1) / (2.0 * len(first))
+        bias = (there.sum() - 2 * n_bins + 1) / (2.0 * len(first))
         found[lag] = (share[there] * np.log(share[there] / apart[there])).sum() - bias
     return found
 
@@ -152,6 +147,8 @@ def false_neighbours(series: Series, delay: int, theiler: int, n_references: int
     By both criteria of Kennel, Brown and Abarbanel (Phys. Rev. A 45, 3403, 1992, eqs. 4 and 6). Dimensions after the
     first two that suffice are NaN.
     """
+    # a neighbour is false if one more coordinate parts it by so many times its distance, or standard deviations
+    ratio, largest = 15.0, 2.0
     size = float(series.values.std())
     found = np.full(MOST_DIMENSIONS, np.nan)
     for dimension in range(1, MOST_DIMENSIONS + 1):
@@ -162,7 +159,7 @@ def false_neighbours(series: Series, delay: int, theiler: int, n_references: int
         ahead = dimension * delay
         more = np.abs(series.values[first + ahead] - series.values[nearest[:, 0] + ahead])
         near = np.maximum(distance[:, 0], 1e-9 * size)
-        false = (more > FALSE_RATIO * near) | (np.hypot(more, near) > FALSE_SIZE * size)
+        false = (more > ratio * near) | (np.hypot(more, near) > largest * size)
         # below a thousandth of the size a ratio compares rounding or noise
         found[dimension - 1] = false[(near > 1e-3 * size) | (more > 1e-2 * size)].sum() / len(false)
         if dimension > 1 and (found[dimension - 2 : dimension] < FEW_FALSE).all():

@@ -12,9 +12,6 @@ from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import counted
 
-MOST_SHOWN = 600
-"""Most rows of the recurrence matrix that are drawn."""
-
 
 @style.drawn
 def plot_series(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
@@ -115,8 +112,9 @@ def _slopes(ax: Axes, ds: xr.Dataset) -> None:
 
 
 def _recurrences(ax: Axes, ds: xr.Dataset) -> None:
+    most = 600  # rows of the recurrence matrix that are drawn
     if "recurrent" in ds:
-        stride = -(-ds.sizes["row"] // MOST_SHOWN)
+        stride = -(-ds.sizes["row"] // most)
         end = float(ds["row"][-1])
         image = ds["recurrent"].values[::stride, ::stride]
         ax.imshow(image, cmap="Greys", origin="lower", extent=(0.0, end, 0.0, end), aspect="auto", interpolation="none")

@@ -10,23 +10,18 @@ from pipeline.analysis.series.embedding import Embedding, Floats, Series
 N_SURROGATES = 39
 """Surrogates: the least of 40 errors is that of the series with a probability of 2.5 % by chance."""
 
-MOST_SAMPLES = 2048
-"""Longest stretch of a series that is compared with surrogates."""
-
-N_ITERATIONS = 60
-"""Most iterations of a surrogate."""
-
 
 def surrogate(values: Floats, generator: np.random.Generator) -> Floats:
     """Return a series of the same values in another order, with almost the same spectrum and random phases.
 
     Iterative amplitude-adjusted Fourier transform (Schreiber and Schmitz, Phys. Rev. Lett. 77, 635, 1996).
     """
+    iterations = 60  # most iterations of a surrogate
     ordered = np.sort(values)
     size = np.abs(fft.rfft(values))
     found = generator.permutation(values)
     order = np.empty(0, np.int64)
-    for _ in range(N_ITERATIONS):
+    for _ in range(iterations):
         phases = np.exp(1j * np.angle(fft.rfft(found)))
         new = np.argsort(fft.irfft(size * phases, len(values)))
         if np.array_equal(new, order):
@@ -41,7 +36,8 @@ def closed_stretch(values: Floats) -> Floats:
 
     Up to a tenth is cut off on each side.
     """
-    values = values[:MOST_SAMPLES]
+    most = 2048  # samples of a stretch that is compared with surrogates
+    values = values[:most]
     slope = np.gradient(values)
     start = np.arange(max(1, len(values) // 10))
     end = len(values) - 1 - start

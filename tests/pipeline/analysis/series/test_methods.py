@@ -16,8 +16,8 @@ from pipeline.analysis.series.analysis import (
     _zero_one_result,
     series_table,
 )
-from pipeline.analysis.series.correlation import _below, _plateau, correlation_sums
-from pipeline.analysis.series.divergence import _range, divergence
+from pipeline.analysis.series.correlation import CorrelationSettings, _below, _plateau, correlation_sums
+from pipeline.analysis.series.divergence import DivergenceSettings, _range, divergence
 from pipeline.analysis.series.embedding import (
     Embedding,
     Series,
@@ -119,17 +119,17 @@ def test_slope_and_spread__of_even_points() -> None:
 def test_below__counts_as_brute_force() -> None:
     apart = np.random.default_rng(0).uniform(1e-4, 1.2, 500)
     radii = 2.0 ** (-np.arange(49)[::-1] / 4.0)
-    np.testing.assert_array_equal(_below(apart, 49), (apart[:, None] <= radii).sum(axis=0))
+    np.testing.assert_array_equal(_below(apart, 49, CorrelationSettings()), (apart[:, None] <= radii).sum(axis=0))
 
 
 def test_plateau__is_the_longest_range_of_one_slope() -> None:
     """Sums of slope 1.5 between a steeper beginning and a flat end."""
     x = np.log(2.0) * np.arange(40) / 4.0
     bends = np.interp(x, [0.0, x[10], x[30], x[-1]], [0.0, 3.0 * x[10], 3.0 * x[10] + 1.5 * (x[30] - x[10]), 8.0])
-    found = _plateau(x, np.stack([bends] * 3), np.arange(40))
+    found = _plateau(x, np.stack([bends] * 3), np.arange(40), CorrelationSettings())
     assert 8 <= found[0] <= 11
     assert 29 <= found[-1] <= 33
-    assert _plateau(x, np.stack([x**3] * 3), np.arange(40)) is None
+    assert _plateau(x, np.stack([x**3] * 3), np.arange(40), CorrelationSettings()) is None
 
 
 def test_correlation_sums__of_henons_map_have_its_dimension() -> None:
@@ -148,12 +148,12 @@ def test_correlation_sums__of_noise_and_of_short_series_are_not_decided() -> Non
 def test_range__of_growth_between_a_dip_and_saturation() -> None:
     time = np.linspace(0.0, 20.0, 200)
     curve = np.minimum(-6.0 + 0.4 * np.maximum(time - 2.0, 0.0), -1.5)
-    start, end = _range(time, curve, 0, 1.0, -1.7)
+    start, end = _range(time, curve, 0, 1.0, -1.7, DivergenceSettings())
     assert slope(time[start : end + 1], curve[start : end + 1]) == pytest.approx(
         0.4, rel=0.15
     )  # halves may differ by .3
     assert end - start > 90
-    assert _range(time, 0.01 * time, 0, 1.0, 5.0) is None  # grows by .2 in all
+    assert _range(time, 0.01 * time, 0, 1.0, 5.0, DivergenceSettings()) is None  # grows by .2 in all
 
 
 def test_divergence__neighbours_in_a_cycle_do_not_part() -> None:

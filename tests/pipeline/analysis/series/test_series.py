@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 import magpend
 from pipeline.analysis.series.analysis import series_table
 from pipeline.analysis.series.embedding import Series, false_neighbours, first_minimum, mutual_information
-from pipeline.analysis.series.recurrence import _measures
+from pipeline.analysis.series.recurrence import RecurrenceSettings, _measures
 from pipeline.analysis.series.surrogates import closed_stretch, surrogate
 
 
@@ -106,7 +106,7 @@ def test_measures__of_a_small_matrix_are_those_counted_by_hand():
     matrix = np.eye(6, dtype=bool)
     for i, j in ((0, 2), (1, 3), (2, 4), (0, 4), (1, 4), (0, 5)):
         matrix[i, j] = matrix[j, i] = True
-    found = _measures(matrix, 1, 0.5)
+    found = _measures(matrix, 1, 0.5, RecurrenceSettings())
     # diagonals: 3 in a row at lag 2; single ones at lags 3, 4, 5
     assert found["determinism"] == pytest.approx(3 / 6)
     assert found["mean_line"] == pytest.approx(3 * 0.5)
