@@ -51,10 +51,6 @@ class _Boxes(NamedTuple):
     n_finished: Ints
 
 
-FEWEST_DRAWN = 5
-"""Fewest boxes for an error of their mean: with a single box all resamples are equal."""
-
-
 def basin_entropy(
     labels: npt.ArrayLike | xr.DataArray,
     box: int | Sequence[int] = 5,
@@ -101,7 +97,7 @@ def basin_entropy(
         the first cell on `n_boxes`, `n_boundary_boxes`, and `fraction_used`, the part of the cells in them;
         `n_labels`, `fraction_unfinished`; `above_ln2`, whether the
         boundary entropy exceeds ln 2; `above_ln2_surely`, whether the lower end of its interval does.
-        Without a boundary box the boundary entropy is NaN. Errors are NaN with fewer than `FEWEST_DRAWN`
+        Without a boundary box the boundary entropy is NaN. Errors are NaN with fewer than 5
         (boundary) boxes, or squares of boxes, to draw from. Boxes should be small against the basins;
         this is not validated.
 
@@ -311,12 +307,13 @@ def _placement_errors(parts: Floats, block: int, resamples: int, confidence: flo
     """Bootstrap both entropies of boxes side by side; return standard errors, and how far the interval reaches below
     and above. NaN if there are too few boxes to draw from.
     """
+    fewest = 5  # boxes for an error of their mean: with a single box all resamples are equal
     sums = np.stack([_pool(part, block) for part in parts])
     weights = bootstrap_weights(sums.shape[1], resamples, seed)
     stderr, low, high = spread(np.array([_entropies(sums @ w) for w in weights]), confidence)
     value = _entropies(sums.sum(axis=1))
     errors = np.array([stderr, value - low, high - value])
-    errors[:, (sums[1:] > 0).sum(axis=1) < FEWEST_DRAWN] = np.nan
+    errors[:, (sums[1:] > 0).sum(axis=1) < fewest] = np.nan
     return errors
 
 

@@ -22,9 +22,6 @@ from pipeline.results.ragged import dense
 from pipeline.results.run import OpenRun
 from pipeline.results.selection import choose, parameter_dims, start_dims
 
-MOST_BARS = 60
-"""Most bars that are drawn: more would hide the bands."""
-
 _BAR: dict[str, Any] = {"linewidth": 0.7, "color": "black"}
 
 
@@ -51,7 +48,7 @@ def plot_fractions(
         Each parameter value is a column, because nothing is known between two values. Its
         `data` hold ``fraction`` and the number of cells, ``n_cells``; of a sweep also ``low`` and ``high``,
         the 95 % Wilson interval of each fraction, as if the starts were drawn independently. The widest
-        interval is written above. Thin bars, `MOST_BARS` at most, show the interval of the summed bands below
+        interval is written above. Thin bars, 60 at most, show the interval of the summed bands below
         an edge. The intervals do not cover the uncertainty from grey cells. The branches of a continuation
         are no sample of initial states, so their shares have no intervals.
 
@@ -60,6 +57,7 @@ def plot_fractions(
     ValueError
         If not exactly one swept parameter is left.
     """
+    most = 60  # bars that are drawn: more would hide the bands
     parameter = swept_parameter(attractors, at, "fractions")
     keep = (parameter, *start_dims(attractors))
     part = choose(attractors, at, keep, f"fractions are drawn over {parameter}")
@@ -69,7 +67,7 @@ def plot_fractions(
     place = {number: k for k, number in enumerate(cast.order)}
     listed = sorted(bands, key=lambda band: place.get(band.attractor, len(place)))
     entries: list[palette.Entry] = [(band.name, band.colour) for band in listed]
-    if bars := "low" in data and 0 < data.sizes[parameter] * (len(bands) - 1) <= MOST_BARS:
+    if bars := "low" in data and 0 < data.sizes[parameter] * (len(bands) - 1) <= most:
         entries.append(Line2D([], [], label="95 % interval of an edge", **_BAR))
     fig, ax = palette.new_panel(data, entries, frame)
     _draw(ax, data, parameter, bands)
@@ -228,7 +226,6 @@ def draw_fractions(run: OpenRun, options: FigureOptions) -> style.DataFigure:
     return noted(plot_fractions(found, at=at, frame=frame_of(options)), notes)
 
 
-_LEAST_PT, _GROWTH_PT = 1.1, 5.0
 _UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55
 _SPAN: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "none", "linewidth": 0.0}
 
@@ -373,7 +370,8 @@ def _word(stability: int) -> str:
 
 
 def _diameter(share: Any) -> Any:
-    return np.sqrt(_LEAST_PT**2 + _GROWTH_PT**2 * np.asarray(share))
+    least, growth = 1.1, 5.0  # diameters without and with all cells [pt]
+    return np.sqrt(least**2 + growth**2 * np.asarray(share))
 
 
 def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:

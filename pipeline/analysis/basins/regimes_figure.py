@@ -30,9 +30,6 @@ from pipeline.results.run import OpenRun
 from pipeline.results.selection import choose, parameter_dims, start_dims
 from pipeline.results.sets import rows_by_number
 
-BESIDE = 0.85
-"""Share of the figure's width for the caption of a map with a legend beside it."""
-
 SHOWN = ("periods", "attractors", "number")
 SHARE_LIMIT = 0.05
 """Share of cells without an attractor from which a point of the map is marked."""
@@ -124,6 +121,7 @@ def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dat
 
 
 def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame) -> style.DataFigure:
+    width = 0.85  # share of the figure's width for the caption of a map with a legend beside it
     colours, entries = _looks(data, show)
     if (data["share_without"] > SHARE_LIMIT).any():
         label = f"over {100 * SHARE_LIMIT:g} % of the cells\nwithout an attractor"
@@ -141,7 +139,7 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
     )
     _dress(ax, data, x, y, frame)
     style.label_axes(ax, labels.parameter_label(data[x]), labels.parameter_label(data[y]))
-    style.caption(ax, text, 1.0 if frame.compact else BESIDE)
+    style.caption(ax, text, 1.0 if frame.compact else width)
     return fig
 
 

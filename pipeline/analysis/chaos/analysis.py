@@ -20,7 +20,7 @@ from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yor
 from pipeline.analysis.chaos.lyapunov import CellMotion, is_closed, motion_attrs, summarise
 from pipeline.analysis.chaos.per_attractor import Nature, chaos_per_attractor, pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
-from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
+from pipeline.analysis.chaos.zero_one import FEWEST_SECTIONS, zero_one_test
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, KINDS, model_of, split_dims
 from pipeline.products.product import Table
@@ -346,9 +346,9 @@ def reasons(ds: xr.Dataset, stride: int = 1) -> list[str]:
             "lyapunov = {} in its specification"
         )
     n = -(-ds.sizes["period_index"] // stride)
-    if n < SHORTEST:
+    if n < FEWEST_SECTIONS:
         every = f" at every {stride}th period" if stride > 1 else ""
-        found.append(f"0-1 test: {n} sections{every}, and it needs {SHORTEST}; raise n_keep")
+        found.append(f"0-1 test: {n} sections{every}, and it needs {FEWEST_SECTIONS}; raise n_keep")
     return found
 
 

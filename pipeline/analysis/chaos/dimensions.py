@@ -104,18 +104,16 @@ def _without_zero(values: np.ndarray, rates: np.ndarray) -> np.ndarray:
     return np.asarray(values[kept].reshape(*rates.shape[:-1], rates.shape[-1] - 1))
 
 
-PER_OCTAVE = 4
-"""Number of radii per factor of two."""
-N_OCTAVES = 20
-"""Number of factors of two from the largest radius to the smallest."""
-MOST_PAIRS = 0.05
-"""Share of pairs closer than the radius, at the upper end of the fit."""
-LEAST_OCTAVES = 2
-"""Shortest range of a fit [octaves]."""
-LEAST_NEIGHBOURS = 10
-"""Mean number of neighbours within the radius, at the lower end of the fit."""
-N_PARTS = 10
-"""Number of parts of the points for the jackknife."""
+@dataclass(frozen=True)
+class DimensionSettings:
+    """Numbers of the correlation sums and of the range of the fit."""
+
+    per_octave: int = 4  # number of radii per factor of two
+    n_octaves: int = 20  # number of factors of two from the largest radius to the smallest
+    most_pairs: float = 0.05  # share of pairs closer than the radius, at the upper end of the fit
+    least_octaves: int = 2  # shortest range of a fit [octaves]
+    least_neighbours: int = 10  # mean number of neighbours within the radius, at the lower end of the fit
+    n_parts: int = 10  # number of parts of the points for the jackknife; more know the error better, and take longer
 
 
 def correlation_dimension(
@@ -236,31 +234,33 @@ def _sample(section: Floats, n_max: int) -> Floats:
     return section[:, -max(1, n_max // max(m, 1)) :]
 
 
-def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometry) -> _Curve:
+def _dimension_of(
+    section: Floats, theiler: int, floor: float, geometry: Geometry, settings: DimensionSettings = DimensionSettings()
+) -> _Curve:
     """Compute the correlation dimension of the section points of some cells together, shape (cell, n, state)."""
-    n_radii = N_OCTAVES * PER_OCTAVE + 1
+    n_radii = settings.n_octaves * settings.per_octave + 1
     nothing = _Curve(np.full(n_radii, np.nan), np.full(n_radii, np.nan))
     n_points = section.shape[0] * section.shape[1]
-    if n_points < N_PARTS:
+    if n_points < settings.n_parts:
         return nothing
     points = section.reshape(n_points, -1)
     extent = _extent(points, geometry)
     if extent <= floor:
         return _Curve(nothing.log_radius, nothing.log_sum, n_points, 0.0, 0.0, 0.0)
-    radii = extent * 2.0 ** (-np.arange(n_radii)[::-1] / PER_OCTAVE)
-    pairs = _Pairs.of(section, radii, theiler, geometry)
+    radii = extent * 2.0 ** (-np.arange(n_radii)[::-1] / settings.per_octave)
+    pairs = _Pairs.of(section, radii, theiler, geometry, settings.n_parts)
     x, y = np.log(radii), _logarithm(pairs.all / pairs.total)
     share = pairs.all / pairs.total
-    if share[np.searchsorted(radii, floor)] > MOST_PAIRS:
+    if share[np.searchsorted(radii, floor)] > settings.most_pairs:
         return _Curve(x, y, n_points, 0.0, 0.0, 0.0)
-    enough = pairs.all >= LEAST_NEIGHBOURS * n_points
-    fit = np.flatnonzero(enough & (radii >= floor) & (share <= MOST_PAIRS))
-    if len(fit) < LEAST_OCTAVES * PER_OCTAVE + 1:
+    enough = pairs.all >= settings.least_neighbours * n_points
+    fit = np.flatnonzero(enough & (radii >= floor) & (share <= settings.most_pairs))
+    if len(fit) < settings.least_octaves * settings.per_octave + 1:
         return _Curve(x, y, n_points)
     middle = len(fit) // 2
     spread = _slope(x, y, fit[: middle + 1]) - _slope(x, y, fit[middle:])
-    without = [_slope(x, _logarithm(pairs.without(i)), fit) for i in range(N_PARTS)]
-    stderr = np.sqrt((N_PARTS - 1) * np.var(without))
+    without = [_slope(x, _logarithm(pairs.without(i)), fit) for i in range(settings.n_parts)]
+    stderr = np.sqrt((settings.n_parts - 1) * np.var(without))
     largest = 2.0 * np.log(n_points) / np.log(extent / radii[fit[0]])
     ends = float(radii[fit[0]]), float(radii[fit[-1]])
     return _Curve(x, y, n_points, _slope(x, y, fit), float(stderr), spread, *ends, float(largest))
@@ -294,14 +294,14 @@ class _Pairs:
     total: int
 
     @classmethod
-    def of(cls, section: Floats, radii: Floats, theiler: int, geometry: Geometry) -> _Pairs:
+    def of(cls, section: Floats, radii: Floats, theiler: int, geometry: Geometry, n_parts: int) -> _Pairs:
         """Count the pairs of section points closer than each radius, among some cells, shape (cell, n, state)."""
         m, n, _ = section.shape
         points = section.reshape(m * n, -1)
         everything = geometry.tree(points)
-        number = np.arange(m * n) * N_PARTS // (m * n)
-        by_part, within = (np.empty((N_PARTS, len(radii)), np.int64) for _ in range(2))
-        for i in range(N_PARTS):
+        number = np.arange(m * n) * n_parts // (m * n)
+        by_part, within = (np.empty((n_parts, len(radii)), np.int64) for _ in range(2))
+        for i in range(n_parts):
             own = geometry.tree(points[number == i])
             # a point is not its own neighbour
             by_part[i] = own.count_neighbors(everything, radii, p=np.inf) - own.n
@@ -311,7 +311,7 @@ class _Pairs:
             near = geometry.distance(section[:, lag:], section[:, :-lag])
             total -= 2 * near.size
             for first, second in ((part[:, lag:], part[:, :-lag]), (part[:, :-lag], part[:, lag:])):
-                for i in range(N_PARTS):
+                for i in range(n_parts):
                     by_part[i] -= np.searchsorted(np.sort(near[first == i]), radii, side="right")
                     both = (first == i) & (second == i)
                     within[i] -= np.searchsorted(np.sort(near[both]), radii, side="right")

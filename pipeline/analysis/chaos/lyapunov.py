@@ -23,9 +23,6 @@ Floats = npt.NDArray[np.float64]
 
 GOOD, UNRESOLVED, FAILED = LyapunovFlag.GOOD, LyapunovFlag.UNRESOLVED, LyapunovFlag.FAILED
 
-FEWEST_BLOCKS = 12
-"""Fewest blocks for detecting a transient: three in each quarter, so that quarters have errors."""
-
 
 class CellMotion(IntEnum):
     """Classes of a cell's motion, decided by its Lyapunov exponents."""
@@ -180,9 +177,10 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
         ended in the last quarter or early in the first; -1 if unknown (fewer than 12 blocks, or no
         exponents).
     """
+    fewest = 12  # blocks for detecting a transient: three in each quarter, so that quarters have errors
     known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
     attrs = {"flag_values": np.arange(-1, 2, dtype=np.int8), "flag_meanings": "unknown no yes"}
-    if ds.sizes.get("block", 0) < FEWEST_BLOCKS:
+    if ds.sizes.get("block", 0) < fewest:
         return xr.full_like(known, -1, dtype=np.int8).assign_attrs(attrs)
     first, quarter = ds["lyapunov_blocks"].isel(exponent=0, drop=True), ds.sizes["block"] // 4
     early, late = first.isel(block=slice(quarter)), first.isel(block=slice(-quarter, None))

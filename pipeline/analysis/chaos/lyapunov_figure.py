@@ -74,8 +74,6 @@ def rate_unit(data: xr.Dataset) -> str:
 
 
 _NO_EXPONENT = "0.8"
-_SHOWN = 0.98
-"""Share of the points whose exponents the scale holds, so that a few do not pale all others."""
 
 
 @style.drawn
@@ -164,9 +162,10 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
     """Return a colour scale that is symmetric about 0, and a word for the ends at which values lie outside it."""
+    held = 0.98  # share of the points whose exponents the scale holds, so that a few do not pale all others
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))
-    half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0
+    half = float(np.quantile(np.abs(known), held)) if known.size else 1.0
     half = half if half > 0.0 else most or 1.0
     if most <= 1.5 * half:
         half = most or 1.0
@@ -181,8 +180,6 @@ def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
 
 EXPONENT_COLOURS = ("#332288", style.ORANGE, style.SKY, "#882255", "#5B3A1E", "#999933", "#44AA99", "#AA4499")
 """Others than those of the motions in the panel above; a ninth begins again."""
-
-_BAND = 0.25
 
 
 @style.drawn
@@ -306,6 +303,7 @@ def _draw_class(
     ax: Axes, x: np.ndarray, value: np.ndarray, error: np.ndarray, flag: np.ndarray, colour: str, gid: str
 ) -> None:
     """Draw the exponents of one class of motion, or one exponent of the spectrum, with error bands."""
+    alpha = 0.25
     there = np.isfinite(value)
     if not there.any():
         return
@@ -315,7 +313,7 @@ def _draw_class(
         for i in np.flatnonzero(there.any(axis=1))
         for low, high in _union(value[i, there[i]], error[i, there[i]])
     ]
-    area = PolyCollection(boxes, facecolor=colour, alpha=_BAND, linewidth=0.0, zorder=1.5, gid=f"band:{gid}")
+    area = PolyCollection(boxes, facecolor=colour, alpha=alpha, linewidth=0.0, zorder=1.5, gid=f"band:{gid}")
     ax.add_collection(area)
     size = min(2.2, max(0.9, 300.0 / max(x.size, 1)))
     for chosen, face in ((there & (flag <= GOOD), colour), (there & (flag > GOOD), "none")):

@@ -46,12 +46,6 @@ from pipeline.layout.vocabulary import (
 from pipeline.products.lyapunov import LyapunovFlag
 from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 
-CHAOTIC_K, REGULAR_K = 0.9, 0.1
-"""Least median of K that shows chaos, and largest that shows order, by the 0-1 test alone."""
-
-FEWEST_POINTS = 1000
-"""Fewest section points for a correlation dimension: enough for a dimension of 1.2."""
-
 
 class Nature(IntEnum):
     """Classes of the motion on attractors, decided by Lyapunov exponents or else by the 0-1 test."""
@@ -224,6 +218,8 @@ def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Na
     """Classify the motion on an attractor or other set by its kind and stability or, if these do not decide, by
     exponents or the 0-1 test.
     """
+    # least median of K that shows chaos, and largest that shows order, by the 0-1 test alone
+    chaotic, regular = 0.9, 0.1
     kind, stability = int(one["kind"]), int(one["stability"])
     if kind in (PERIODIC_ORBIT, EQUILIBRIUM):
         return Nature.UNDECIDED if stability == UNSTABLE else Nature.REGULAR
@@ -243,9 +239,9 @@ def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Na
     k = found.get("median_zero_one")
     if k is None:
         return Nature.UNKNOWN
-    if k >= CHAOTIC_K:
+    if k >= chaotic:
         return Nature.CHAOTIC_BY_TEST
-    return Nature.REGULAR_BY_TEST if k <= REGULAR_K else Nature.UNDECIDED
+    return Nature.REGULAR_BY_TEST if k <= regular else Nature.UNDECIDED
 
 
 class _Curves:
@@ -258,9 +254,10 @@ class _Curves:
         """Compute the correlation dimension of one attractor from its cells; an empty dict if there are too few section
         points.
         """
+        fewest = 1000  # section points for a correlation dimension: enough for a dimension of 1.2
         lasting = (cells.values["attractor_id"] == number) & (cells.values["is_transient"] != 1)
         n_keep = point.sizes["period_index"]
-        if min(int(lasting.sum()) * n_keep, self._n_max) < FEWEST_POINTS:
+        if min(int(lasting.sum()) * n_keep, self._n_max) < fewest:
             return {}
         found = correlation_dimension(
             pooled(point, starts, lasting), pool=["cell"], n_max=self._n_max, geometry=geometry_of(point)

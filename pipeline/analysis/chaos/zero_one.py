@@ -12,10 +12,10 @@ from pipeline.products.reporting import report
 from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import SAME_POINT
 
-BUDGET = 64 * 2**20
+STEP_BYTES = 64 * 2**20
 """Most memory of a step of the 0-1 test [bytes]."""
 
-SHORTEST = 200
+FEWEST_SECTIONS = 200
 """Fewest sections for the 0-1 test: lags reach a tenth of them, and with ten lags period 3 looks chaotic."""
 
 
@@ -86,9 +86,9 @@ def zero_one_test(
     section = computed(ds, geometry).isel(period_index=slice(None, None, at_least("stride", stride, 1)))
     n_frequencies = at_least("n_frequencies", n_frequencies, 10)
     n = section.sizes["period_index"]
-    if n < SHORTEST:
+    if n < FEWEST_SECTIONS:
         raise ValueError(
-            f"{n} sections (with stride {stride}) are too few for the 0-1 test, which needs {SHORTEST}: "
+            f"{n} sections (with stride {stride}) are too few for the 0-1 test, which needs {FEWEST_SECTIONS}: "
             "raise n_keep, to some hundreds if possible"
         )
     cells = [d for d in section.dims if d not in ("period_index", "state")]
@@ -98,7 +98,7 @@ def zero_one_test(
     c = np.random.default_rng(seed).uniform(0.2 * np.pi, 0.8 * np.pi, n_frequencies)
     phi = _observable(flat, None if state is None else _number(ds, state), geometry)
     measures = np.full((6, len(phi)), np.nan)
-    step = max(1, BUDGET // (16 * n * n_frequencies))
+    step = max(1, STEP_BYTES // (16 * n * n_frequencies))
     for begin in range(0, len(phi), step):
         report("0-1 test", begin, len(phi))
         rows = slice(begin, begin + step)
@@ -146,7 +146,7 @@ def _zero_one(phi: Floats, c: Floats) -> Floats:
     n = phi.shape[1]
     k = np.sort(_growth(phi, c), axis=1)
     half = np.full(len(phi), np.nan)
-    if n // 2 >= SHORTEST:
+    if n // 2 >= FEWEST_SECTIONS:
         later = phi[:, n - n // 2 :]
         half = np.median(_growth(later - later.mean(axis=1, keepdims=True), c), axis=1)
     away = 0.5 * np.sqrt(len(c))

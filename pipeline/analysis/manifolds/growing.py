@@ -25,24 +25,6 @@ from magpend_core.engine.system import System
 from magpend_core.orbits import section_map, wrap_angles
 from pipeline.results.tolerances import BRANCH_RTOL, SAME_POINT
 
-FIRST = 1e-5
-"""Scaled distance of the first segment from the orbit."""
-
-TURN = 0.2
-"""Largest angle between neighbouring chords [rad]."""
-
-TURN_DISTANCE = 2e-4
-"""Largest product of that angle and the chord: where the curve is sharply bent, short chords may turn more."""
-
-NEWTON_STEPS, NEWTON_CLOSE = 20, 1e-8
-"""Most Newton steps for a preimage, and the length of the last one [scaled]: the next would be its square."""
-
-SHORTEST = 1e-12
-"""Least difference of two places on the first segment."""
-
-MOST_GENERATIONS = 60
-"""Generations after which a manifold that stays short ends."""
-
 
 @dataclass(frozen=True, eq=False)
 class Saddle:
@@ -100,13 +82,17 @@ class Saddle:
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of a manifold: longest distance between points [scaled], total length [scaled], largest number of
-    points.
-    """
+    """Resolution of a manifold: how far it grows, and how fine; finer ones take longer."""
 
-    chord: float = 0.02
-    length: float = 20.0
-    most: int = 20_000
+    chord: float = 0.02  # longest distance between points [scaled]
+    length: float = 20.0  # total length [scaled]
+    most: int = 20_000  # largest number of points
+    first: float = 1e-5  # scaled distance of the first segment from the orbit; less errs less, and takes more images
+    turn: float = 0.2  # largest angle between neighbouring chords [rad]
+    # largest product of that angle and the chord: where the curve is sharply bent, short chords may turn more
+    turn_distance: float = 2e-4
+    shortest: float = 1e-12  # least difference of two places on the first segment
+    most_generations: int = 60  # after which a manifold that stays short ends
 
 
 @dataclass(eq=False)
@@ -154,7 +140,7 @@ def _grow(saddle: Saddle, side: float, stable: bool, resolution: Resolution) -> 
     rate = abs(np.log(abs(multiplier))) * (2.0 if multiplier < 0.0 else 1.0)
 
     def first(places: np.ndarray) -> np.ndarray:
-        away = side * FIRST * np.exp(rate * places)[:, None] * vector
+        away = side * resolution.first * np.exp(rate * places)[:, None] * vector
         return np.asarray(saddle.state + away * saddle.scales)
 
     def ahead(points: np.ndarray, guesses: np.ndarray) -> np.ndarray:
@@ -185,7 +171,7 @@ class _Curve:
     def grow(self) -> Manifold:
         """Add images (or preimages) of the first segment until the manifold has the requested length."""
         points, times, length, end = [self.generations[0][:1]], [np.zeros(1)], 0.0, "generations"
-        for number in range(MOST_GENERATIONS):
+        for number in range(self.resolution.most_generations):
             if number:
                 (self._add_preimages if self.stable else self._add_images)()
             self._refine()
@@ -242,7 +228,7 @@ class _Curve:
                 tangent, away, length = step / ahead, moved, length + moved
                 found.append(here)
                 matrix = saddle.images(here[None], self.n_periods)[1][0]
-            elif self.places[i] - self.places[i - 1] > SHORTEST:
+            elif self.places[i] - self.places[i - 1] > self.resolution.shortest:
                 self._insert(np.array([i - 1]), float(np.clip(self.resolution.chord / ahead, 1e-3, 0.5)))
             else:
                 break
@@ -254,7 +240,7 @@ class _Curve:
         each other.
         """
         while len(self.places) < self.resolution.most:
-            coarse = self._coarse(self.generations[-1]) & (np.diff(self.places) > SHORTEST)
+            coarse = self._coarse(self.generations[-1]) & (np.diff(self.places) > self.resolution.shortest)
             if not coarse.any():
                 break
             self._insert(np.flatnonzero(coarse))
@@ -292,7 +278,9 @@ class _Curve:
         lengths = np.linalg.norm(chords, axis=1)
         inner = (chords[1:] * chords[:-1]).sum(axis=1) / np.maximum(lengths[1:] * lengths[:-1], 1e-300)
         turns = np.arccos(np.clip(inner, -1.0, 1.0))
-        bent = (turns > TURN) & (turns * np.maximum(lengths[1:], lengths[:-1]) > TURN_DISTANCE)
+        bent = (turns > self.resolution.turn) & (
+            turns * np.maximum(lengths[1:], lengths[:-1]) > self.resolution.turn_distance
+        )
         coarse = lengths > self.resolution.chord
         coarse[1:] |= bent
         coarse[:-1] |= bent
@@ -306,12 +294,14 @@ def _preimages(saddle: Saddle, points: np.ndarray, guesses: np.ndarray, n_period
     next step, with the same derivative, is shorter (natural monotonicity; Deuflhard, Newton Methods for
     Nonlinear Problems, 2004, Sect. 3.3); else it is divided by four.
     """
+    # most Newton steps, and the length of the last one [scaled]: the next would be its square
+    most_steps, close = 20, 1e-8
     found = np.where(np.isfinite(guesses).all(axis=1, keepdims=True), guesses, np.nan).astype(np.float64)
     rows = np.flatnonzero(np.isfinite(found).all(axis=1) & np.isfinite(points).all(axis=1))
     converged = np.zeros(len(points), bool)
     n = len(saddle.scales)
     steps, share, matrices = np.zeros_like(found), np.zeros(len(points)), np.zeros((len(points), n, n))
-    for number in range(NEWTON_STEPS):
+    for number in range(most_steps):
         trial = found[rows] + share[rows, None] * steps[rows] * saddle.scales
         images, derivatives = saddle.images(trial, n_periods)
         residual = saddle.scaled(points[rows] - images)
@@ -323,7 +313,7 @@ def _preimages(saddle: Saddle, points: np.ndarray, guesses: np.ndarray, n_period
                 found[row], matrices[row], share[row] = trial[k], scaled[k], 1.0
                 steps[row] = _solve(scaled[k], residual[k])
                 left = np.linalg.norm(residual[k] - scaled[k] @ steps[row])  # 0, unless the derivative is singular
-                converged[row] = np.abs(steps[row]).max() < NEWTON_CLOSE and left < SAME_POINT
+                converged[row] = np.abs(steps[row]).max() < close and left < SAME_POINT
                 found[row] += converged[row] * steps[row] * saddle.scales
             else:
                 share[row] *= 0.25

@@ -22,8 +22,6 @@ from pipeline.results.tabular import Row, Words, aligned, at_point, number, poin
 
 MOST_PEAKS = 16
 """Most peaks whose places are kept."""
-_BEYOND = 0.05
-"""Margin of the histogram on either side, as a share of the range of all points."""
 
 
 class Peaks(NamedTuple):
@@ -132,6 +130,7 @@ def _points(cells: PointCells, skip: int) -> np.ndarray:
 
 def _edges(cube: xr.Dataset, options: DensityOptions, number: int, on_circle: bool) -> np.ndarray:
     """Return the edges of the bins, the same for all parameter points."""
+    beyond = 0.05  # margin of the histogram on either side, as a share of the range of all points
     if options.skip >= cube.sizes["period_index"]:
         raise ValueError(f"skip = {options.skip} leaves none of {cube.sizes['period_index']} sections; lower it")
     if on_circle:
@@ -143,7 +142,7 @@ def _edges(cube: xr.Dataset, options: DensityOptions, number: int, on_circle: bo
             low, high = min(low, float(values.min())), max(high, float(values.max()))
     if not np.isfinite(low):
         raise ValueError("no cell has section points")
-    margin = _BEYOND * (high - low) or 0.5
+    margin = beyond * (high - low) or 0.5
     return np.linspace(low - margin, high + margin, options.bins + 1)
 
 

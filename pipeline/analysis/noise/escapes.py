@@ -32,14 +32,6 @@ from pipeline.results.tabular import Row, Words, aligned, at_point, number, poin
 _IN_AND_OUT = ("inside", "outside")
 
 
-_MOST_ITERATIONS = 100
-
-_CONVERGED = 1e-12
-
-_LARGEST_STEP = 2.0
-
-_LEAST_EVENTS, _LEAST_POINTS = 2, 3
-
 _ESCAPE = (
     "n_cells",
     "n_left",
@@ -53,9 +45,6 @@ _ESCAPE = (
     "left_high",
     "constant_p",
 )
-
-_UNEVEN = 0.01
-"""Level below which a rate counts as changing along the record."""
 
 
 def needs_set(run: OpenRun, options: EscapeOptions) -> None:
@@ -350,11 +339,14 @@ def fit_kramers(
         `NO_FIT` unless three strengths have cells at risk and two of these have events. The interval of the slope
         is that of the likelihood's curvature.
     """
+    events, least = 2, 3  # fewest points with an event, and fewest points, of a fit
+    # most iterations, the change at which they end, and the longest step
+    iterations, converged, longest = 100, 1e-12, 2.0
     strength, n, m = (np.asarray(x, np.float64) for x in (strength, n_events, n_risked))
     t = np.broadcast_to(np.asarray(interval, np.float64), n.shape)
     # where nearly every interval at risk has an event the rate is no rate any more
     use = (strength > 0) & (m > 0) & (n < 0.5 * m)
-    if use.sum() < _LEAST_POINTS or (n[use] > 0).sum() < _LEAST_EVENTS:
+    if use.sum() < least or (n[use] > 0).sum() < events:
         return NO_FIT
     x, n = -1.0 / strength[use] ** 2, n[use]
     # -m log(1 - n/m) events of a constant rate over the whole time at risk
@@ -363,11 +355,11 @@ def fit_kramers(
     some = n > 0
     line = np.polyfit(x[some], np.log(n[some] / exposure[some]), 1)
     beta = np.array([line[1], line[0]])
-    for _ in range(_MOST_ITERATIONS):
+    for _ in range(iterations):
         mean = exposure * np.exp(np.clip(design @ beta, -700.0, 700.0))
         step = np.linalg.solve(design.T @ (mean[:, None] * design), design.T @ (n - mean))
-        beta = beta + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
-        if np.abs(step).max() < _CONVERGED * (1.0 + np.abs(beta).max()):
+        beta = beta + np.clip(step, -longest, longest)
+        if np.abs(step).max() < converged * (1.0 + np.abs(beta).max()):
             break
     mean = exposure * np.exp(design @ beta)
     error = float(np.sqrt(np.linalg.inv(design.T @ (mean[:, None] * design))[1, 1]))
@@ -422,7 +414,8 @@ def _escape_words(ds: xr.Dataset, row: Row, dims: list[str]) -> Words:
 
 def _uneven_line(ds: xr.Dataset, row: Row, dims: list[str]) -> str:
     """Return a warning if cells leave at another rate early in the record than late."""
-    if not row["constant_p"] < _UNEVEN:
+    uneven = 0.01  # level below which a rate counts as changing along the record
+    if not row["constant_p"] < uneven:
         return ""
     place = ", ".join(f"{d} {row[d]:g}{unit_of(ds, d)}" for d in dims)
     return (

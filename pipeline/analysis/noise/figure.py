@@ -136,10 +136,6 @@ def draw_escapes(run: OpenRun, options: EscapeFigureOptions) -> style.DataFigure
     return noted(plot(ds, at=at, frame=frame_of(options)), notes)
 
 
-_GAMMA = 0.5
-"""Exponent of the colour scale: the square root shows what is rare, too."""
-
-
 @style.drawn
 def plot_density(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
@@ -162,13 +158,14 @@ def _text(part: xr.Dataset, drop: list[str]) -> str:
 
 
 def _over(part: xr.Dataset, along: str, frame: style.Frame) -> style.DataFigure:
+    gamma = 0.5  # exponent of the colour scale: the square root shows what is rare, too
     fig = style.new_figure(5.2, part[["density", "smoothed", "peak", "n_peaks", "bandwidth"]], frame)
     ax, below = fig.subplots(2, 1, sharex=True, height_ratios=(4, 1))
     measure = labels.state_measure(part, str(part.attrs["density_of"]))
     x, y = (part[d].values.astype(np.float64) for d in (along, "value"))
     shown = part["smoothed"].transpose("value", along).values / measure.factor
     top = float(np.nanmax(shown)) if np.isfinite(shown).any() else 1.0
-    norm = PowerNorm(_GAMMA, 0.0, top)
+    norm = PowerNorm(gamma, 0.0, top)
     ax.pcolormesh(style.edges(x), style.edges(measure.shown(y)), shown, norm=norm, rasterized=True, gid="density")
     peaks = measure.shown(part["peak"].transpose(along, "rank").values)
     ax.plot(

@@ -26,9 +26,6 @@ from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, Words, aligned, words_of
 from pipeline.results.tolerances import CLOSURE, PORTRAIT_RTOL
 
-BEYOND = 1e-3
-"""How far beyond the end of a stable orbit a trajectory is integrated, as a share of the interval."""
-
 PATIENCE, LONGEST = 20_000, 64
 """Drive periods or returns after which a trajectory is given up, and the longest period at which it may close."""
 
@@ -79,7 +76,8 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     there = measured(events, flow, options.harmonics)
     variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
     low, high = interval_along(run, options.parameter)
-    variables |= _jumps(located, base, events, BEYOND * (high - low))
+    step = 1e-3 * (high - low)  # beyond the end of a stable orbit, where a trajectory is integrated
+    variables |= _jumps(located, base, events, step)
     kept = located.drop_vars([name for name in map(str, located.variables) if name.startswith((*_LEFT_OUT, "state"))])
     kept = kept.rename({name: _own_name(name) for name in base.names if name in kept and name in variables})
     return kept.assign(variables).assign_coords(channel_coordinates(flow, options.harmonics))

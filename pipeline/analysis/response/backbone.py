@@ -44,17 +44,6 @@ KINDS = ("phase_resonance", "normal_mode")
 
 NAME = parameter_name(FREQUENCY)
 
-HARMONICS = 5
-"""Number of harmonics that are measured."""
-
-GUESSES = 256
-"""Most cells whose last section is a guess of an equilibrium."""
-
-IMAGINARY = 1e-7
-"""Real part of an eigenvalue, as a share of its modulus, below which a linear mode counts as undamped."""
-
-WIDE = 10.0
-"""Factor from the frequencies of the linear modes of a flow to the default bounds."""
 
 INSTANTS = np.linspace(0.0, 1.0, 16, endpoint=False)
 """Shares of a period at which the drive is looked at."""
@@ -222,16 +211,19 @@ def _quadratures(run: OpenRun, options: BackboneOptions) -> Iterator[tuple[Reson
 
 def _follow_modes(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_out: list[str]) -> None:
     """Append the normal modes of all equilibria that are found."""
+    # real part of an eigenvalue, as a share of its modulus, below which a linear mode counts as undamped
+    imaginary = 1e-7
+    wide = 10.0  # factor from the frequencies of the linear modes of a flow to the default bounds
     base = _undamped(run, options)
     model, starts = base.model, []
     channel = _channels(model).index(options.channel)
     for state, values, vectors in _equilibria(run, base):
         where = ", ".join(f"{name} {x:.4g}" for name, x in zip(model.state_names, state, strict=True))
-        undamped = (values.imag > 0.0) & (np.abs(values.real) <= IMAGINARY * np.abs(values))
+        undamped = (values.imag > 0.0) & (np.abs(values.real) <= imaginary * np.abs(values))
         low, high = _interval(options)
         if not model.clock.has_drive and undamped.any():
             lines = values.imag[undamped] / (2.0 * np.pi)
-            low, high = options.low or lines.min() / WIDE, options.high or lines.max() * WIDE
+            low, high = options.low or lines.min() / wide, options.high or lines.max() * wide
         for k in np.flatnonzero(values.imag > 0.0)[np.argsort(values.imag[values.imag > 0.0])]:
             hertz = float(values[k].imag / (2.0 * np.pi))
             line = f"normal mode of {NAME} = {hertz:.7g} at {where}"
@@ -255,11 +247,12 @@ def _follow_modes(run: OpenRun, options: BackboneOptions, curves: list[Curve], l
 
 def _equilibria(run: OpenRun, base: Parameters) -> Iterator[tuple[Array, Array, Array]]:
     """Yield equilibria, each once, with the eigenvalues and eigenvectors of their Jacobian."""
+    most = 256  # cells whose last section is a guess of an equilibrium
     system = base.model.system
     seen = run.cube()["section"].isel(period_index=-1)
     sections = seen.transpose(..., "state").values.reshape(-1, system.n_states)
     sections = sections[np.isfinite(sections).all(axis=1)]
-    chosen = np.unique(np.linspace(0, len(sections) - 1, min(GUESSES, len(sections))).astype(int))
+    chosen = np.unique(np.linspace(0, len(sections) - 1, min(most, len(sections))).astype(int))
     guesses = np.concatenate([np.zeros((1, system.n_states)), sections[chosen]])
     found = find_equilibria(system, guesses, base.pack())
     kept: list[Array] = []
@@ -271,6 +264,7 @@ def _equilibria(run: OpenRun, base: Parameters) -> Iterator[tuple[Array, Array, 
 
 
 def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_out: list[str]) -> xr.Dataset:
+    n_harmonics = 5  # that are measured
     model = of_flow(parameters_of(run.cube())).model
     n, m = max((len(c.points) for c in curves), default=0), len(model.states)
     shape = (len(curves), n)
@@ -287,7 +281,7 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         residual[i, j], unstable[i, j] = curve.gap(point), curve.n_unstable(point)
         multiplier[i, j, : len(own)] = own
     orbits = {(i, j): curves[i].problem.orbit(curves[i].points[j].u) for i, j in places}
-    variables: dict[str, Any] = measured_along(orbits, {"curve": len(curves), "point": n}, model, HARMONICS)
+    variables: dict[str, Any] = measured_along(orbits, {"curve": len(curves), "point": n}, model, n_harmonics)
     over = ("curve", "point")
     linear = [c.problem.linear_hz if isinstance(c.problem, ModeProblem) else np.nan for c in curves]
     first, last = ([ENDS.index(c.ends[k]) for c in curves] for k in (0, 1))
@@ -306,7 +300,7 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         "linear_frequency": ("curve", np.array(linear, float)),
     }
     left_out = [*left_out, *(f"curve {i}: {why}" for i, curve in enumerate(curves) for why in _cut_off(curve))]
-    coords = {**channel_coordinates(model, HARMONICS), "state": list(model.state_names)}
+    coords = {**channel_coordinates(model, n_harmonics), "state": list(model.state_names)}
     attrs = {"model": model_attribute(run.model), **section_attributes(run.model.crossing), "parameter": FREQUENCY}
     attrs |= {"parameter_units": "Hz", "of_channel": options.channel, "force": options.drive}
     return xr.Dataset(variables, coords, {**attrs, "left_out": "\n".join(left_out)})

@@ -18,14 +18,10 @@ from pipeline.results.tolerances import BRANCH_RTOL
 FEWEST, MOST = 512, 8192
 """Samples per drive period or return: at first, and at most."""
 
-SETTLED = 1e-9
-"""Relative change of all measures, from half of the samples to all of them, at which these suffice."""
 
 AT_ONCE = 2_000_000
 """Samples of all orbits that are integrated in one call, which bounds the memory."""
 
-NOTHING = 1e-10
-"""Amplitude of a harmonic, as a share of the largest value, below which it has no phase."""
 
 Array = np.ndarray
 
@@ -74,6 +70,7 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = F
     Orbits are of one model. Harmonics are those of the orbit's own period if `of_orbit`, with a drive as well. NaN for
     orbits that could not be integrated.
     """
+    settled = 1e-9  # relative change of all measures, from half of the samples to all of them, at which these suffice
     model = of_flow(orbits[0].parameters).model if orbits else None
     n_channels = 0 if model is None else len(model.states) + len(model.quantities)
     shape = (len(orbits), n_channels)
@@ -87,7 +84,7 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = F
             base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven and not of_orbit else 1
             _measure(found, rows, values, base, n_harmonics)
         scale = np.abs(found.mean[left]) + found.amplitude[left]
-        left, n = left[(found.error[left] > SETTLED * scale).any(axis=1)], 2 * n
+        left, n = left[(found.error[left] > settled * scale).any(axis=1)], 2 * n
     return found
 
 
@@ -173,11 +170,12 @@ def lags_of(orbits: Sequence[Orbit], harmonics: Array) -> Array:
     A harmonic is cos(n (w t + a) - lag), where the drive's first harmonic is cos(w t + a). A model whose time
     dependence is no single forcing has a = 0. NaN where a harmonic vanishes.
     """
+    nothing = 1e-10  # amplitude of a harmonic, as a share of the largest value, below which it has no phase
     order = np.arange(1, harmonics.shape[-1] + 1)
     shift = np.array([_drive_phase(orbit) for orbit in orbits])[:, None, None]
     lag = np.angle(np.exp(1j * (order * shift - np.angle(harmonics))))
     size = np.abs(harmonics)
-    return np.where(size > NOTHING * np.fmax(size.max(axis=-1, keepdims=True, initial=0.0), NOTHING), lag, np.nan)
+    return np.where(size > nothing * np.fmax(size.max(axis=-1, keepdims=True, initial=0.0), nothing), lag, np.nan)
 
 
 def _drive_phase(orbit: Orbit) -> float:

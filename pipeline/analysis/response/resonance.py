@@ -35,11 +35,6 @@ MODE = Settings(1e-2, 5e-3, 1e-5, max_points=2000, tolerance=1e-11, max_iteratio
 """Settings of normal modes; the frequency of the linear mode counts as 1. The longest step is in units of the longest
 distance from the equilibrium."""
 
-SMALL = 1e-2
-"""Scaled distance from its equilibrium at which a normal mode begins."""
-
-OPEN = 1e-7
-"""Gap between an orbit's ends, as a share of its distance from the equilibrium, above which energy is lost."""
 
 NEUTRAL = 1e-4
 """Distance from the unit circle within which a multiplier of a conservative system counts as on it."""
@@ -202,13 +197,16 @@ def phase_resonance(problem: ResonanceProblem, guess: Array) -> Steps[Curve | No
 
 def normal_mode(problem: ModeProblem, direction: Array) -> Steps[Curve | None]:
     """Follow a normal mode from a scaled state of length 1 on its linear mode; None if the orbits do not close."""
+    small = 1e-2  # scaled distance from its equilibrium at which the mode begins
+    # gap between an orbit's ends, as a share of its distance from the equilibrium, above which energy is lost
+    largest = 1e-7
     normal = np.append(direction, 0.0)
-    start = np.append(problem.equilibrium, 1.0) + SMALL * normal
+    start = np.append(problem.equilibrium, 1.0) + small * normal
 
     def is_closed(_: Point, there: Point) -> Steps[bool]:
         yield from ()
         gap = np.abs(problem.family.mismatch(there.u, there.value.images[-1])).max()
-        if gap > OPEN * problem.distance(there.u):
+        if gap > largest * problem.distance(there.u):
             return False
         problem.keep(there.u)
         return True

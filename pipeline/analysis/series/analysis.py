@@ -14,7 +14,7 @@ import xarray as xr
 from scipy import stats
 
 from magpend_core.models.model import Model
-from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
+from pipeline.analysis.chaos.zero_one import FEWEST_SECTIONS, zero_one_test
 from pipeline.analysis.series.correlation import Sums, correlation_sums
 from pipeline.analysis.series.declaration import SERIES_COLUMNS, SeriesOptions
 from pipeline.analysis.series.divergence import Divergence, divergence
@@ -93,9 +93,9 @@ def series_of(ds: xr.Dataset, channel: str = "", *, seed: int = 0) -> xr.Dataset
     channel, pieces, rate = pieces_of(ds, channel)
     if "model" in ds.attrs:
         refuse_map(model_of(ds), channel)
-    pieces = [piece for piece in pieces if len(piece) >= SHORTEST]
+    pieces = [piece for piece in pieces if len(piece) >= FEWEST_SECTIONS]
     if not pieces:
-        raise ValueError(f"channel {channel!r} has no {SHORTEST} samples in a row.")
+        raise ValueError(f"channel {channel!r} has no {FEWEST_SECTIONS} samples in a row.")
     series = Series.of(pieces, 1.0 / rate)
     if not np.ptp(series.values) > 0.0:
         raise ValueError(f"channel {channel!r} is constant.")
@@ -248,8 +248,8 @@ def _unless(reason: str, result: Result) -> Result:
 def _zero_one_result(values: Floats, delay: int, drift: str) -> Result:
     stride = 2 * delay
     n = len(values) // stride
-    if drift or n < SHORTEST:
-        return Result("zero_one", "1", reason=drift or f"{n} samples two delays apart, fewer than {SHORTEST}")
+    if drift or n < FEWEST_SECTIONS:
+        return Result("zero_one", "1", reason=drift or f"{n} samples two delays apart, fewer than {FEWEST_SECTIONS}")
     chosen = values[: n * stride : stride][:4000]
     ds = xr.Dataset({"section": (("period_index", "state"), chosen[:, None])})
     one = zero_one_test(ds, geometry=Geometry((False,), (float(values.std()),)))

@@ -42,9 +42,6 @@ from pipeline.results.selection import select_points
 from pipeline.results.tabular import Row, Words, aligned, number, plain, words_of
 from pipeline.specification.tables import FREQUENCY
 
-FEWEST, MOST = 128, 2048
-"""Samples per drive period or return of a motion that does not close: at first, and at most."""
-
 FOLDED = 1e-6
 """Share of the power in the upper half of the band, below which samples are not doubled."""
 
@@ -52,8 +49,6 @@ ESTIMATES = ("none", "lines", "average")
 NONE, LINES, AVERAGE = range(len(ESTIMATES))
 """Values of `estimate`: a trajectory that failed, the lines of a closed orbit, an averaged periodogram."""
 
-SHOWN_LINES = 4
-"""Largest lines that the printed table names."""
 
 Array = np.ndarray
 
@@ -137,9 +132,11 @@ def _lines(motions: Sequence[Motion], place: int, options: SpectrumOptions) -> l
 
 def _average(motion: Motion, place: int, options: SpectrumOptions) -> dict[str, Any]:
     """Average periodograms of a long trajectory; samples are doubled until almost no power folds back."""
+    # samples per drive period or return of a motion that does not close: at first, and at most
+    fewest, most = 128, 2048
     rate = clock_of(motion)
     n_periods = -(-options.segment * (options.averages + 1) // 2)
-    n_samples = max(FEWEST, 1 << (8 * options.orders - 1).bit_length())
+    n_samples = max(fewest, 1 << (8 * options.orders - 1).bit_length())
     while True:
         values = sampled(motion, rate, n_periods, n_samples, place)
         if values is None:
@@ -148,7 +145,7 @@ def _average(motion: Motion, place: int, options: SpectrumOptions) -> dict[str, 
         found = averaged([values], rate * n_samples, nperseg=options.segment * n_samples, **settings)
         high = found.power[len(found.power) // 2 :].sum()
         too_long = 2 * n_samples * n_periods * len(motion.state) > 8 * AT_ONCE
-        if high <= FOLDED * found.power.sum() or 2 * n_samples > MOST or too_long:
+        if high <= FOLDED * found.power.sum() or 2 * n_samples > most or too_long:
             return _row(motion, found, values, rate, n_samples, options)
         n_samples *= 2
 
@@ -250,11 +247,12 @@ def spectrum_table(ds: xr.Dataset) -> Table:
 
 
 def _words(one: xr.Dataset, head: Row) -> Words:
+    most = 4  # lines, the largest ones, that the printed table names
     column, unit = ("order", "") if "order" in one.coords else ("frequency_hz", " Hz")
     is_average = head.get("estimate", "average") == "average"
     values = np.nan_to_num(one["power" if is_average else "amplitude"].values)
     places = signal.find_peaks(values, distance=3)[0] if is_average else np.flatnonzero(values)
-    best = places[np.argsort(-values[places], kind="stable")][:SHOWN_LINES]
+    best = places[np.argsort(-values[places], kind="stable")][:most]
     largest = ", ".join(f"{values[k]:.4g} at {float(one[column][k]):.5g}{unit}" for k in best)
 
     def told(name: str, form: str) -> str | None:

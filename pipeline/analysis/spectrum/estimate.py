@@ -17,14 +17,9 @@ from pipeline.layout.columns import described
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import told_by
 
-UNEVEN = 0.01
-"""Largest deviation of a sampling interval from their median, as a share of it, at which a series counts as even."""
-
 LOBE = 4
 """Half width of a line in bins, of the window by which lines are told apart (Blackman-Harris, side lobes at -92 dB)."""
 
-MOST_FIRST, MOST_SECOND = 12, 6
-"""Largest multiples of the two frequencies of a torus in its lines."""
 
 ALL = 0.99
 """Share of the power in combinations of two frequencies from which on a motion is said to have these two."""
@@ -99,6 +94,7 @@ def frequencies_of(values: Array, rate_hz: float, drive_hz: float | None = None)
     that is no multiple of the first. It is known up to its sign and multiples of the first. Both maximise the
     transform of the whole series with a Blackman-Harris window. Samples are even, over many periods of both.
     """
+    most_first, most_second = 12, 6  # largest multiples of the two frequencies of a torus in its lines
     n = len(values)
     weighted = (values - values.mean()) * signal.get_window("blackmanharris", n)
     power = np.abs(np.fft.rfft(weighted)) ** 2
@@ -107,7 +103,7 @@ def frequencies_of(values: Array, rate_hz: float, drive_hz: float | None = None)
     rest = np.where(_near(len(power), n / rate_hz * first * np.arange(1, n)), 0.0, power)
     second = _peak(weighted, rate_hz, rest)
     multiples = np.add.outer(
-        first * np.arange(-MOST_FIRST, MOST_FIRST + 1), second * np.arange(-MOST_SECOND, MOST_SECOND + 1)
+        first * np.arange(-most_first, most_first + 1), second * np.arange(-most_second, most_second + 1)
     )
     inside = _near(len(power), n / rate_hz * np.abs(multiples).ravel())
     return Frequencies(first, second, float(power[inside].sum() / power.sum()))
@@ -273,6 +269,8 @@ def pieces_of(ds: xr.Dataset, channel: str) -> tuple[str, list[Array], float]:
 
 def _stretches(ds: xr.Dataset, channel: str) -> _Stretches:
     """Divide a channel (by default the first) at its gaps; raise ValueError unless samples are even."""
+    # largest deviation of a sampling interval from their median, as a share of it, at which a series counts as even
+    uneven = 0.01
     names = [str(name) for name, v in ds.data_vars.items() if v.ndim == 1 and v.dims == ds["time"].dims]
     channel = channel or names[0]
     if channel not in names:
@@ -286,7 +284,7 @@ def _stretches(ds: xr.Dataset, channel: str) -> _Stretches:
         raise ValueError(f"channel {channel!r} has no two samples in a row.")
     steps = np.concatenate([np.diff(time[part]) for part in stretches])
     step = float(np.median(steps))
-    if (np.abs(steps - step) > UNEVEN * step).any():
+    if (np.abs(steps - step) > uneven * step).any():
         raise ValueError(
             f"the samples of {channel} are {steps.min():.6g} to {steps.max():.6g} s apart, and a spectrum needs even "
             "ones: interpolate the series first."

@@ -27,21 +27,6 @@ from pipeline.plots.figure import frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.results.run import OpenRun
 
-MOST_PANELS = 6
-"""Most spectra of one point that are drawn: those of the largest shares."""
-
-DECADES_OF_LINES, DECADES_OF_POWER = 6.0, 11.0
-"""Decades below the largest value that are drawn: further down are errors of the integration."""
-
-DECADES_OF_COLOURS = 3.0
-"""Decades that the colours of a waterfall span."""
-
-ROWS = 720
-"""Rows of the image of a waterfall."""
-
-MOST_NAMED, MOST_NAMES, APART = 3, 6, (0.055, 0.07)
-"""Of a torus: largest sum of multiples in the name of a line, number of names, their least distances on the axes."""
-
 
 @style.drawn
 def plot_spectrum(
@@ -57,7 +42,7 @@ def plot_spectrum(
     Parameters
     ----------
     ds
-        From the analysis ``spectrum`` or from `magpend.spectrum_of`; the `MOST_PANELS` rows of the largest share are
+        From the analysis ``spectrum`` or from `magpend.spectrum_of`; the 6 rows of the largest share are
         drawn.
     axis
         ``order`` or ``Hz``; by default orders where the dataset has them.
@@ -78,12 +63,13 @@ def plot_spectrum(
     ValueError
         If nothing could be measured, or orders are asked for without a drive.
     """
+    most = 6  # spectra of one point that are drawn: those of the largest shares
     looks = looks or [("black", "")] * ds.sizes["spectrum"]
     good = [i for i in range(ds.sizes["spectrum"]) if "estimate" not in ds or int(ds["estimate"][i]) != NONE]
     if not good:
         raise ValueError("no spectrum could be measured: every trajectory failed.")
     if "share" in ds:
-        good = sorted(sorted(good, key=lambda i: -np.nan_to_num(float(ds["share"][i])))[:MOST_PANELS])
+        good = sorted(sorted(good, key=lambda i: -np.nan_to_num(float(ds["share"][i])))[:most])
     data = ds.isel(spectrum=good)
     column = _column(ds, axis)
     measure = _measure(ds, degrees)
@@ -146,6 +132,8 @@ def _measure(ds: xr.Dataset, degrees: bool) -> Measure:
 
 
 def _draw_one(ax: Axes, one: xr.Dataset, column: str, measure: Measure, colour: str) -> None:
+    # decades below the largest value that are drawn: further down are errors of the integration
+    of_lines, of_power = 6.0, 11.0
     is_lines = "estimate" in one and int(one["estimate"]) == LINES
     x = one[column].values
     y = one["amplitude"].values * measure.factor if is_lines else one["power"].values * measure.factor**2
@@ -153,13 +141,13 @@ def _draw_one(ax: Axes, one: xr.Dataset, column: str, measure: Measure, colour: 
     x, y = x[there], y[there]
     ax.set_yscale("log")
     if is_lines:
-        low = max(y.max(initial=0.0) * 10.0**-DECADES_OF_LINES, 10.0 * float(one["error"])) if len(y) else 1e-6
+        low = max(y.max(initial=0.0) * 10.0**-of_lines, 10.0 * float(one["error"])) if len(y) else 1e-6
         x, y = x[y > low], y[y > low]
         ax.vlines(x, low, y, color=colour, linewidth=1.1, gid="lines")
         style.points(ax, x, y, 3.4, colour, gid="tops")
         what, unit = "amplitude", measure.unit
     else:
-        low = y.max(initial=1e-12) * 10.0**-DECADES_OF_POWER
+        low = y.max(initial=1e-12) * 10.0**-of_power
         ax.plot(x, y, color=colour, linewidth=0.8, gid="power")
         scaling = str(one.attrs["scaling"])
         what, unit = "density" if scaling == "density" else "power", power_unit(measure.unit, scaling)
@@ -193,6 +181,7 @@ def _resolution(one: xr.Dataset, column: str) -> str:
 
 def _name_lines(ax: Axes, one: xr.Dataset, column: str) -> None:
     """Name the largest lines of a torus by its two frequencies, such as 2f - f2, where the names do not collide."""
+    most_names, apart = 6, (0.055, 0.07)  # largest number of names, and their least distances on the axes
     if "second_hz" not in one or not np.isfinite(float(one["second_hz"])):
         return
     x, y = np.asarray(ax.get_lines()[0].get_xydata()).T
@@ -204,8 +193,8 @@ def _name_lines(ax: Axes, one: xr.Dataset, column: str) -> None:
     for peak in peaks[np.argsort(-level[peaks])]:
         name = next((text for place, text in names if abs(place - x[peak]) <= x[1] - x[0]), "")
         spot = (x[peak] - left) / (right - left), (level[peak] - low) / (high - low)
-        free = all(abs(spot[0] - a) > APART[0] or abs(spot[1] - b) > APART[1] for a, b in taken)
-        if name and free and 0.03 < spot[0] < 0.97 and len(taken) < MOST_NAMES:
+        free = all(abs(spot[0] - a) > apart[0] or abs(spot[1] - b) > apart[1] for a, b in taken)
+        if name and free and 0.03 < spot[0] < 0.97 and len(taken) < most_names:
             taken.append(spot)
             look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom"}
             ax.annotate(
@@ -215,9 +204,10 @@ def _name_lines(ax: Axes, one: xr.Dataset, column: str) -> None:
 
 def _names(one: xr.Dataset, column: str) -> list[tuple[float, str]]:
     """Return places and names of the combinations of the two frequencies of a torus, the simplest first."""
+    largest = 3  # sum of multiples in the name of a line of a torus
     first, second = float(one["first_hz"]), float(one["second_hz"])
     unit = first if column == "order" else 1.0
-    both = [(m, n) for m in range(-MOST_NAMED, MOST_NAMED + 1) for n in range(-MOST_NAMED, MOST_NAMED + 1)]
+    both = [(m, n) for m in range(-largest, largest + 1) for n in range(-largest, largest + 1)]
     both.sort(key=lambda one: abs(one[0]) + abs(one[1]))
     places = [((m * first + n * second) / unit, _combination(m, n)) for m, n in both]
     return [(place, name) for place, name in places if place > 0.0]
@@ -259,6 +249,7 @@ def plot_waterfall(
     ValueError
         If nothing could be measured, there is not one axis, or orders are asked for without a drive.
     """
+    decades = 3.0  # that the colours span
     swept = [name for name in axes_of(ds) if len(np.unique(ds[name])) > 1]
     if len(swept) != 1:
         raise ValueError(f"a waterfall is drawn along one axis, and the spectra have {', '.join(swept) or 'none'}.")
@@ -276,7 +267,7 @@ def plot_waterfall(
     ax = fig.add_subplot()
     style.style_axes(ax, inside=False)
     brightest = float(np.nanmax(image))
-    low = brightest * 10.0 ** -(DECADES_OF_COLOURS * (2 if is_density else 1))
+    low = brightest * 10.0 ** -(decades * (2 if is_density else 1))
     norm = LogNorm(low, brightest)
     shown = np.ma.masked_invalid(np.where(image < low, np.nan, image))
     ramp = colormaps[rcParams["image.cmap"]].reversed()  # faint values are light, as the paper beside them
@@ -320,9 +311,10 @@ def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str, top: float)
     """Return places on the vertical axis up to `top`, and the colour of each at each parameter value; NaN where there
     is none.
     """
+    n_rows = 720  # rows of the image
     bins = data[column].values
-    y = (np.arange(ROWS) + 0.5) * top / ROWS
-    image = np.full((ROWS, len(x)), np.nan)
+    y = (np.arange(n_rows) + 0.5) * top / n_rows
+    image = np.full((n_rows, len(x)), np.nan)
     is_density = str(data.attrs["scaling"]) == "density"
     for k in range(data.sizes["spectrum"]):
         one = data.isel(spectrum=k)
@@ -339,10 +331,10 @@ def _image(data: xr.Dataset, along: str, x: np.ndarray, column: str, top: float)
         amplitude = one["amplitude"].values[: len(own)]
         shown = 0.5 * amplitude**2 / float(one["bandwidth_hz"]) if is_density else amplitude
         # of equal orders the same, in spite of rounding
-        rows = np.floor(own / top * ROWS + 1e-6).astype(int)
-        rows, shown = rows[rows <= ROWS], shown[rows <= ROWS]
+        rows = np.floor(own / top * n_rows + 1e-6).astype(int)
+        rows, shown = rows[rows <= n_rows], shown[rows <= n_rows]
         for thick in (-1, 0, 1):
-            near = np.clip(rows + thick, 0, ROWS - 1)
+            near = np.clip(rows + thick, 0, n_rows - 1)
             image[near, place] = np.fmax(image[near, place], shown)
     return y, image
 

@@ -38,12 +38,6 @@ if TYPE_CHECKING:
 MOST_VALUES = 40
 """Most values of the swept number that are listed one by one."""
 
-MOST_STEPS = 60
-"""Most bisections; float64 has 53 binary digits."""
-
-MOST_KNOWN = 3
-"""Cells of each attractor that go on beside those that are examined."""
-
 
 def needs_drift(run: OpenRun, options: TippingOptions) -> None:
     """Raise ValueError unless the run's parameters come to rest before it ends."""
@@ -309,12 +303,13 @@ class Bisection:
 
     def run_all(self, brackets: list[Bracket]) -> list[Bracket]:
         """Return the brackets, halved until they are narrow enough or cannot be decided."""
+        most_steps = 60  # most bisections; float64 has 53 binary digits
         found = list(brackets)
-        for step in range(MOST_STEPS):
+        for step in range(most_steps):
             open_ = [i for i, b in enumerate(found) if self._is_open(b)]
             if not open_:
                 break
-            report("bisecting", step, MOST_STEPS)
+            report("bisecting", step, most_steps)
             for i, outcome in zip(open_, self._outcomes([found[i] for i in open_]).tolist(), strict=True):
                 found[i] = found[i].halved(outcome)
         return found
@@ -361,10 +356,11 @@ class Bisection:
 
 def _examples(group: Group, ids: dict[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return states on each attractor of a group, and the attractors' numbers."""
+    most = 3  # cells of each attractor that go on beside those that are examined
     states, labels = [np.zeros((0, group.settled.shape[1]))], []
     own = group.outcome[np.searchsorted(group.cells, group.integrated)]
     for local, number in ids.items():
-        chosen = np.flatnonzero(own == local)[:MOST_KNOWN]
+        chosen = np.flatnonzero(own == local)[:most]
         states.append(group.settled[chosen])
         labels += [number] * len(chosen)
     return np.concatenate(states), np.array(labels, np.int64)

@@ -20,7 +20,6 @@ from pipeline.plots import labels, style
 from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.results.run import OpenRun
 
-DARKEST, LIGHTEST = 0.0, 0.85
 BELOW = "0.72"
 MOST_DOTS = 200_000
 """Most dots of a vector file that are not pixels."""
@@ -87,7 +86,8 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> tuple[
 
 def _ramp() -> ListedColormap:
     """Return the colours from the least to the largest value, without the lightest, which would be faint on white."""
-    return ListedColormap(colormaps[rcParams["image.cmap"]](np.linspace(DARKEST, LIGHTEST, 256)))
+    darkest, lightest = 0.0, 0.85
+    return ListedColormap(colormaps[rcParams["image.cmap"]](np.linspace(darkest, lightest, 256)))
 
 
 def _colours(part: xr.Dataset, swept: list[str]) -> list[str]:

@@ -39,13 +39,6 @@ MOST_SETS = 16
 MODES = 8
 """Slow eigenvalues that are kept."""
 
-PAIRS_IN_BOX = 25
-UNITS = 50
-"""Least number of resampled units; fewer cells are cut into stretches."""
-
-MANY_UNKNOWN = 0.01
-"""Share of pairs that end in boxes without a pair, above which the table warns."""
-
 
 def needs_pairs(run: OpenRun, options: TransferOptions) -> None:
     """Raise ValueError unless the run is a sweep with pairs of sections, and the options name its states."""
@@ -81,12 +74,13 @@ def pairs_of(run: OpenRun, cells: PointCells, columns: Sequence[int]) -> Pairs:
 
     A cell that diverged has no sections, and counts only if it did so in its first step.
     """
+    units = 50  # least number of resampled units; fewer cells are cut into stretches
     section = cells.section
     if _has_starts(run):
         section = np.concatenate([inputs_at(run, cells).initial_states[:, None], section], axis=1)
     before, after = section[:, :-1], section[:, 1:]
     n_cells, n = before.shape[:2]
-    parts = max(1, -(-UNITS // n_cells))
+    parts = max(1, -(-units // n_cells))
     unit = np.arange(n_cells)[:, None] * parts + np.arange(n) * parts // n
     known = np.isfinite(before).all(axis=2)
     known &= np.isfinite(after).all(axis=2) | (cells.n_periods == 1)[:, None]
@@ -95,6 +89,7 @@ def pairs_of(run: OpenRun, cells: PointCells, columns: Sequence[int]) -> Pairs:
 
 def grid_of(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options: TransferOptions) -> Grid:
     """Return even boxes over the range of all states, or over that of the options."""
+    each = 25  # mean number of pairs in a box of the default grid
     both = np.concatenate([pairs.before, pairs.after])
     low, high = (np.array([f(both[:, i]) for i in range(len(names))]) for f in (np.nanmin, np.nanmax))
     circle = np.array(angles)
@@ -103,7 +98,7 @@ def grid_of(pairs: Pairs, names: Sequence[str], angles: Sequence[bool], options:
     low, high = np.where(free, -np.pi, low - margin), np.where(free, np.pi, high + margin)
     for k, name in enumerate(names):
         low[k], high[k] = options.low.get(name, low[k]), options.high.get(name, high[k])
-    bins = options.bins or max(2, int((len(pairs.before) / PAIRS_IN_BOX) ** (1.0 / len(names))))
+    bins = options.bins or max(2, int((len(pairs.before) / each) ** (1.0 / len(names))))
     return Grid(low, high, np.full(len(names), bins), circle)
 
 
@@ -337,6 +332,7 @@ def transfer_table(ds: xr.Dataset) -> Table:
 
 
 def _summary(one: xr.Dataset, n: int) -> str:
+    many = 0.01  # share of pairs that end in boxes without a pair, above which the table warns
     pairs, boxes, closed = (int(one[name]) for name in ("n_pairs", "n_boxes", "n_closed"))
     text = f"{pairs} pairs in {boxes} boxes; "
     if not n:
@@ -346,7 +342,7 @@ def _summary(one: xr.Dataset, n: int) -> str:
         real, imaginary = (float(one[name].values[1]) for name in ("eigenvalue", "eigenvalue_imaginary"))
         text += f", second eigenvalue {complex(real, imaginary) if imaginary else real:.4g}"
     for name, words in (("outside", "leave the grid"), ("unknown", "end in boxes that no pair leaves")):
-        if float(one[name]) > (MANY_UNKNOWN if name == "unknown" else 0.0):
+        if float(one[name]) > (many if name == "unknown" else 0.0):
             text += f"; {100 * float(one[name]):.2g} % of pairs {words}"
     return text
 

@@ -18,9 +18,6 @@ from pipeline.results.ragged import N_POINTS, SAMPLE, SET, isel
 from pipeline.results.run import OpenRun
 from pipeline.results.selection import place
 
-_DECADES = 3.0
-"""Range of the densities that are told apart, below the highest of a set."""
-
 
 @style.drawn
 def plot_transfer(
@@ -80,10 +77,11 @@ def _colour(k: int) -> str:
 
 def _shades(part: xr.Dataset, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return how strong the colour of each box is in the left and in the right panel, between 0 and 1."""
+    decades = 3.0  # range of the densities that are told apart, below the highest of a set
     density = part["density"].values
     top = np.array([density[own == k].max(initial=1e-300) for k in range(part.sizes[SET])])[own]
     with np.errstate(divide="ignore"):
-        strong = np.clip(1.0 + np.log10(density / top) / _DECADES, 0.0, 1.0)
+        strong = np.clip(1.0 + np.log10(density / top) / decades, 0.0, 1.0)
     strong = np.where(part["is_core"].values > 0, 1.0, 0.75 * strong)
     return strong, part["committor"].values
 

@@ -23,9 +23,6 @@ OUTSIDE = -1
 FEW_BOXES = 400
 """Chains of at most so many boxes are solved as dense matrices."""
 
-NEAR_ONE = 1.0 + 1e-6
-"""Eigenvalues are sought next to this number: at 1 itself the shifted matrix is singular."""
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -163,13 +160,14 @@ def leading_eigenvalue(p: csr_array) -> float:
 
 def slow_eigenvalues(p: csr_array, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the k eigenvalues next to 1 and their right eigenvectors, the nearest first; fewer if there are fewer."""
+    near_one = 1.0 + 1e-6  # eigenvalues are sought next to this number: at 1 itself the shifted matrix is singular
     n = p.shape[0]
     if n <= max(FEW_BOXES, k + 2):
         values, vectors = np.linalg.eig(p.toarray())
     else:
         start = np.ones(n)
         start[::2] = 0.5  # not an eigenvector of a stochastic matrix
-        values, vectors = eigs(csc_array(p), k=k, sigma=NEAR_ONE, v0=start)
+        values, vectors = eigs(csc_array(p), k=k, sigma=near_one, v0=start)
     order = np.argsort(np.abs(values - 1.0), kind="stable")[:k]
     return values[order], vectors[:, order]
 

@@ -117,7 +117,7 @@ def test_zero_one_test__oversampling_hides_chaos_and_is_flagged():
 def test_zero_one_test__does_not_depend_on_neighbours_or_blocks(monkeypatch):
     section = np.concatenate([henon(5, 250)[..., :1], logistic([3.5, 3.6], 250)])
     whole = zero_one_test(cube(section), geometry=LINE)
-    monkeypatch.setattr("pipeline.analysis.chaos.zero_one.BUDGET", 1)
+    monkeypatch.setattr("pipeline.analysis.chaos.zero_one.STEP_BYTES", 1)
     alone = zero_one_test(cube(section), geometry=LINE)
     xr.testing.assert_allclose(whole, alone, rtol=1e-9)
     named = zero_one_test(cube(henon(1, 250)), state="x1", geometry=PLANE)

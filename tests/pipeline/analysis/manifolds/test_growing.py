@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.manifolds.growing import (
-    MOST_GENERATIONS,
     Manifold,
     Resolution,
     Saddle,
@@ -204,7 +203,7 @@ def test_manifold__ends_where_points_are_too_many_or_too_few() -> None:
     slow = linear([[1.05, 0.0], [0.0, STABLE]])
     curve = unstable_manifold(slow, 1.0, Resolution(chord=0.1, length=1.0))
     assert curve.end == "generations"
-    assert np.abs(curve.points[-1, 0]) == pytest.approx(1e-5 * 1.05**MOST_GENERATIONS, rel=1e-9)
+    assert np.abs(curve.points[-1, 0]) == pytest.approx(1e-5 * 1.05**Resolution.most_generations, rel=1e-9)
 
 
 def test_manifold__ends_where_the_map_does() -> None:
