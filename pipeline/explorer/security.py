@@ -16,7 +16,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-TOKEN_BYTES = 32
 TOKEN_HEADERS = ("Authorization", "X-Magpend-Token")
 _SCHEME = "token "
 
@@ -26,7 +25,8 @@ FROM_HERE = ("same-origin", "none")
 
 def new_token() -> str:
     """Return a new random token that gives access to the page."""
-    return secrets.token_urlsafe(TOKEN_BYTES)
+    n_bytes = 32
+    return secrets.token_urlsafe(n_bytes)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import xarray as xr
 from magpend_core import Status
 from magpend_core.models.model import Model
 from pipeline.analysis.tipping.declaration import TippingOptions
-from pipeline.analysis.tipping.endings import NONE, Final, Group, endings, ends_s, finals_of
+from pipeline.analysis.tipping.endings import UNKNOWN_END, Final, Group, endings, ends_s, finals_of
 from pipeline.layout.cells import CellMap, initial_states
 from pipeline.layout.vocabulary import (
     axis_name,
@@ -66,7 +66,7 @@ def tipping(run: OpenRun, options: TippingOptions) -> xr.Dataset:
     run.echo(f"tipping: going on at the final parameters for {options.settle + options.keep} periods")
     groups = list(endings(run, finals_of(run.spec, packed, frequency), last, status, options))
     ids, table = _numbered(groups)
-    outcome = np.full(len(status), NONE)
+    outcome = np.full(len(status), UNKNOWN_END)
     for group, own in zip(groups, ids, strict=True):
         outcome[group.cells] = [own.get(int(o), int(o)) for o in group.outcome]
     outcome = outcome.reshape(shape)
@@ -157,7 +157,7 @@ def _of_brackets(brackets: list[Bracket], others: tuple[str, ...], model: Model)
 
 def outcome_word(outcome: int) -> str:
     """Return the name of an outcome: a letter, diverged, or not decided."""
-    return {DIVERGED: "diverged", NONE: "not decided"}.get(outcome) or letter(outcome)
+    return {DIVERGED: "diverged", UNKNOWN_END: "not decided"}.get(outcome) or letter(outcome)
 
 
 def tipping_table(ds: xr.Dataset) -> Table:
@@ -265,7 +265,7 @@ class Bracket:
     def halved(self, outcome: int) -> Bracket:
         """Return the half at whose ends the outcomes differ, the lower one if both do, by the outcome in the middle."""
         n = self.n_evaluated + 1
-        if outcome == NONE:
+        if outcome == UNKNOWN_END:
             return replace(self, n_evaluated=n, is_decided=False)
         if outcome == self.outcome_low:
             return replace(self, low=self.middle, n_evaluated=n)
@@ -273,8 +273,8 @@ class Bracket:
 
 
 def brackets_of(outcomes: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of indices of neighbouring known outcomes that differ; `NONE` is not known."""
-    known = np.flatnonzero(outcomes != NONE)
+    """Return the pairs of indices of neighbouring known outcomes that differ; `UNKNOWN_END` is not known."""
+    known = np.flatnonzero(outcomes != UNKNOWN_END)
     return [(a, b) for a, b in pairwise(known.tolist()) if outcomes[a] != outcomes[b]]
 
 
@@ -336,7 +336,7 @@ class Bisection:
 
     def _compared(self, finals: list[Final], states: np.ndarray, status: np.ndarray) -> np.ndarray:
         """Return the known attractors on which cells end; cells of each known attractor go on beside them."""
-        outcome = np.full(len(finals), NONE)
+        outcome = np.full(len(finals), UNKNOWN_END)
         outcome[status == Status.DIVERGED] = DIVERGED
         keys = [final.key for final in finals]
         for key in dict.fromkeys(keys):
@@ -350,7 +350,7 @@ class Bisection:
             (group,) = endings(self.run, [final] * len(both), both, codes, self.options)
             names = {int(o): int(label) for o, label in zip(group.outcome[:n], labels, strict=True) if o >= 0}
             names[DIVERGED] = DIVERGED
-            outcome[own] = [names.get(int(o), NONE) for o in group.outcome[n:]]
+            outcome[own] = [names.get(int(o), UNKNOWN_END) for o in group.outcome[n:]]
         return outcome
 
 

@@ -23,7 +23,7 @@ from pipeline.specification.spec import Spec
 
 GOOD = (Status.PERIODIC, Status.BOUNDED)
 
-NONE = -1
+UNKNOWN_END = -1
 """Outcome of a cell that ends on no known attractor."""
 
 
@@ -67,7 +67,7 @@ class Group:
     ids: xr.Dataset | None  # result of `identify`; its cells are those that were integrated on
     integrated: np.ndarray  # their numbers
     settled: np.ndarray  # (len(integrated), n_states): their states after the integration
-    outcome: np.ndarray  # int, (len(cells),): attractors' ids in `ids`, `DIVERGED`, or `NONE`
+    outcome: np.ndarray  # int, (len(cells),): attractors' ids in `ids`, `DIVERGED`, or `UNKNOWN_END`
 
 
 def endings(
@@ -82,7 +82,7 @@ def endings(
         cells = np.flatnonzero([k == key for k in keys])
         final = finals[cells[0]]
         going = cells[np.isin(status[cells], GOOD)]
-        outcome = np.where(status[cells] == Status.DIVERGED, DIVERGED, NONE)
+        outcome = np.where(status[cells] == Status.DIVERGED, DIVERGED, UNKNOWN_END)
         ids, settled = None, np.zeros((0, states.shape[1]))
         if len(going):
             cube = _going_on(run, final, states[going], options)

@@ -30,8 +30,6 @@ from pipeline.specification.problems import SpecError, unknown_name
 MOST_PLACES = 4000
 """Answers of a kind that a copy holds, one for each place of the axes."""
 
-BLOCK_BYTES = 1_000_000
-"""Answers lie together in objects of about so many bytes before compression."""
 
 Place = dict[str, int]
 
@@ -132,6 +130,7 @@ def _answers(copied: Copied, kind: str, alike: bool) -> None:
 
     If they are all alike, such as how to compute what is missing, the first stands for all.
     """
+    each = 1_000_000  # answers lie together in objects of about so many bytes before compression
     asked = list(itertools.islice(_requests(copied, kind), 1 if alike else MOST_PLACES + 1))
     if alike:
         copied.about["answers"][kind] = {"blocks": {}, "missing": "", "alike": asked[0][1]()}
@@ -148,7 +147,7 @@ def _answers(copied: Copied, kind: str, alike: bool) -> None:
         held[key] = answer()
         blocks[key] = number
         size += len(json.dumps(held[key]))
-        if size > BLOCK_BYTES:
+        if size > each:
             copied.objects[f"{kind}-{number}"] = zip_json(held)
             held, number, size = {}, number + 1, 0
     if held:

@@ -28,11 +28,6 @@ from pipeline.store.files import CUBE, entry_of
 from pipeline.store.local import refuse_place, remove_tree, unwritable
 from pipeline.store.run import RunDirectory
 
-MOST_PAGE_BYTES = 20_000_000
-"""Size of a copy in one file: beyond some 20 to 30 MB, browsers have trouble with a page."""
-
-MOST_ORBITS = 2000
-
 ORBITS_SHARE, PLANES_SHARE = 0.25, 0.15
 """What orbits and planes may take of a copy in one file."""
 
@@ -56,8 +51,8 @@ def export_page(
     *,
     force: bool = False,
     quantities: Sequence[str] = (),
-    most_orbits: int = MOST_ORBITS,
-    most_bytes: int = MOST_PAGE_BYTES,
+    most_orbits: int = 2000,
+    most_bytes: int = 20_000_000,
 ) -> Exported:
     """Write the interactive page of a run as one HTML file.
 
@@ -185,17 +180,9 @@ INDEX, LIST, DATA, LICENCES = "index.html", "objects.json", "data", "LICENSES.tx
 QUANTITY = "quantity_"
 """What the names of quantities in the cube begin with."""
 
-MOST_FOLDER_BYTES = 500_000_000
-"""What orbits, and planes, may take of a folder each."""
-
 
 def export_folder(
-    source: RunDirectory,
-    out: Path,
-    *,
-    force: bool = False,
-    quantities: Sequence[str] = (),
-    most_orbits: int = MOST_ORBITS,
+    source: RunDirectory, out: Path, *, force: bool = False, quantities: Sequence[str] = (), most_orbits: int = 2000
 ) -> Exported:
     """Write the interactive page of a run, and its data, as a folder that any static web host can serve.
 
@@ -254,10 +241,11 @@ def check_folder(out: Path, force: bool) -> None:
 
 
 def _write_folder(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbits: int) -> Exported:
+    most_bytes = 500_000_000  # of what orbits, and planes, may take of a folder each
     copied = gather(run, quantities)
     columns, codes = read_columns(copied)
-    add_planes(copied, MOST_FOLDER_BYTES)
-    orbits = add_all_orbits(copied, columns, codes, Room(most_orbits, MOST_FOLDER_BYTES, brief=False))
+    add_planes(copied, most_bytes)
+    orbits = add_all_orbits(copied, columns, codes, Room(most_orbits, most_bytes, brief=False))
     layers = _layers_of(copied, codes)
     for name in columns:
         if name in quantities:

@@ -25,12 +25,6 @@ BLOCK = 32
 SERIES = ("time", "states", "quantities", "drawing")
 """Arrays of an orbit that run over time."""
 
-BRIEF_PERIODS = 5
-"""Periods that a page shows of a motion that does not close."""
-
-SAMPLE = 6
-"""Orbits by which the size of all is judged."""
-
 
 @dataclass(frozen=True)
 class Room:
@@ -150,7 +144,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
 
 
 def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -> float:
-    some = chosen.cells[:: max(1, len(chosen.cells) // SAMPLE)][:SAMPLE]
+    n_orbits = 6  # by which the size of all is judged
+    some = chosen.cells[:: max(1, len(chosen.cells) // n_orbits)][:n_orbits]
     sizes = []
     for cell in some.tolist():
         arrays, attrs = _orbit(copied.run, cell, count, room)
@@ -174,8 +169,9 @@ def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[
 
 def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarray]:
     """Shorten an orbit that does not close to its first periods, at every second instant."""
-    sections = arrays["section_times"][: BRIEF_PERIODS + 1]
-    if closed or len(sections) <= BRIEF_PERIODS:
+    n_periods = 5  # that a page shows of a motion that does not close
+    sections = arrays["section_times"][: n_periods + 1]
+    if closed or len(sections) <= n_periods:
         return dict(arrays)
     n = int(np.searchsorted(arrays["time"], sections[-1], side="right"))
     series = {name: values[:n:2] for name, values in arrays.items() if name in SERIES}

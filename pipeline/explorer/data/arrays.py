@@ -21,11 +21,10 @@ import numpy as np
 DTYPES = ("float64", "float32", "int32", "uint32", "int16", "uint16", "int8", "uint8")
 """What a browser has typed arrays for; 64-bit integers are not among them."""
 
-_ALIGNMENT = 8
-
 
 def _padding(length: int) -> int:
-    return -length % _ALIGNMENT
+    alignment = 8
+    return -length % alignment
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
@@ -62,10 +61,6 @@ def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, header["attrs"]
 
 
-GZIP_LEVEL = 6
-"""Of gzip: beyond it, data of this kind shrink by less than a percent."""
-
-
 def pack_zipped(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
     """Pack arrays and attributes as `pack_arrays` does, and compress them by gzip."""
     apart: dict[str, dict[str, Any]] = {}
@@ -86,5 +81,6 @@ def zip_json(value: Any) -> bytes:
 
 
 def _zipped(content: bytes) -> bytes:
+    level = 6  # beyond it, data of this kind shrink by less than a percent
     # no time stamp, so that equal content gives equal bytes
-    return gzip.compress(content, GZIP_LEVEL, mtime=0)
+    return gzip.compress(content, level, mtime=0)

@@ -20,11 +20,9 @@ if TYPE_CHECKING:
 
     from pipeline.explorer.data.explored import ExploredRun
 
-NONE = 65535
+NO_CODE = 65535
 """Code of a cell that has none."""
 
-MOST_SEEDS = 64
-"""Initial states that are told apart by colour: more could not be."""
 
 _DIRECTIONS = ("up", "down")
 
@@ -119,11 +117,12 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
 
 def _seeds(run: ExploredRun) -> Iterator[Scheme]:
     """Yield the colour scheme by initial state, if there are few initial states."""
+    most = 64  # initial states that are told apart by colour: more could not be
     cube, dims = run.cube(), run.start_dims
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in dims]
     walked = BRANCH in dims
     count = int(cube["seed"].max()) + 1 if walked else int(np.prod(sizes, dtype=np.int64))
-    if not 2 <= count <= MOST_SEEDS:
+    if not 2 <= count <= most:
         return
     n_colours = len(palette.COLOURS)
     categories = tuple(Category(k, f"start {k}", rgb(palette.COLOURS[k % n_colours])) for k in range(count))

@@ -1,7 +1,7 @@
 """Read the points of a bifurcation diagram: the section points of the cells along one axis.
 
 The cube is read block by block in the chunks of the store, each compared with its sha256; what stays in
-memory is one number per point. A diagram of more than `MOST_POINTS` shows the last sections of each cell, as
+memory is one number per point. A diagram of too many points shows the last sections of each cell, as
 many as fit, and says so.
 """
 
@@ -16,15 +16,12 @@ import xarray as xr
 
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
-from pipeline.explorer.data.colours import NONE, Scheme, schemes
+from pipeline.explorer.data.colours import NO_CODE, Scheme, schemes
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.verticals import Vertical, vertical
 from pipeline.layout.vocabulary import PENDING
 from pipeline.plots.points import DRAWN, selections
 from pipeline.store.run import RunDirectory
-
-MOST_POINTS = 20_000_000
-"""Points of one diagram; 8 bytes each go to the page."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +38,16 @@ class Points:
     kept: int  # number of section points shown per cell, the last ones
 
 
-def diagram(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> bytes:
+def diagram(run: RunDirectory, x: str, y: str, at: Mapping[str, int], most_points: int = 20_000_000) -> bytes:
     """Return the points of a bifurcation diagram, packed for the page.
 
     `x` is a swept axis, `y` a state, a quantity of the model or a kept extreme such as ``NAME.max``, and `at` the index
-    on each other swept axis. Raise RequestError if one is not there, or the cells are too many.
+    on each other swept axis. Raise RequestError if one is not there, or the cells are more than `most_points`;
+    8 bytes of each point go to the page.
     """
     explored = ExploredRun.of(run)
     upwards = vertical(explored, y)
-    found = points(explored, x, y, at)
+    found = points(explored, x, y, at, most_points)
     arrays = {
         "x": found.x,
         "cell": found.cell,
@@ -70,18 +68,18 @@ def diagram(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> bytes:
     return pack_arrays(arrays, attrs)
 
 
-def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
+def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int], most_points: int = 20_000_000) -> Points:
     """Read the points of a bifurcation diagram; the arguments are those of `diagram`."""
     axis, upwards, place = run.axis(x), vertical(run, y), run.place(at, but=x)
     ds = _numbered(run).isel({name: slice(i, i + 1) for name, i in place.items()})
     sizes = tuple(ds.sizes[d] for d in run.plan.dims)
     n_cells = int(np.prod(sizes, dtype=np.int64))
-    if n_cells > MOST_POINTS:
+    if n_cells > most_points:
         raise RequestError(
-            f"a diagram shows {MOST_POINTS:,} cells at most, and there are {n_cells:,} here; "
+            f"a diagram shows {most_points:,} cells at most, and there are {n_cells:,} here; "
             "look at the plane of initial states, or at a zoom of the run."
         )
-    kept = max(1, min(run.n_keep, MOST_POINTS // n_cells))
+    kept = max(1, min(run.n_keep, most_points // n_cells))
     table = _Table(run, upwards, sizes, kept)
     for selection in selections(ds[upwards.variable]):
         table.read(ds, selection)
@@ -111,7 +109,7 @@ class _Table:
         self.names = [str(n) for n in run.cube().data_vars if n in names]
         self.values = np.full((*sizes, kept), np.nan)
         self.status = np.full(sizes, PENDING, np.int8)
-        self.codes = {s.name: np.full(sizes, NONE, np.uint16) for s in self.schemes}
+        self.codes = {s.name: np.full(sizes, NO_CODE, np.uint16) for s in self.schemes}
 
     def read(self, ds: xr.Dataset, selection: Mapping[str, slice]) -> None:
         block = ds[self.names].isel(selection).load()
@@ -124,7 +122,7 @@ class _Table:
         zero = xr.zeros_like(status, dtype=np.int32)
         for scheme in self.schemes:
             found = (zero + scheme.codes(block).drop_vars(list(ds.coords), errors="ignore")).transpose(*self.dims)
-            self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
+            self.codes[scheme.name][where] = np.where(found.values < 0, NO_CODE, found.values)
 
     def points(self, x: np.ndarray, cells: np.ndarray) -> Points:
         """Return all points that can be drawn, ordered along the horizontal axis."""

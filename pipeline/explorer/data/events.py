@@ -17,7 +17,7 @@ from pipeline.analysis.events.names import RANGE_END, UNDECIDED
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import finite
-from pipeline.explorer.data.overlays import SAME_VALUE
+from pipeline.explorer.data.overlays import SAME_ON_AXIS
 from pipeline.explorer.data.parameter_plane import packed_orbit
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, frequency_of, parameter_name
 from pipeline.results.outcomes import outcomes
@@ -51,7 +51,7 @@ def _kept(run: ExploredRun, x: str, place: Mapping[str, int]) -> xr.Dataset | No
         there = {axis_name(name): value for name, value in given.items()}
         values = {name: float(run.axis(name).values[i]) for name, i in place.items()}
         if str(one.attrs["parameter"]) == x and all(
-            math.isclose(there.get(name, value), value, rel_tol=SAME_VALUE) for name, value in values.items()
+            math.isclose(there.get(name, value), value, rel_tol=SAME_ON_AXIS) for name, value in values.items()
         ):
             return one
     return None
@@ -104,7 +104,7 @@ def _cells(run: ExploredRun, one: xr.Dataset, x: str, place: Mapping[str, int]) 
 
 
 def _index(values: np.ndarray, value: float) -> int | None:
-    near = np.flatnonzero(np.isclose(values, value, rtol=SAME_VALUE, atol=0.0))
+    near = np.flatnonzero(np.isclose(values, value, rtol=SAME_ON_AXIS, atol=0.0))
     return int(near[0]) if near.size else None
 
 

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MOST_LARGE = 2
-"""Diagrams that are kept in memory, of up to some 200 MB each."""
-
 
 @dataclass(frozen=True)
 class Axis:
@@ -113,12 +110,13 @@ class ExploredRun(RunDirectory):
 
     def large(self, key: str, make: Callable[[], T]) -> T:
         """Return the cached value of a key; compute it if it is not cached. The last few values stay in memory."""
+        most = 2  # diagrams that are kept in memory, of up to some 200 MB each
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:
                 last.remove(key)
             last.append(key)
-            while len(last) > MOST_LARGE:
+            while len(last) > most:
                 self._opened.pop(last.pop(0), None)
             alone = self._opened.setdefault("large alone", threading.Lock())
         with alone:

@@ -24,7 +24,7 @@ from pipeline.results.outcomes import share_interval
 from pipeline.results.ragged import dense, dims_of, isel
 from pipeline.store.run import RunDirectory
 
-SAMPLES = 128
+PER_PERIOD = 128
 """Instants per drive period or return."""
 
 
@@ -101,19 +101,13 @@ def orbit_series(
     atol: float = 1e-9,
 ) -> dict[str, np.ndarray]:
     """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
-    n = max(1, min(n_periods * parameters.model.clock.samples(SAMPLES), 65_536))
+    n = max(1, min(n_periods * parameters.model.clock.samples(PER_PERIOD), 65_536))
     times = seconds * np.arange(n + 1) / n
     return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)
 
 
-TOLERANCE = 1e-9
+ORBIT_RTOL = 1e-9
 """Relative and absolute, of what is integrated here; the run's own where that is smaller."""
-
-N_PERIODS = 10
-"""Drive periods, or returns, that are shown of a motion that does not close."""
-
-MOST_SEEDS = 200
-"""Initial states that are listed as leading to an attractor."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +157,7 @@ def orbit(run: RunDirectory, cell: int, point: int, *, linearised: bool = True) 
     RequestError if there is no such point or the run's motion has no orbits, ArithmeticError if the trajectory ends
     early.
     """
+    usual = 10  # drive periods, or returns, that are shown of a motion that does not close
     explored = ExploredRun.of(run)
     if problem := run.spec.motion.refusal("an orbit"):
         raise RequestError(f"{run.name}: {problem}")
@@ -173,9 +168,9 @@ def orbit(run: RunDirectory, cell: int, point: int, *, linearised: bool = True) 
         raise RequestError(_no_point(found, point, int(kept.sum())))
     attractor = _attractor(explored, found)
     period = found.period or attractor["period"]
-    n_periods = period or N_PERIODS
+    n_periods = period or usual
     seconds = _seconds(run, found, section[point], n_periods)
-    tolerances = {name: min(TOLERANCE, float(getattr(run.spec.integration, name))) for name in ("rtol", "atol")}
+    tolerances = {name: min(ORBIT_RTOL, float(getattr(run.spec.integration, name))) for name in ("rtol", "atol")}
     arrays = orbit_series(found.parameters, found.clock_hz, section[point], n_periods, float(seconds[-1]), **tolerances)
     arrays = {**arrays, "section": section[kept], "section_times": np.concatenate([[0.0], seconds])}
     said = _attrs(explored, found, attractor, linearised)
@@ -389,6 +384,7 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
 
     Without attractors it is the cell's own alone. Each has a value of every state, and a ``label``.
     """
+    most = 200  # initial states that are listed as leading to an attractor
     cube, found = run.cube(), run.kept("attractors")
     own = tuple(cell.index[d] for d in run.start_dims)
     chosen = [own]
@@ -396,12 +392,12 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
         number = int(found["attractor_id"].isel(cell.index))
         ids = found["attractor_id"].isel(_parameter_index(run, cell)).transpose(*run.start_dims).values
         if number >= 0:
-            others = [tuple(int(i) for i in row) for row in np.argwhere(ids == number)[: MOST_SEEDS + 1]]
+            others = [tuple(int(i) for i in row) for row in np.argwhere(ids == number)[: most + 1]]
             chosen += [row for row in others if row != own]
     columns = {s.name: _starts_of(run, grid_dim(s.name)) for s in run.model.states}
     return [
         {**{name: float(values[row]) for name, values in columns.items()}, "label": _seed_label(cube, run, row)}
-        for row in chosen[:MOST_SEEDS]
+        for row in chosen[:most]
     ]
 
 

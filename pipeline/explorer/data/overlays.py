@@ -31,7 +31,7 @@ from pipeline.results.ragged import dense, isel
 from pipeline.results.tabular import sets_of
 from pipeline.store.run import RunDirectory
 
-SAME_VALUE = 1e-9
+SAME_ON_AXIS = 1e-9
 """Largest relative difference between a value of an axis and that at which branches were followed."""
 
 MOST_SECTION = 2000
@@ -172,7 +172,7 @@ def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str,
     for name, index in place.items():
         value = float(run.axis(name).values[index])
         there = float(found[name][branch]) if name in found else _base(run, name)
-        if not math.isclose(there, value, rel_tol=SAME_VALUE, abs_tol=1e-300):
+        if not math.isclose(there, value, rel_tol=SAME_ON_AXIS, abs_tol=1e-300):
             return False
     return True
 
@@ -305,7 +305,7 @@ def _index(run: ExploredRun, found: xr.Dataset, place: Mapping[str, int]) -> dic
         if name not in found.coords:
             return None
         value = float(run.axis(name).values[i])
-        near = [math.isclose(v, value, rel_tol=SAME_VALUE, abs_tol=1e-300) for v in np.atleast_1d(found[name].values)]
+        near = [math.isclose(v, value, rel_tol=SAME_ON_AXIS, abs_tol=1e-300) for v in np.atleast_1d(found[name].values)]
         if True not in near:
             return None
         if name in found.dims:

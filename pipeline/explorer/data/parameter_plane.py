@@ -16,7 +16,7 @@ from pipeline.analysis.branches.kinds import CURVE_KINDS, HOMOCLINIC, LABELS
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.explorer.data.orbits import TOLERANCE, fixed_points, orbit_series, parts_of
+from pipeline.explorer.data.orbits import ORBIT_RTOL, fixed_points, orbit_series, parts_of
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
 from pipeline.plots.labels import swept_label
@@ -125,7 +125,7 @@ def packed_orbit(
     ends = section_map(parameters.pack()[None], np.array([clock_hz]), state[None], period, system=run.model.system)
     seconds = np.cumsum(ends.times[0])
     multipliers = np.linalg.eigvals(ends.derivatives[0])
-    arrays = orbit_series(parameters, clock_hz, state, period, float(seconds[-1]), rtol=TOLERANCE, atol=TOLERANCE)
+    arrays = orbit_series(parameters, clock_hz, state, period, float(seconds[-1]), rtol=ORBIT_RTOL, atol=ORBIT_RTOL)
     images = np.concatenate([state[None], ends.images[0, : period - 1]])
     arrays = {**arrays, "section": images, "section_times": np.concatenate([[0.0], seconds])}
     return pack_arrays(arrays, _attrs(run, parameters, clock_hz, period, multipliers, kind))

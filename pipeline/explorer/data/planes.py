@@ -14,7 +14,7 @@ from pipeline.explorer.data.explored import ExploredRun
 from pipeline.layout.vocabulary import DIVERGED, grid_dim, is_grid_dim
 from pipeline.store.run import RunDirectory
 
-NONE = -1
+NO_LABEL = -1
 """Label of a start that leads to nothing known."""
 
 _DIVERGED = -2
@@ -122,7 +122,7 @@ def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Data
 
 def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
     codes = part["_code"].values
-    told = np.where(codes < 0, NONE, codes)
+    told = np.where(codes < 0, NO_LABEL, codes)
     if scheme.name != "status":
         told = np.where(part["status"].values == DIVERGED, _DIVERGED, told)
     return part["status"].copy(data=told.astype(np.int16))

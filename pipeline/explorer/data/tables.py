@@ -29,8 +29,6 @@ from pipeline.store.run import RunDirectory
 FORMATS = {"csv": "text/csv; charset=utf-8", "nc": "application/x-netcdf"}
 """Formats by name, and what they are called in an answer."""
 
-MOST_ROWS = 2_000_000
-"""Rows of a table as CSV; what is larger is for NetCDF, or for Python."""
 
 _ROWS_AT_ONCE = 65_536
 
@@ -210,9 +208,10 @@ def _of_rows(rows: list[tuple[Any, ...]], names: tuple[str, ...]) -> xr.Dataset:
 
 
 def _csv(ds: xr.Dataset) -> bytes:
+    most = 2_000_000  # rows of a table as CSV; what is larger is for NetCDF, or for Python
     n = ds.sizes.get("row", 0)
-    if n > MOST_ROWS:
-        raise RequestError(f"{n:,} rows are too many for CSV, {MOST_ROWS:,} at most; take NetCDF.")
+    if n > most:
+        raise RequestError(f"{n:,} rows are too many for CSV, {most:,} at most; take NetCDF.")
     text = io.StringIO()
     for name, value in ds.attrs.items():
         text.write(f"# {name}: {' '.join(str(value).split())}\n")

@@ -22,7 +22,7 @@ from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import RATES
 from pipeline.store.run import RunDirectory
 
-FORMAT = 1
+VIEW_FORMAT = 1
 """Of the answers; a page refuses another one."""
 
 _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
@@ -36,7 +36,7 @@ def describe_view(run: RunDirectory, live: bool) -> dict[str, Any]:
     """
     explored = ExploredRun.of(run)
     return {
-        "format": FORMAT,
+        "format": VIEW_FORMAT,
         "title": run.info.title,
         "name": _name(run),
         "digest": run.digest,

@@ -35,15 +35,6 @@ from pipeline.results.ragged import N_IDS, dense, dims_of, isel
 from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import SAME_SECONDS, STRICT
 
-MOST_ENTRIES = 64
-"""Attractors told apart besides those of the run; what closes elsewhere is told by its period alone."""
-
-BLOCK_CELLS = 4096
-"""Cells of the run that are read at once."""
-
-SAME_REST = 1e-5
-"""Largest scaled distance between an equilibrium of the run and the same one found again."""
-
 
 @dataclass(frozen=True, eq=False)
 class Entry:
@@ -181,8 +172,9 @@ class Catalog:
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
         """Add the periodic orbits of undecided cells to the catalog, and write their catalog numbers into `numbers`."""
+        most = 64  # attractors told apart besides those of the run; what closes elsewhere is told by its period alone
         for row in np.flatnonzero(block.is_closed & (numbers < 0)):
-            if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
+            if numbers[row] >= 0 or self._n_new >= most:
                 continue
             own = block.section[row]
             period = min(int(block.orbit_period[row]), len(own))
@@ -233,8 +225,9 @@ class Catalog:
         return next(entry for entry in self.entries if entry.number == number)
 
     def _entry_near(self, kind: int, state: np.ndarray) -> Entry | None:
+        same = 1e-5  # largest scaled distance between an equilibrium of the run and the same one found again
         for entry in self.entries:
-            if entry.kind == kind and self._geometry.distance(entry.points[0], state) <= SAME_REST:
+            if entry.kind == kind and self._geometry.distance(entry.points[0], state) <= same:
                 return entry
         return None
 
@@ -284,6 +277,7 @@ class Catalog:
 
     def _point_of(self, cells: xr.Dataset | None) -> Point:
         """Return this parameter point with the run's cells there."""
+        n_cells = 4096  # of the run that are read at once
         return Point(
             xr.Dataset() if cells is None else cells,
             {},
@@ -292,7 +286,7 @@ class Catalog:
             self.place.parameters.pack(),
             self.place.parameters,
             sum(self._geometry.is_angle),
-            BLOCK_CELLS,
+            n_cells,
             self.model.system,
             has_returns=self.model.crossing is not None,
             can_rest=self.model.clock.has_equilibria,

@@ -135,16 +135,6 @@ def _pale(colour: str) -> str:
 
 LOG = logging.getLogger(__name__)
 
-MOST_CATALOGS = 64
-"""Parameter points of which the attractors are remembered."""
-
-FAR = 10.0
-"""How many times higher or lower than the run's own a drive frequency may be."""
-
-SAME_VALUE = 1e-12
-"""Relative difference at which a value is that of the cube."""
-
-MOST_THREADS = 8
 
 CLOSING_S = PATIENCE_S + 2.0
 """Time that all jobs have to end when the run is closed [s]."""
@@ -179,12 +169,13 @@ class LiveRun:
     """A run for which `live_problem` has nothing to say, with the state that all its live sessions share."""
 
     def __init__(self, run: RunDirectory) -> None:
+        most = 8
         problem = live_problem(run)
         if problem is not None:
             raise RequestError(problem)
         self.run, self.model, self.spec = ExploredRun.of(run), run.model, run.spec
         self.integration = run.spec.integration
-        self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
+        self.threads = max(1, min(os.cpu_count() or 1, most))
         self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
         self.region_lock = threading.Lock()
         self._lock = threading.Lock()
@@ -241,6 +232,7 @@ class LiveRun:
         return Place(parameters, hertz, index)
 
     def _frequency(self, given: float | None) -> float:
+        far = 10.0  # how many times higher or lower than the run's own a drive frequency may be
         if self.model.clock.hertz is not None:
             return self.model.clock.hertz
         axis = self.spec.axes.get(FREQUENCY)
@@ -250,7 +242,7 @@ class LiveRun:
                 raise RequestError(f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz].")
             return own
         values = np.array([own]) if axis is None else axis.array()
-        low, high = float(values.min()) / FAR, float(values.max()) * FAR
+        low, high = float(values.min()) / far, float(values.max()) * far
         if not low <= given <= high:
             raise RequestError(f"frequency = {given:g} Hz: must be from {low:g} to {high:g} Hz here.")
         return given
@@ -301,6 +293,7 @@ class LiveRun:
 
     def catalog(self, place: Place) -> Catalog:
         """Return the catalog of known attractors at a parameter point; each point has one catalog."""
+        most = 64  # parameter points of which the attractors are remembered
         known = self._known(place)
         key = (float(known.attractors is not None), *place.key)
         with self._lock:
@@ -310,7 +303,7 @@ class LiveRun:
         with self._lock:
             found = self._catalogs.setdefault(key, found)
             self._catalogs.move_to_end(key)
-            while len(self._catalogs) > MOST_CATALOGS:
+            while len(self._catalogs) > most:
                 self._catalogs.popitem(last=False)
         return found
 
@@ -342,7 +335,8 @@ class LiveRun:
 
 
 def _same(a: float, b: float) -> bool:
-    return abs(a - b) <= SAME_VALUE * max(abs(a), abs(b))
+    rounding = 1e-12  # relative difference at which a value is that of the cube
+    return abs(a - b) <= rounding * max(abs(a), abs(b))
 
 
 class Warming:

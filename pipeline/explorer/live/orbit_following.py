@@ -34,28 +34,24 @@ from pipeline.layout.vocabulary import PERIODIC_ORBIT, axes_of, axis_name
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
 
-MOST_ORBITS = 256
-"""Orbits that a session remembers."""
 
-MOST_SECONDS = 3.0
-"""Time for one answer [s]; then the orbit is shown as far as it was followed."""
+@dataclass(frozen=True)
+class FollowSettings:
+    """Numbers of following an orbit while a user waits."""
 
-FIRST_STEP, LONGEST_STEP, SHORTEST_STEP = 0.01, 0.05, 1e-6
-"""Steps of the parameter, in units of its scale."""
+    most_seconds: float = 3.0  # time for one answer [s]; then the orbit is shown as far as it was followed
+    # steps of the parameter, in units of its scale; longer ones are faster, and lose orbits that turn
+    first_step: float = 0.01
+    longest_step: float = 0.05
+    shortest_step: float = 1e-6
+    longest_move: float = 0.3  # largest change of a state in a step, in units of its scale; a longer one is halved
+    # largest angle between the tangents at the ends of a step [rad]: what turns more may be another orbit
+    largest_turn: float = 0.3
+    near_one: float = 0.15  # distance of a multiplier from 1 at which an orbit that ends has come to a fold
+    halved: float = 1e-6  # scaled distance between the halves of an orbit below which they are one
 
-LONGEST_MOVE = 0.3
-"""Largest change of a state in a step, in units of its scale; a longer one is halved."""
-
-LARGEST_TURN = 0.3
-"""Largest angle between the tangents at the ends of a step [rad]: what turns more may be another orbit."""
 
 NEWTON = Settings(max_iterations=6, tolerance=1e-9)
-
-NEAR_ONE = 0.15
-"""Distance of a multiplier from 1 at which an orbit that ends has come to a fold."""
-
-HALVED = 1e-6
-"""Scaled distance between the halves of an orbit below which they are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +112,11 @@ class Follower:
         )
 
     def _keep(self, held: Held) -> int:
+        most = 256  # orbits that a session remembers
         with self._lock:
             number, self._next = self._next, self._next + 1
             self._held[number] = held
-            while len(self._held) > MOST_ORBITS:
+            while len(self._held) > most:
                 self._held.popitem(last=False)
             return number
 
@@ -202,7 +199,14 @@ def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
     return 0 if here is None or int(here["kind"]) != PERIODIC_ORBIT else int(here["orbit_period"])
 
 
-def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
+def _followed(
+    family: Family,
+    state: np.ndarray,
+    begin: float,
+    target: float,
+    job: Job,
+    settings: FollowSettings = FollowSettings(),
+) -> Reached:
     """Follow a periodic orbit from one parameter value towards another, as far as the orbit exists and time allows."""
     problem, scale = OrbitProblem(family), family.scales[0]
     normal = np.zeros(problem.size)
@@ -210,7 +214,7 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
     here = run_alone(correct(problem, family.unknowns(state, [begin]), normal, NEWTON))
     if here is None:
         raise RequestError("the point is too far from a closed orbit for Newton's method to find one.")
-    until, step = time.perf_counter() + MOST_SECONDS, FIRST_STEP
+    until, step = time.perf_counter() + settings.most_seconds, settings.first_step
     goal = target / scale
     while here.u[-1] != goal:
         job.check()
@@ -219,46 +223,48 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
             return Reached(reached, here, f"followed to {reached:.6g} in the time; ask again to go on.", False)
         left = goal - here.u[-1]
         move = left if abs(left) <= step else np.copysign(step, left)
-        there = _step(problem, here, move, normal)
+        there = _step(problem, here, move, normal, settings)
         if there is None:
             step = 0.5 * abs(move)
-            if step < SHORTEST_STEP:
-                return Reached(float(here.u[-1] * scale), here, _why(here, family, target), True)
+            if step < settings.shortest_step:
+                return Reached(float(here.u[-1] * scale), here, _why(here, family, target, settings), True)
             continue
         if move == left:
             there.u[-1] = goal
-        here, step = there, min(1.5 * step, LONGEST_STEP) if there.n_iterations <= 3 else step
+        here, step = there, min(1.5 * step, settings.longest_step) if there.n_iterations <= 3 else step
     return Reached(target, here, "", False)
 
 
-def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -> Point | None:
+def _step(
+    problem: OrbitProblem, here: Point, move: float, normal: np.ndarray, settings: FollowSettings
+) -> Point | None:
     """Follow an orbit over one step `move` of the parameter; None if it cannot be followed that far."""
     slope = here.tangent / here.tangent[-1] if abs(here.tangent[-1]) > 1e-6 else normal
     ahead = move * slope
-    if np.abs(ahead[:-1]).max(initial=0.0) > LONGEST_MOVE:
+    if np.abs(ahead[:-1]).max(initial=0.0) > settings.longest_move:
         return None
     there = run_alone(correct(problem, here.u + ahead, normal, NEWTON))
     if there is None:
         return None
     corrected = np.abs((there.u - here.u - ahead)[:-1]).max(initial=0.0)
-    turned = float(here.tangent @ there.tangent) < np.cos(LARGEST_TURN)
-    if corrected > 0.5 * np.abs(ahead).max() or turned or _has_halved(problem.family, there):
+    turned = float(here.tangent @ there.tangent) < np.cos(settings.largest_turn)
+    if corrected > 0.5 * np.abs(ahead).max() or turned or _has_halved(problem.family, there, settings):
         return None
     return there
 
 
-def _has_halved(family: Family, point: Point) -> bool:
+def _has_halved(family: Family, point: Point, settings: FollowSettings) -> bool:
     if family.period % 2:
         return False
     half = family.mismatch(point.u, point.value.images[family.period // 2 - 1])
-    return bool(np.abs(half).max() < HALVED)
+    return bool(np.abs(half).max() < settings.halved)
 
 
-def _why(point: Point, family: Family, target: float) -> str:
+def _why(point: Point, family: Family, target: float, settings: FollowSettings) -> str:
     value = float(point.u[-1] * family.scales[0])
     multipliers = np.linalg.eigvals(point.value.monodromy)
     name = family.free[0]
-    if np.abs(multipliers - 1.0).min() < NEAR_ONE:
+    if np.abs(multipliers - 1.0).min() < settings.near_one:
         half = ", or joins that of half its period" if family.period % 2 == 0 else ""
         return (
             f"lost at {name} = {value:.7g} on the way to {target:.6g}: a multiplier is near 1, as at a fold, "

@@ -38,11 +38,6 @@ if TYPE_CHECKING:
 MOST_CELLS = 2_000_000
 """Cells of a region that the explorer runs; more are for the command line."""
 
-LOOK_EVERY_S = 0.4
-"""How often progress is looked at [s]."""
-
-DIGITS = 4
-"""Decimal digits of an interval's length that its ends keep."""
 
 _PACKAGES = Path(__file__).parents[3]
 
@@ -106,11 +101,12 @@ def _names(run: RunDirectory, region: Region, swept: list[str]) -> tuple[str, st
 
 def _rounded(name: str, low: float, high: float) -> tuple[float, float]:
     """Round the ends of an interval to the digits that a mouse can resolve."""
+    n_digits = 4  # decimal digits of an interval's length that its ends keep
     if not low < high:
         raise RequestError(f"{name}: the interval {low:g} to {high:g} is empty; its end must be greater.")
     if not math.isfinite(high - low):
         raise RequestError(f"{name}: the interval {low:g} to {high:g} is too long.")
-    digits = DIGITS - 1 - math.floor(math.log10(high - low))
+    digits = n_digits - 1 - math.floor(math.log10(high - low))
     ends = round(low, digits), round(high, digits)
     return ends if ends[0] < ends[1] else (low, high)
 
@@ -173,13 +169,14 @@ class RegionRunner:
 
     def _watch(self, job: Job, spec: Spec, path: Path, out: Path) -> None:
         """Run a region's specification in a process of its own; report its progress, and wait for its end."""
+        every_s = 0.4  # how often progress is looked at [s]
         plan = make_plan(spec)
         words = ["run", str(path), "--out", str(out), *(["--workers", "0"] if plan.n_tasks == 1 else [])]
         job.tell("progress", done=0, total=plan.n_cells, name=out.name)
         with (path.parent / "said").open("w+b") as said, _group(words, path.parent, said) as process:
             done = 0
             while process.poll() is None:
-                job.wait(LOOK_EVERY_S)
+                job.wait(every_s)
                 now = _committed(out)
                 if now != done:
                     done = now

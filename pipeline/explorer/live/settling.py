@@ -18,18 +18,6 @@ from pipeline.explorer import RequestError
 from pipeline.results.tolerances import EXTEND_CLOSURE, EXTEND_RTOL
 from pipeline.specification.tables import Integration
 
-MOST_STEPS = 200_000
-"""Attempted steps of a period beyond which a live trajectory is given up, if the run goes on longer."""
-
-CALL_S, FIRST_CALL = 0.08, 4
-"""Time that a call of the kernel is to take [s], and periods of the first: between calls one can cancel."""
-
-MOST_KEPT, MOST_KEPT_OF_SLICE, MOST_TRANSIENT = 100_000, 512, 4096
-"""Most sections that a live start keeps, and each cell of a slice; most periods before these."""
-
-LEG = 32
-"""Periods between two looks at the cells of a slice."""
-
 
 class Ends(Protocol):
     """The methods of a catalog of attractors that an integration needs; see
@@ -98,7 +86,9 @@ class LiveFlight(Flight):
             starts,
             rtol=integration.rtol,
             atol=integration.atol,
-            max_steps=min(integration.max_steps_per_period, MOST_STEPS),
+            max_steps=min(
+                integration.max_steps_per_period, 200_000
+            ),  # more attempts for a period give a live trajectory up
             closure=integration.closure_tolerance,
             longest=integration.max_orbit_period,
             most=window_of(integration.max_orbit_period),
@@ -106,11 +96,13 @@ class LiveFlight(Flight):
         self._check, self._call_s = check, 0.0
 
     def _calls(self, n: int) -> Iterator[int]:
+        # time that a call of the kernel is to take [s], and periods of the first: between calls one can cancel
+        call_s, first = 0.08, 4
         done = 0
         while done < n:
             self._check()
             going = self.flying.sum()
-            most = FIRST_CALL if not self._call_s else max(1, int(CALL_S / (self._call_s * max(going, 1))))
+            most = first if not self._call_s else max(1, int(call_s / (self._call_s * max(going, 1))))
             k, started = min(n - done, most), time.perf_counter()
             yield k
             self._call_s = max((time.perf_counter() - started) / (k * going), 1e-9)
@@ -143,11 +135,12 @@ def run_start(flight: LiveFlight, integration: Integration, tell: Tell, periods:
     periods
         Periods in all, if not those of the run.
     """
+    most = 100_000  # sections that a live start keeps
     n_keep = integration.n_keep if periods is None else min(integration.n_keep, periods)
     n_transient = integration.n_transient if periods is None else periods - n_keep
-    if n_keep > MOST_KEPT:
+    if n_keep > most:
         raise RequestError(
-            f"the run keeps {n_keep} sections of each cell, and a live start at most {MOST_KEPT}; give periods."
+            f"the run keeps {n_keep} sections of each cell, and a live start at most {most}; give periods."
         )
     early, window = integration.stop_when_closed, window_of(integration.max_orbit_period)
     done, leg, period = 0, window // 4 if early else 2, np.zeros(1, np.int16)
@@ -170,13 +163,6 @@ def run_start(flight: LiveFlight, integration: Integration, tell: Tell, periods:
     return flight.block(kept, turns, period if period[0] else flight.closed(flight.section))
 
 
-RUN_ON_LEGS = 32
-"""How long cells that come back near are run on, in legs of `RUN_ON_LEG` periods."""
-
-RUN_ON_LEG = 64
-"""Periods between two looks at cells that are run on."""
-
-
 def run_on(
     place: Place, integration: Integration, ends: Ends, states: np.ndarray, check: Check, tell: Tell | None = None
 ) -> np.ndarray:
@@ -195,15 +181,16 @@ def run_on(
     check, tell
         See `LiveFlight` and `Tell`; sections of the first cell are told.
     """
+    n_legs, n_periods = 32, 64  # how long cells that come back near are run on, and periods between two looks at them
     settings = integration.model_copy(
         update={"rtol": EXTEND_RTOL, "atol": EXTEND_RTOL, "closure_tolerance": EXTEND_CLOSURE}
     )
     flight = LiveFlight(place, settings, states, check)
     numbers = np.full(len(states), -1, np.int64)
-    for leg in range(RUN_ON_LEGS):
-        section = flight.advance(RUN_ON_LEG).section
+    for leg in range(n_legs):
+        section = flight.advance(n_periods).section
         if tell is not None and flight.rows[0] == 0:
-            tell(section[0], (leg + 1) * RUN_ON_LEG)
+            tell(section[0], (leg + 1) * n_periods)
         numbers[flight.rows] = flight.look(ends, strictly=True)
         flight.keep((numbers[flight.rows] < 0) & flight.flying)
         if not len(flight.rows):
@@ -228,16 +215,18 @@ def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.
     check
         See `LiveFlight`.
     """
+    leg = 32  # periods between two looks at the cells
+    most_kept, most_before = 512, 4096  # most sections that each cell keeps, and most periods before these
     flight = LiveFlight(place, integration, starts, check)
     numbers = np.full(len(starts), -1, np.int64)
-    done, n_transient = 0, min(integration.n_transient, MOST_TRANSIENT)
+    done, n_transient = 0, min(integration.n_transient, most_before)
     while done < n_transient and flight.flying.any():
-        n = min(LEG, n_transient - done)
+        n = min(leg, n_transient - done)
         flight.advance(n)
         done += n
         numbers[flight.rows] = flight.look(ends)
         flight.keep(numbers[flight.rows] < 0)
-    first, rest = flight.advance(1), flight.advance(min(integration.n_keep, MOST_KEPT_OF_SLICE) - 1)
+    first, rest = flight.advance(1), flight.advance(min(integration.n_keep, most_kept) - 1)
     section = np.concatenate([first.section, rest.section], axis=1)
     block = flight.block(section, rest.turns, flight.closed(flight.section))
     numbers[flight.rows] = conclude(place, integration, ends, block, flight.state[flight.rows], check)

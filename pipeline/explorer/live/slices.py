@@ -24,11 +24,6 @@ from pipeline.explorer.live.settling import Place, settle_cells
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
 
-FIRST_BATCH, BATCH = 64, 256
-"""Starts that a thread takes at once: of the coarsest grid, and of the others."""
-
-SHOW_EVERY_S = 0.5
-"""How often an unfinished grid is shown [s]."""
 
 NOT_YET = -1
 
@@ -122,9 +117,11 @@ class _Slice:
 
     def compute(self, n: int) -> None:
         """Compute the labels that the n x n grid still lacks, and send the unfinished grid to the page now and then."""
+        first_batch, batch = 64, 256  # starts that a thread takes at once: of the coarsest grid, and of the others
+        every_s = 0.5  # how often an unfinished grid is shown [s]
         rows, columns = self._grid.missing(n)
         total, done, shown = len(rows), 0, time.perf_counter()
-        size = FIRST_BATCH if n == LEAST_RESOLUTION else BATCH
+        size = first_batch if n == LEAST_RESOLUTION else batch
         parts = [slice(i, i + size) for i in range(0, total, size)]
         if n == LEAST_RESOLUTION:  # alone, so that the others find the attractors that it meets
             part = parts.pop(0)
@@ -144,7 +141,7 @@ class _Slice:
                     part = at_work.pop(future)
                     self._take(part, rows, columns, future.result())
                     done += len(rows[part])
-                if time.perf_counter() - shown > SHOW_EVERY_S:
+                if time.perf_counter() - shown > every_s:
                     self.show(n, done / total)
                     shown = time.perf_counter()
         finally:

@@ -18,7 +18,7 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.explorer import RequestError
-from pipeline.explorer.data.orbits import SAMPLES, fixed_points, series
+from pipeline.explorer.data.orbits import PER_PERIOD, fixed_points, series
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import StartRequest
 from pipeline.explorer.live.settling import LiveFlight, Place, conclude, run_start, system_at
@@ -29,14 +29,8 @@ if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
 
 
-NOISY_PERIODS, PIECE = 400, 16
-"""Periods of a noisy start, and those that are integrated and sent at once."""
-
-TOLERANCE = 0.01
+LARGEST_CHANGE = 0.01
 """Largest change within a period when the steps are halved, in units of the scales; as that of a run's noise."""
-
-MOST_STEPS = 64 * STEPS
-"""Most steps per period that are tried."""
 
 
 def noisy_states(model: Model) -> list[str]:
@@ -47,16 +41,17 @@ def noisy_states(model: Model) -> list[str]:
 
 def noisy_start(live: LiveRun, job: Job, place: Place, state: np.ndarray) -> None:
     """Integrate an initial state with the noise that a job asks for; send its section points piece by piece."""
+    usual, piece = 400, 16  # periods of a noisy start, and those that are integrated and sent at once
     request = job.request
     assert isinstance(request, StartRequest)
     path = _NoisyPath(live, place, state, request.noise, request.seed)
     path.choose_steps(job)
-    periods, found, error = request.periods or NOISY_PERIODS, None, 0.0
+    periods, found, error = request.periods or usual, None, 0.0
     while path.done < periods and (found is None or found.status[0] == Status.BOUNDED):
         job.check()
-        found = path.advance(min(PIECE, periods - path.done))
+        found = path.advance(min(piece, periods - path.done))
         error = max(error, float(np.nan_to_num(found.strong_error[0])))
-        if error > TOLERANCE:
+        if error > LARGEST_CHANGE:
             raise RequestError(_too_long(path.steps))
         section = found.section[0][np.isfinite(found.section[0]).all(axis=1)]
         if len(section):
@@ -109,12 +104,13 @@ class _NoisyPath:
 
     def choose_steps(self, job: Job) -> None:
         """Double the steps until those of the first period are short enough; raise RequestError if none are."""
+        most_steps = 64 * STEPS  # most steps per period that are tried
         while True:
             job.check()
             found = self._call(1)
-            if not found.strong_error[0] > TOLERANCE:  # a start that diverges at once has no error
+            if not found.strong_error[0] > LARGEST_CHANGE:  # a start that diverges at once has no error
                 return
-            if self.steps >= MOST_STEPS:
+            if self.steps >= most_steps:
                 raise RequestError(_too_long(self.steps))
             self.steps *= 2
 
@@ -144,15 +140,9 @@ class _NoisyPath:
         )
 
 
-FIRST_PERIODS, PERIODS = 2, 16
-"""Periods of the path that are shown at once, and in all."""
-
-MOST_EVERY_S = 0.03
-"""Sections are told at most so often [s]."""
-
-
 def start(live: LiveRun, job: Job) -> None:
     """Integrate the initial state that a job names; send its trajectory, its section points and its attractor."""
+    first, whole = 2, 16  # periods of the path that are shown at once, and in all
     request = job.request
     assert isinstance(request, StartRequest)
     place = live.place(request.parameters, request.frequency)
@@ -161,11 +151,11 @@ def start(live: LiveRun, job: Job) -> None:
         noisy_start(live, job, place, state)
         return
     path = _Path(live, job, place, state)
-    path.show(FIRST_PERIODS)
+    path.show(first)
     sections = _Sections(job)
     flight = LiveFlight(place, live.integration, state[None], job.check)
     if not live.model.clock.has_equilibria:
-        path.show(PERIODS - FIRST_PERIODS)
+        path.show(whole - first)
     block = run_start(flight, live.integration, sections.take, request.periods)
     sections.flush()
     catalog = live.catalog(place)
@@ -230,7 +220,7 @@ class _Path:
     def show(self, n_periods: int) -> None:
         """Integrate the first `n_periods` periods and send them; send nothing if the integration fails."""
         live, place = self._live, self._place
-        samples = live.model.clock.samples(SAMPLES)
+        samples = live.model.clock.samples(PER_PERIOD)
         times = self._period * np.arange(n_periods * samples + 1) / samples
         try:
             found = series(
@@ -260,9 +250,10 @@ class _Sections:
 
     def take(self, section: np.ndarray, done: int) -> None:
         """Add section points (k, n_states) to the buffer, and send the buffer if it is time."""
+        every_s = 0.03  # sections are told at most so often [s]
         self._kept.append(section[np.isfinite(section).all(axis=1)])
         self.done = done
-        if time.perf_counter() - self._told >= MOST_EVERY_S:
+        if time.perf_counter() - self._told >= every_s:
             self.flush()
 
     def flush(self) -> None:

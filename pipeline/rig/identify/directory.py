@@ -40,7 +40,7 @@ from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")
 
-FORMAT = 1
+FIT_FORMAT = 1
 IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
     "identification.json",
     "result.json",
@@ -120,7 +120,7 @@ def identity_of(
         table.pop("file", None)
         table["data"] = measured.as_dict()
     return {
-        "format": FORMAT,
+        "format": FIT_FORMAT,
         "spec": tables,
         "model_digest": spec.model.digest,
         "versions": {"engine": ENGINE, "fit": FIT},
@@ -148,9 +148,9 @@ def read_info(directory: str | Path) -> Info:
     try:
         data = json.loads(content)
         found = data["identity"]["format"]
-        if found != FORMAT:
+        if found != FIT_FORMAT:
             raise RefusedError(
-                f"{path}: format {found}, and this magpend reads {FORMAT}; identify again into another directory."
+                f"{path}: format {found}, and this magpend reads {FIT_FORMAT}; identify again into another directory."
             )
         info = Info(directory=directory, **data)
         fits = digest_of(info.identity) == info.digest

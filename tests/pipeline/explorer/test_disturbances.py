@@ -168,19 +168,19 @@ def test_noisy_start__without_noise_is_the_plain_one(watcher):
 def test_noisy_start__is_refused_in_a_sentence(watcher, monkeypatch):
     assert "noise" in noisy(watcher, noise=-1.0)[0]["error"]
     assert "seed" in noisy(watcher, noise=0.1, seed=-1)[0]["error"]
-    monkeypatch.setattr(starting, "TOLERANCE", 1e-12)
+    monkeypatch.setattr(starting, "LARGEST_CHANGE", 1e-12)
     assert "too few for this motion" in noisy(watcher, noise=0.1)[0]["error"]
 
 
 @pytest.mark.slow
 def test_noisy_start__takes_shorter_steps_where_it_must(watcher, monkeypatch):
     plain = noisy(watcher, noise=0.05, periods=1)[0]
-    monkeypatch.setattr(starting, "TOLERANCE", plain["step_error"] / 1.5)
+    monkeypatch.setattr(starting, "LARGEST_CHANGE", plain["step_error"] / 1.5)
     finer = noisy(watcher, noise=0.05, periods=1)[0]
     assert plain["steps_per_period"] == starting.STEPS
     assert finer["steps_per_period"] > starting.STEPS
-    assert finer["step_error"] <= starting.TOLERANCE
+    assert finer["step_error"] <= starting.LARGEST_CHANGE
     # also later on the way
-    monkeypatch.setattr(starting, "TOLERANCE", plain["step_error"] / 100.0)
+    monkeypatch.setattr(starting, "LARGEST_CHANGE", plain["step_error"] / 100.0)
     monkeypatch.setattr(starting._NoisyPath, "choose_steps", lambda path, job: None)
     assert "256 steps in a period are too few" in noisy(watcher, noise=0.05, periods=40)[0]["error"]

@@ -14,13 +14,12 @@ from scipy.integrate import solve_ivp
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
 from pipeline.explorer import RequestError
-from pipeline.explorer.data import diagram as diagrams
 from pipeline.explorer.data import tables
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.data.colours import NONE
+from pipeline.explorer.data.colours import NO_CODE
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.explorer.data.orbits import SAMPLES, cell_of, linearise, orbit
+from pipeline.explorer.data.orbits import PER_PERIOD, cell_of, linearise, orbit
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane
 from pipeline.explorer.data.tables import table
@@ -195,7 +194,7 @@ def test_diagram__colours_are_those_of_the_analyses(sweep):
     ids = derive(sweep, "attractors")["attractor_id"].transpose("frequency", "amplitude", "x_0", "v_0").values.ravel()
     expected = ids[arrays["cell"]]
     assert len(set(expected.tolist())) > 1
-    np.testing.assert_array_equal(arrays["colour_attractor"], np.where(expected < 0, NONE, expected))
+    np.testing.assert_array_equal(arrays["colour_attractor"], np.where(expected < 0, NO_CODE, expected))
     named = {c["id"] for c in describe_view(explored, False)["colours"][0]["categories"]}
     assert set(expected.tolist()) - {-1} <= named
 
@@ -211,18 +210,16 @@ def test_diagram__tells_directions_and_seeds(walk):
 
 
 @pytest.mark.slow
-def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkeypatch):
+def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep):
     explored = ExploredRun.of(sweep)
     whole, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
-    monkeypatch.setattr(diagrams, "MOST_POINTS", 72 * 5)
-    part, attrs = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
+    part, attrs = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}, 72 * 5))
     assert (attrs["kept"], attrs["n_keep"]) == (5, 12)
     k = int(np.flatnonzero(np.diff(whole["first"]) == 12)[0])
     own = whole["y"][whole["first"][k] : whole["first"][k + 1]]
     np.testing.assert_array_equal(part["y"][part["first"][k] : part["first"][k + 1]], own[-5:])
-    monkeypatch.setattr(diagrams, "MOST_POINTS", 71)
     with pytest.raises(RequestError, match="71 cells at most"):
-        diagram(explored, "amplitude", "x", {"frequency": 0})
+        diagram(explored, "amplitude", "x", {"frequency": 0}, 71)
 
 
 @pytest.mark.slow
@@ -267,7 +264,7 @@ def test_orbit__ends_where_the_cube_goes_on(which, request):
         cell = cell_of(explored, number)
         for point in (0, 5):
             arrays, attrs = unpack_arrays(orbit(explored, number, point))
-            ends = arrays["states"][::SAMPLES]
+            ends = arrays["states"][::PER_PERIOD]
             assert len(ends) == attrs["n_periods"] + 1
             np.testing.assert_array_equal(ends[0], cell.section[point])
             n = min(len(ends), len(cell.section) - point)

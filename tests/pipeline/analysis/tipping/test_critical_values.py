@@ -22,7 +22,7 @@ from pipeline.analysis.tipping.analysis import (
     tipping_table,
 )
 from pipeline.analysis.tipping.declaration import TippingOptions
-from pipeline.analysis.tipping.endings import NONE, Final, Group, ends_s, finals_of
+from pipeline.analysis.tipping.endings import UNKNOWN_END, Final, Group, ends_s, finals_of
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import KINDS
 from pipeline.results.outcomes import DIVERGED
@@ -44,10 +44,10 @@ def run_of(**changes: object) -> SimpleNamespace:
     ("outcomes", "pairs"),
     [
         ([0, 0, 1, 1], [(1, 2)]),
-        ([0, NONE, NONE, 1], [(0, 3)]),  # what is not decided lies inside
-        ([0, NONE, 0], []),
-        ([NONE, 1, DIVERGED, 1], [(1, 2), (2, 3)]),
-        ([NONE, NONE], []),
+        ([0, UNKNOWN_END, UNKNOWN_END, 1], [(0, 3)]),  # what is not decided lies inside
+        ([0, UNKNOWN_END, 0], []),
+        ([UNKNOWN_END, 1, DIVERGED, 1], [(1, 2), (2, 3)]),
+        ([UNKNOWN_END, UNKNOWN_END], []),
     ],
 )
 def test_brackets_of__neighbouring_outcomes_that_are_known(outcomes, pairs) -> None:
@@ -60,7 +60,7 @@ def test_bracket__keeps_the_half_at_whose_ends_outcomes_differ() -> None:
     assert (whole.halved(7).low, whole.halved(7).high) == (1.0, 1.5)
     third = whole.halved(5)  # a third attractor: the lower change is kept, with its own name
     assert (third.low, third.high, third.outcome_low, third.outcome_high) == (1.0, 1.5, 3, 5)
-    unknown = whole.halved(NONE)
+    unknown = whole.halved(UNKNOWN_END)
     assert not unknown.is_decided
     assert (unknown.low, unknown.high, unknown.n_evaluated) == (1.0, 2.0, 1)
 
@@ -88,7 +88,7 @@ def test_bisection__finds_the_square_root_of_two() -> None:
 
 def test_bisection__ends_each_bracket_by_itself() -> None:
     def rule(bracket: Bracket) -> int:
-        return NONE if bracket.start == 1 else int(bracket.middle > 1.25)
+        return UNKNOWN_END if bracket.start == 1 else int(bracket.middle > 1.25)
 
     brackets = [Bracket(k, (), 1.0, 2.0, 0, 1) for k in range(3)]
     found = ByRule(rule, TippingOptions(width=0.01)).run_all(brackets)
@@ -105,7 +105,7 @@ def test_bisection__stops_at_neighbouring_numbers() -> None:
 
 
 def test_brackets__of_each_start_along_the_axis() -> None:
-    outcome = np.array([[0, 0], [0, DIVERGED], [NONE, DIVERGED], [DIVERGED, DIVERGED]])
+    outcome = np.array([[0, 0], [0, DIVERGED], [UNKNOWN_END, DIVERGED], [DIVERGED, DIVERGED]])
     found = _brackets(run_of(), "l_rate_per_s", (), outcome, ("l_rate_per_s",))
     assert [(b.start, b.low, b.high, b.outcome_low, b.outcome_high) for b in found] == [
         (0, 1.0, 1.3, 0, DIVERGED),
@@ -175,7 +175,7 @@ def numbered() -> tuple[list[dict[int, int]], xr.Dataset]:
     """Return the numbers and the table of attractors of two groups; of the first group an attractor has no cell."""
     groups = [
         group_of(1.0, [0, 1, 2], [2, 0, 2], [-1.0, 0.5, 1.0]),
-        group_of(2.0, [3, 4, 5], [0, DIVERGED, NONE], [3.0]),
+        group_of(2.0, [3, 4, 5], [0, DIVERGED, UNKNOWN_END], [3.0]),
     ]
     ids, table = _numbered(groups)
     return ids, xr.Dataset(table)
@@ -193,7 +193,7 @@ def test_numbered__attractors_of_all_groups_that_have_cells(numbered) -> None:
 
 
 def test_tipping_table__names_outcomes_and_counts_cells(numbered) -> None:
-    outcome = xr.DataArray([[1, 0, 1], [2, DIVERGED, NONE]], dims=("a", "initial_condition"))
+    outcome = xr.DataArray([[1, 0, 1], [2, DIVERGED, UNKNOWN_END]], dims=("a", "initial_condition"))
     brackets = [Bracket(1, (), 1.25, 1.250002, 0, DIVERGED, 19), Bracket(2, (), 1.0, 2.0, 1, 2, 1, is_decided=False)]
     ds = numbered[1].assign(outcome=outcome, **_of_brackets(brackets, (), load_model("duffing")))
     ds = ds.assign_coords(a=("a", [1.0, 2.0], {"units": "N"})).assign_attrs(parameter="a", n_brackets=3)
@@ -223,4 +223,4 @@ def test_tipping_table__joins_values_with_equal_counts() -> None:
 
 
 def test_outcome_word__letters_and_what_is_no_attractor() -> None:
-    assert [outcome_word(o) for o in (0, 25, 26, DIVERGED, NONE)] == ["A", "Z", "AA", "diverged", "not decided"]
+    assert [outcome_word(o) for o in (0, 25, 26, DIVERGED, UNKNOWN_END)] == ["A", "Z", "AA", "diverged", "not decided"]
