@@ -29,15 +29,6 @@ SAMPLES = 128
 N_HARMONICS = 5
 """Harmonics of the target, besides its mean."""
 
-MOST_ROUNDS, TOLERANCE = 30, 1e-3
-"""Most Picard iterations, and the largest further harmonic of the output, in units of the first, that ends them."""
-
-PATIENCE, LEAST_GAIN = 3, 0.7
-"""Iterations in which that harmonic must fall to this share of what it was; if it does not, noise limits it."""
-
-SURE = 2.0
-"""Scatters by which the drive's amplitude must change between neighbours for the slope to tell the stability."""
-
 
 @dataclass(frozen=True)
 class Controlled:
@@ -75,6 +66,10 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
     Raise `SpecError` if the state has no rate, the drive is no parameter that acts on it as a cosine, or a target is
     not positive, and `ArithmeticError` if control fails: a rig diverges.
     """
+    # most Picard iterations, and the largest further harmonic of the output, in units of the first, that ends them
+    rounds, smallest = 30, 1e-3
+    # iterations in which that harmonic must fall to this share of what it was; if it does not, noise limits it
+    patience, least_gain = 3, 0.7
     sizes = np.asarray(targets, np.float64)
     plant = _Plant.of(rig, sizes)
     target = np.zeros((len(sizes), N_HARMONICS + 1), np.complex128)
@@ -82,14 +77,14 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
     random = np.random.default_rng(rig.seed)
     state = np.zeros((len(sizes), len(rig.parameters.model.state_names)))
     worst: list[float] = []
-    for _ in range(MOST_ROUNDS):
+    for _ in range(rounds):
         state, _, _ = plant.run(state, target, rig.n_settle, random)
         state, seen, output = plant.run(state, target, rig.n_measure, random)
         response, excitation = _harmonics(seen), _harmonics(output)
         others = np.delete(np.abs(excitation), 1, axis=1)
         residue = others.max(axis=1) / np.abs(excitation[:, 1])
         worst.append(float(residue.max()))
-        if worst[-1] < TOLERANCE or (len(worst) > PATIENCE and worst[-1] > LEAST_GAIN * worst[-1 - PATIENCE]):
+        if worst[-1] < smallest or (len(worst) > patience and worst[-1] > least_gain * worst[-1 - patience]):
             break
         target = np.where(np.arange(N_HARMONICS + 1) == 1, target, response)
     cycles = np.stack(np.split(seen, rig.n_measure))
@@ -193,10 +188,12 @@ def _harmonics(signal: np.ndarray) -> np.ndarray:
 
 def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) -> tuple[str, ...]:
     """Return the stability of each orbit, from the slope of the drive's amplitude along the branch."""
+    # scatters by which the drive's amplitude must change between neighbours for the slope to tell the stability
+    sure = 2.0
     if len(targets) < 2:
         return ("unknown",) * len(targets)
     order = np.argsort(targets)
-    rises = np.sign(np.where(np.abs(np.diff(drive[order])) > SURE * scatter[order].max(), np.diff(drive[order]), 0.0))
+    rises = np.sign(np.where(np.abs(np.diff(drive[order])) > sure * scatter[order].max(), np.diff(drive[order]), 0.0))
     sides = np.stack([np.append(rises[:1], rises), np.append(rises, rises[-1:])])
     found = np.empty(len(targets), object)
     found[order] = np.where(sides[0] != sides[1], "unknown", np.array(["unknown", "yes", "no"])[sides[0].astype(int)])

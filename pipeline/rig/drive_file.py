@@ -14,9 +14,6 @@ from pipeline.specification.recorded_drive import EDGES, HEADERS, TORQUE, parse_
 
 Floats = npt.NDArray[np.float64]
 
-LONG = 1.5
-"""Factor over the median period above which a period may have lost an edge."""
-
 
 @dataclass(frozen=True)
 class DriveFile:
@@ -79,6 +76,7 @@ def _head(recording: xr.Dataset, what: str, kind: str) -> list[str]:
 
 
 def _edges(recording: xr.Dataset) -> DriveFile:
+    long = 1.5  # factor over the median period above which a period may have lost an edge
     edges = edges_of(recording)
     timing = edges.frequency()
     rising = edges.rising
@@ -99,7 +97,7 @@ def _edges(recording: xr.Dataset) -> DriveFile:
     notes = tuple(
         f"the period from {rising[i]:.6g} s on is {period[i]:.4g} s, {period[i] / median:.2g} times the "
         "median; if an edge was missed there, choose a window without it"
-        for i in np.flatnonzero(period > LONG * median)
+        for i in np.flatnonzero(period > long * median)
     )
     text = "\n".join(lines) + "\n"
     return DriveFile(text, timing, len(rising), recording.sizes["sample"], notes=notes)

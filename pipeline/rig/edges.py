@@ -21,15 +21,6 @@ from pipeline.specification.problems import SpecError
 Floats = npt.NDArray[np.float64]
 
 DRIVE = "drive"
-_LEAST_CONTRAST = 6.0
-"""Least distance of the two levels in units of the noise. White noise alone splits into halves 1.35 apart."""
-_MOST_JITTER = 0.2
-"""Largest jitter of a periodic drive, as a fraction of its period."""
-_HARMONICS = 40
-"""Harmonics of the sawtooth that describes the rounding of edge times to samples."""
-_DRIFTS = 9
-_GAP = 1.5
-"""Step in time, in sampling intervals, from which on it is a gap. An edge inside a gap has no known time."""
 
 
 class Timing(NamedTuple):
@@ -78,6 +69,7 @@ class Edges:
         not reveal an offset of up to half a sampling interval. Raise `SpecError` if there are fewer than three rising
         edges, or they scatter by more than a fifth of a period.
         """
+        most = 0.2  # jitter of a periodic drive, as a fraction of its period
         rising = self.rising
         if rising.size < 3:
             raise SpecError(f"drive: {rising.size} rising edges; a frequency needs 3: choose a longer window.")
@@ -86,7 +78,7 @@ class Edges:
         fitted = start + period * number
         residual = rising - fitted
         jitter = math.sqrt(float(residual @ residual) / (rising.size - 2))
-        if jitter > _MOST_JITTER * period:
+        if jitter > most * period:
             raise SpecError(
                 f"drive: its rising edges scatter by {jitter:.3g} s about a period of {period:.3g} s, so it "
                 "is not periodic here: choose a window of one frequency, or a larger hysteresis."
@@ -117,7 +109,7 @@ class Edges:
         """
         return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
 
-    def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = _DRIFTS) -> float:
+    def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = 9) -> float:
         """Return the standard error [s] of a weighted sum of edge times, with correlated rounding errors.
 
         A time known to one sample is rounded to the middle of the interval. The rounding error is a sawtooth
@@ -126,11 +118,12 @@ class Edges:
         known to about one sample, so the result is averaged over `drifts` slopes that differ by up to one
         sample.
         """
+        n_harmonics = 40  # of the sawtooth that describes the rounding of edge times to samples
         step = self.resolution_s
         if not step:
             return scatter * math.sqrt(float(weights @ weights))
         blur = math.sqrt(max(scatter**2 - step**2 / 12, 0.0)) / step
-        k = np.arange(1, _HARMONICS + 1)
+        k = np.arange(1, n_harmonics + 1)
         power = 0.5 * (step / (math.pi * k)) ** 2 * np.exp(-4 * (math.pi * k * blur) ** 2)
         place = (fitted - fitted[0]) / step
         share = np.linspace(-0.5, 0.5, fitted.size)
@@ -184,9 +177,11 @@ class _Switch:
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
     """Estimate the levels of a drive signal and its noise; raise SpecError if the noise hides their difference."""
+    # least distance of the two levels in units of the noise; white noise alone splits into halves 1.35 apart
+    contrast = 6.0
     low, high, noise = _levels(x)
     span = high - low
-    if span <= _LEAST_CONTRAST * noise or span <= 0:
+    if span <= contrast * noise or span <= 0:
         raise SpecError(
             f"drive: no edges; its levels {low:.4g} and {high:.4g} are within noise, {noise:.2g}: "
             'map the channel that switches, choose a window in which it runs, or say drive = "none".'
@@ -199,6 +194,7 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
     """Return the edges of a drive signal, in order, from its stretches (sample times, values)."""
+    gap = 1.5  # step in time, in sampling intervals, from which on it is a gap; an edge inside a gap has no known time
     instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
@@ -208,7 +204,7 @@ def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
         step = float(np.median(np.diff(t)))
         steps.append(step)
         for a, b in zip(decided[turn], decided[turn + 1], strict=True):
-            if np.diff(t[a : b + 1]).max() < _GAP * step:
+            if np.diff(t[a : b + 1]).max() < gap * step:
                 instants.append(_crossing(t[a : b + 1], above[a : b + 1]))
                 rises.append(above[b] > 0)
                 slopes.append(abs(above[b] - above[a]) / (t[b] - t[a]))

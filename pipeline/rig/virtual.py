@@ -36,12 +36,6 @@ if TYPE_CHECKING:
 GROUP = "rig"
 """Group of the channels in a file."""
 
-SUPPLY_V = 5.0
-TRACK_V = (0.25, 4.75)
-"""Voltages at the ends of a potentiometer's track."""
-
-DEAD_V = 0.1
-"""Voltage below which the wiper is off the track, where a resistor pulls it to 0 V."""
 
 TURN = 2.0 * math.pi
 
@@ -241,24 +235,26 @@ def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> A
 def _potentiometer(
     channel: str, angle: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    low, high = TRACK_V
+    # voltages at the ends of the track, and the one below which the wiper is off it, where a resistor pulls it to 0 V
+    track_v, dead_v, supply_v = (0.25, 4.75), 0.1, 5.0
+    low, high = track_v
     middle, per_rad = 0.5 * (low + high), (high - low) / (TURN - sensor.dead_band)
     folded = np.mod(angle + math.pi, TURN) - math.pi
     volts = middle + per_rad * folded
     is_off = np.abs(folded) > math.pi - 0.5 * sensor.dead_band
     volts[is_off] = 0.0
-    noisy = np.clip(volts + per_rad * sensor.noise * rng.standard_normal(len(volts)), 0.0, SUPPLY_V)
+    noisy = np.clip(volts + per_rad * sensor.noise * rng.standard_normal(len(volts)), 0.0, supply_v)
     if sensor.bits is not None:
-        grain = SUPPLY_V / (2**sensor.bits - 1)
+        grain = supply_v / (2**sensor.bits - 1)
         noisy = grain * np.round(noisy / grain)
     entry = ChannelMap(
         channel=channel,
         unit="V",
         scale=1.0 / per_rad,
         zero=middle,
-        range=(0.0, SUPPLY_V),
+        range=(0.0, supply_v),
         wraps=True,
-        dead_band=(0.0, DEAD_V) if sensor.dead_band else None,
+        dead_band=(0.0, dead_v) if sensor.dead_band else None,
     )
     return noisy, entry, "V"
 

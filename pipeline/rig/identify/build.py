@@ -24,11 +24,6 @@ FEWEST_SAMPLES = 12
 
 DRIVE = "drive"
 DUTY = "duty_cycle"
-MOST_ROUNDING = 0.45
-"""Largest scatter of edges, in samples, that is taken for rounding. A uniform error has 0.29."""
-
-LEAST_NOISE = 1e-6
-"""Least noise of a channel as a fraction of its spread. Simulated recordings may have no noise."""
 
 
 @dataclass(frozen=True)
@@ -264,12 +259,13 @@ def noise_of(
     The specification may state it. Otherwise the recordings give it, one value for all channels of a unit: in
     most rigs the model's error exceeds the sensors' noise and is not proportional to it.
     """
+    least = 1e-6  # noise of a channel as a fraction of its spread; simulated recordings may have no noise
     noise = {}
     for name in channels:
         own = [float(ds[name].attrs.get("noise", math.nan)) for ds in smoothed]
         spread = max(float(np.nanstd(ds[name].values)) for ds in smoothed)
         rms = math.sqrt(float(np.nanmean(np.square(own)))) if np.isfinite(own).any() else 0.0
-        noise[name] = max(rms, LEAST_NOISE * spread) or LEAST_NOISE
+        noise[name] = max(rms, least * spread) or least
     found = []
     for name in channels:
         unit = model.state(name).unit
@@ -453,13 +449,14 @@ def _steadied(edges: Edges) -> Edges:
 
     A single edge is known to half a sampling interval; a line through many edges is known far better.
     """
+    most = 0.45  # scatter of edges, in samples, that is taken for rounding; a uniform error has 0.29
     if not edges.resolution_s:
         return edges
     try:
         timing = edges.frequency()
     except SpecError:
         return edges
-    if not timing.jitter_s < MOST_ROUNDING * edges.resolution_s or not math.isfinite(timing.duty_cycle):
+    if not timing.jitter_s < most * edges.resolution_s or not math.isfinite(timing.duty_cycle):
         return edges
     period = 1.0 / timing.frequency_hz
     number = np.round((edges.rising - edges.rising[0]) / period)

@@ -26,11 +26,6 @@ from pipeline.rig.measured.branch_figure import plot_branch
 
 # ---- data of the residuals -------------------------------------------------------------------------
 
-LONGEST_LAG = 1 / 3
-"""Longest lag of the autocorrelation, as a fraction of the shortest piece."""
-
-BINS = 30
-
 
 @dataclass(frozen=True)
 class Series:
@@ -98,9 +93,10 @@ def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
 
 def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
     """Return what the residual plots show: autocorrelation, mean against the rate, density, rms by piece."""
+    longest, n_bins = 1 / 3, 30  # longest lag of the autocorrelation in lengths of the shortest piece; bins of the rate
     fitted = [s.of(ds) for s in pieces_in(ds) if not s.held_out]
     step = float(np.median(np.diff(fitted[0]["time"].values)))
-    most = max(2, int(LONGEST_LAG * min(p.sizes["sample"] for p in fitted)))
+    most = max(2, int(longest * min(p.sizes["sample"] for p in fitted)))
     views = xr.Dataset(coords={"lag": ("lag", step * np.arange(most + 1), {"units": "s"})})
     for channel in channels:
         parts = [p[f"{channel}_residual"].values for p in fitted]
@@ -111,7 +107,7 @@ def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
         views[f"{channel}_autocorrelation"] = ("lag", rho, {"band": band, "units": "1"})
         rate, residual = rate_of(ds, channel)
         order = np.argsort(rate, kind="stable")
-        bins = np.array_split(order, min(BINS, max(1, len(order) // 5)))
+        bins = np.array_split(order, min(n_bins, max(1, len(order) // 5)))
         dim = f"{channel}_bin"
         views[f"{channel}_rate"] = (dim, np.array([rate[b].mean() for b in bins]), {"units": f"{unit}/s"})
         views[f"{channel}_mean"] = (dim, np.array([residual[b].mean() for b in bins]), {"units": unit})
@@ -126,14 +122,6 @@ def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
 
 # ---- figures ---------------------------------------------------------------------------------------
 
-MOST_PIECES = 4
-"""Most pieces that are drawn over the data."""
-
-MOST_DOTS = 3000
-"""Most residuals that are drawn against the rate. The means in bins use all residuals."""
-
-VIEWS = 4
-"""Number of views of residuals: autocorrelation, by piece, against the rate, histogram."""
 
 MILLI = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "rad/s": ("mrad/s", 1e3)}
 """Unit and factor in which residuals are drawn, by unit."""
@@ -230,13 +218,14 @@ def plot_fit(ds: xr.Dataset) -> style.DataFigure:
 
 
 def _chosen(pieces: list[Series]) -> list[Series]:
+    most = 4  # pieces that are drawn over the data
     fitted = [s for s in pieces if not s.held_out]
     held = [s for s in pieces if s.held_out]
     worst = max(fitted, key=lambda s: s.worst)
     wanted = [fitted[0], worst, *held[:1], fitted[-1]]
     if len(held) > 1 or not held:
         wanted.insert(2, fitted[len(fitted) // 2])
-    found = list(dict.fromkeys(wanted))[:MOST_PIECES]
+    found = list(dict.fromkeys(wanted))[:most]
     return sorted(found, key=lambda s: (s.recording, s.number))
 
 
@@ -270,13 +259,14 @@ def plot_residuals(ds: xr.Dataset) -> style.DataFigure:
     Wrong friction shows in the third row: the mean residual then depends on the rate. Except in the second row, only
     fitted pieces count.
     """
+    n_views = 4  # autocorrelation, by piece, against the rate, histogram
     channels = str(ds.attrs["channels"]).split()
     views = residual_views(ds, channels)
     title = _title(ds.attrs, "residuals")
     fig = style.new_figure(8.2, views.assign_attrs({**ds.attrs, "title": title}), style.WIDE)
-    grid = fig.add_gridspec(VIEWS, len(channels))
+    grid = fig.add_gridspec(n_views, len(channels))
     for c, channel in enumerate(channels):
-        column = [fig.add_subplot(grid[row, c]) for row in range(VIEWS)]
+        column = [fig.add_subplot(grid[row, c]) for row in range(n_views)]
         for ax in column:
             style.style_axes(ax, minor=False)
         unit, factor = _milli(ds, channel)
@@ -332,8 +322,9 @@ def _draw_pieces(ax: Axes, ds: xr.Dataset, channel: str, factor: float) -> None:
 
 
 def _draw_against_rate(ax: Axes, ds: xr.Dataset, views: xr.Dataset, channel: str, factor: float) -> None:
+    most = 3000  # residuals that are drawn against the rate; the means in bins use all residuals
     rate, left = rate_of(ds, channel)
-    step = max(1, len(rate) // MOST_DOTS)
+    step = max(1, len(rate) // most)
     style.points(ax, rate[::step], factor * left[::step], 1.5, "0.72", marker=".", rasterized=True)
     ax.axhline(0.0, color="0.5", linewidth=0.5)
     ax.plot(

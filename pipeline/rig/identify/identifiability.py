@@ -19,21 +19,6 @@ from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import DETUNING, Free, Problem
 from pipeline.rig.identify.statistics import Covariance, covariance_of, linearise, loss_scale_of
 
-LOOSE = 0.5
-"""Standard error along a direction, relative to the parameters' sizes, above which it is not determined."""
-
-SHOWN = 0.15
-"""Component, relative to the largest, from which on a parameter is named in a direction."""
-
-ALIKE = 0.99
-"""Correlation above which two estimates are reported as known better together than apart."""
-
-BY_PRIOR = 0.9
-"""Ratio of standard error to the prior's above which an estimate rests on its prior alone."""
-
-NEVER = 1e-6
-"""Ratio to the largest singular value below which one counts as zero."""
-
 
 @dataclass(frozen=True)
 class Direction:
@@ -48,7 +33,8 @@ class Direction:
     @property
     def is_loose(self) -> bool:
         """Whether the standard error along the direction is so large that the data do not determine it."""
-        return self.error > LOOSE
+        loose = 0.5  # standard error, relative to the parameters' sizes, above which the direction is not determined
+        return self.error > loose
 
 
 def sizes_of(
@@ -70,12 +56,13 @@ def directions_of(information: np.ndarray, scale: np.ndarray, inflation: float) 
     The matrix is scaled by the parameters' sizes, see `sizes_of`; `inflation` is a factor on standard errors, see
     `Covariance`.
     """
+    zero = 1e-6  # ratio to the largest singular value below which one counts as zero
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     singular = np.sqrt(np.maximum(values[::-1], 0.0))
     found = []
     for value, vector in zip(singular, vectors.T[::-1], strict=True):
         sign = np.sign(vector[np.argmax(np.abs(vector))]) or 1.0
-        never = value <= NEVER * singular[0]
+        never = value <= zero * singular[0]
         error = np.inf if never else inflation / value
         found.append(Direction(float(value), float(error), vector * sign))
     return found
@@ -100,6 +87,7 @@ def warnings_of(
     `directions` come from the data alone, `covariance` includes priors; `prior_sd` is NaN without a prior, and
     `at_bound` has ``lower``, ``upper`` or an empty text for each parameter.
     """
+    by_prior = 0.9  # ratio of standard error to the prior's above which an estimate rests on its prior alone
     found = [_loose(names, d, prior_sd) for d in directions if d.is_loose]
     errors = covariance.errors
     for i, name in enumerate(names):
@@ -109,7 +97,7 @@ def warnings_of(
                 "what would have moved it further. Widen the bound if it may be passed, and look at the "
                 "residuals."
             )
-        if np.isfinite(prior_sd[i]) and errors[i] > BY_PRIOR * prior_sd[i]:
+        if np.isfinite(prior_sd[i]) and errors[i] > by_prior * prior_sd[i]:
             found.append(
                 f"{name} is as its prior says: the recordings add nothing (standard error {errors[i]:.3g}, "
                 f"that of the prior {prior_sd[i]:.3g})."
@@ -118,9 +106,10 @@ def warnings_of(
 
 
 def _loose(names: Sequence[str], direction: Direction, prior_sd: np.ndarray) -> str:
+    least = 0.15  # component, relative to the largest, from which on a parameter is named in a direction
     weight = direction.vector / np.abs(direction.vector).max()
     order = np.argsort(-np.abs(weight), kind="stable")
-    shown = [int(i) for i in order if abs(weight[i]) >= SHOWN]
+    shown = [int(i) for i in order if abs(weight[i]) >= least]
     known = np.isfinite(direction.error)
     share = f"standard error {_percent(direction.error)} of its size"
     error = share if known else "the fit is the same for any value"
@@ -146,11 +135,12 @@ def _loose(names: Sequence[str], direction: Direction, prior_sd: np.ndarray) -> 
 
 
 def _alike(names: Sequence[str], correlations: np.ndarray) -> list[str]:
+    alike = 0.99  # correlation above which two estimates are reported as known better together than apart
     pairs = [
         (i, j)
         for i in range(len(names))
         for j in range(i)
-        if np.isfinite(correlations[i, j]) and abs(correlations[i, j]) > ALIKE
+        if np.isfinite(correlations[i, j]) and abs(correlations[i, j]) > alike
     ]
     return [
         f"{names[j]} and {names[i]} are known better together than apart: their correlation is "
@@ -168,15 +158,6 @@ def _and(words: Sequence[str]) -> str:
 
 
 # ---- profile likelihoods ---------------------------------------------------------------------------
-
-STEPS = (0.4, 0.8, 1.2, 1.6)
-"""Distances at which a profile is computed on either side, in half widths of the interval."""
-
-TOLERANCES = (1e-9, 1e-6)
-"""Smallest and largest tolerance of the fits, see `pipeline.rig.identify.local.fit_local`."""
-
-UNKNOWN_STEP = 0.1
-"""Half width that is tried if the standard error is unknown, relative to the parameter's size."""
 
 
 @dataclass(frozen=True)
@@ -211,18 +192,22 @@ class Curvature:
 
 def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]) -> Profile:
     """Compute the profile likelihood of a parameter: at each value, all other unknowns are fitted again."""
+    # distances at which the profile is computed on either side, in half widths of the interval
+    steps = (0.4, 0.8, 1.2, 1.6)
+    tolerances = (1e-9, 1e-6)  # smallest and largest tolerance of the fits, see `pipeline.rig.identify.local.fit_local`
+    unknown = 0.1  # half width that is tried if the standard error is unknown, relative to the parameter's size
     index = [f.name for f in problem.free].index(name)
     free = problem.free[index]
     estimate = float(best.theta[index])
     known = np.isfinite(about.error) and about.error > 0
-    half = about.critical * about.error if known else UNKNOWN_STEP * about.size
+    half = about.critical * about.error if known else unknown * about.size
     unit = (about.error / about.plain) ** 2 if known else 1.0
     # so that the cost is accurate to a hundredth of its growth at one standard error
-    tolerance = float(np.clip(0.05 * unit / max(best.cost, 1e-300), *TOLERANCES))
+    tolerance = float(np.clip(0.05 * unit / max(best.cost, 1e-300), *tolerances))
     found = {estimate: 0.0}
     for side in (-1.0, 1.0):
         theta, starts, at = best.theta, best.starts, estimate
-        for step in STEPS:
+        for step in steps:
             value = float(np.clip(estimate + side * step * half, free.lower, free.upper))
             if value in found:
                 break
@@ -266,19 +251,6 @@ def interval_of(values: np.ndarray, growth: np.ndarray, estimate: float, critica
 
 
 # ---- frequency of a known drive ----------------------------------------------------------------
-
-FAR = 2.0
-"""Distance from the stated frequency, in half widths of the 95 % interval, that is reported: four standard errors or
-more."""
-
-
-VAGUE_PERIODS = 0.1
-"""Half width of the interval, in drive periods over the recording, above which a step from the fit decides nothing."""
-
-
-MISSED = 0.2
-"""Root mean square of the residuals, relative to the spread of a channel, above which the fit misses so much of the
-motion that a step from it decides nothing: several periods off, the cost hardly depends on the frequency."""
 
 
 AGREES, OFF, OPEN = "agrees", "off", "not decided"
@@ -325,6 +297,14 @@ def estimate_frequencies(problem: Problem, fit: Fit, scale: np.ndarray) -> list[
     A detuning of each known drive is a further unknown, which gives an estimate with its standard error (a score test:
     Rao, Math. Proc. Camb. Philos. Soc. 44, 1948, 50). `scale` are the unknowns' sizes.
     """
+    # distance from the stated frequency, in half widths of the 95 % interval, that is reported: four standard errors or
+    # more
+    far = 2.0
+    # half width of the interval, in drive periods over the recording, above which a step from the fit decides nothing
+    vague_periods = 0.1
+    # root mean square of the residuals, relative to the spread of a channel, above which the fit misses so much of the
+    # motion that a step from it decides nothing: several periods off, the cost hardly depends on the frequency
+    misses = 0.2
     stated = {p.recording: p.known_hz for p in problem.pieces if p.known_hz}
     if not stated:
         return []
@@ -350,8 +330,8 @@ def estimate_frequencies(problem: Problem, fit: Fit, scale: np.ndarray) -> list[
     for i, (recording, known) in enumerate(stated.items(), len(fit.theta)):
         moved_hz, error = float(step[i]), float(covariance.errors[i])
         half = covariance.critical * error
-        vague = not half < VAGUE_PERIODS * scales[i] or _missed(problem, fit, recording) > MISSED
-        verdict = OFF if abs(moved_hz) > FAR * half else OPEN if vague else AGREES
+        vague = not half < vague_periods * scales[i] or _missed(problem, fit, recording) > misses
+        verdict = OFF if abs(moved_hz) > far * half else OPEN if vague else AGREES
         found.append(DriveFrequency(recording, known, known + moved_hz, error, verdict))
     return found
 

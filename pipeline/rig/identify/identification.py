@@ -43,13 +43,6 @@ from pipeline.store.local import make_folder, refuse_links, writer_lock
 
 Echo = Callable[[str], None]
 
-NEAR_BOUND = 1e-4
-"""Distance to a bound, relative to a parameter's size, below which an estimate lies on it."""
-
-
-SAME_MOTION = 1e-3
-"""Difference of two trajectories, relative to the measured spread, that exceeds the error of integration."""
-
 
 class NotConvergedError(ArithmeticError):
     """Error of an identification in which no local fit converged."""
@@ -173,6 +166,8 @@ def refuse_invisible(problem: Problem) -> None:
 
 def _is_driven(problem: Problem) -> bool:
     """Return whether the model's own drive acts on a piece without a recorded one, as its period then matters."""
+    # difference of two trajectories, relative to the measured spread, that exceeds the error of integration
+    error = 1e-3
     if not problem.pieces or problem.pieces[0].drive is not None:
         return False
     piece = problem.pieces[0]
@@ -184,7 +179,7 @@ def _is_driven(problem: Problem) -> bool:
         found = evaluate(one, problem.start[None], piece.start[None, None], slopes=False)[0]
         motions.append(found.residuals[0])
     spread = np.nanstd(piece.measured, axis=0)
-    return bool((np.nanmax(np.abs(motions[0] - motions[1]), axis=0) > SAME_MOTION * spread).any())
+    return bool((np.nanmax(np.abs(motions[0] - motions[1]), axis=0) > error * spread).any())
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
@@ -258,9 +253,10 @@ def _sizes(problem: Problem, best: Fit) -> np.ndarray:
 
 
 def _at_bound(problem: Problem, best: Fit, scale: np.ndarray) -> list[str]:
+    share = 1e-4  # distance to a bound, relative to a parameter's size, below which an estimate lies on it
     found = []
     for value, low, high, size in zip(best.theta, problem.lower, problem.upper, scale, strict=True):
-        near = NEAR_BOUND * size
+        near = share * size
         found.append("lower" if value - low <= near else "upper" if high - value <= near else "")
     return found
 

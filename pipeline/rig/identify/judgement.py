@@ -13,12 +13,6 @@ from pipeline.rig.identify.local import Fit, fit_local, fit_starts
 from pipeline.rig.identify.problem import Piece, Problem
 from pipeline.rig.identify.search import slowest_period
 
-FIRST_PERIODS = 0.7
-"""Length, in periods of the slowest oscillation, over which starts are fitted first.
-
-The length is then doubled until it covers the piece: a long piece does not tolerate a bad guess.
-"""
-
 
 @dataclass(frozen=True)
 class Judgement:
@@ -109,9 +103,12 @@ def judge(
 
     Return the judgement and the fit of the starts, which may not have converged.
     """
+    # length, in periods of the slowest oscillation, over which starts are fitted first. The length is then doubled
+    # until it covers the piece: a long piece does not tolerate a bad guess.
+    n_periods = 0.7
     known = known_problem(problem, values, zeros, pieces)
     longest = max(float(p.time[-1]) for p in known.pieces)
-    length, starts = FIRST_PERIODS * slowest_period(known), known.starts
+    length, starts = n_periods * slowest_period(known), known.starts
     while length < longest:
         starts = fit_starts(_beginning(known, length), np.zeros(0), starts).starts
         length *= 2

@@ -18,14 +18,6 @@ from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
 
-MAX_ITERATIONS = 40
-FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-3, 0.1, 10.0, 1e12
-N_PHASES = 12
-"""Number of phases of a known drive from which the best one is chosen."""
-
-SETTLED = 1e-10
-"""Relative decrease of a piece's cost, predicted by its slopes, below which its start is found."""
-
 
 class Starts(NamedTuple):
     """Fitted initial states of the pieces, and whether each has converged."""
@@ -57,18 +49,22 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
 
     `starts` are first guesses, (member, piece, n_states). Each member depends on its own unknowns and guesses alone.
     """
+    iterations = 40  # most iterations
+    # damping: at first, its factors after a step that is better or worse, and the largest
+    first, less, more, most = 1e-3, 0.1, 10.0, 1e12
+    settled = 1e-10  # relative decrease of a piece's cost, predicted by its slopes, below which its start is found
     held = replace(problem, continuity=None, orbits=(), held=True)
     found = np.array(starts)
-    damping = np.full(found.shape[:2], FIRST_DAMPING)
+    damping = np.full(found.shape[:2], first)
     blocks = _blocks(held, thetas, found)
     moving = np.ones(found.shape[:2], bool)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(iterations):
         steps = np.zeros_like(found)
         for i, k in np.argwhere(moving):
             block = blocks[i][k]
             steps[i, k], gain = _step(block.jacobian, block.rows, damping[i, k])
             # below this gain, rounding decides and no step improves the start
-            moving[i, k] = gain > SETTLED * _cost(block) and damping[i, k] < MOST_DAMPING
+            moving[i, k] = gain > settled * _cost(block) and damping[i, k] < most
         members, pieces = np.flatnonzero(moving.any(axis=1)), np.flatnonzero(moving.any(axis=0))
         if not len(members):
             break
@@ -79,7 +75,7 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
                 if not moving[i, k]:
                     continue
                 better = _cost(block) < _cost(blocks[i][k])
-                damping[i, k] *= LESS if better else MORE
+                damping[i, k] *= less if better else more
                 if better:
                     found[i, k], blocks[i][k] = start, block
     costs = np.array([[_cost(block) for block in row] for row in blocks]).reshape(moving.shape)
@@ -88,12 +84,13 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
 
 def choose_phases(problem: Problem, theta: Array) -> Array:
     """Return the unknowns with the phase of each known drive moved to the best of phases all round the circle."""
+    n_phases = 12  # from which the best one is chosen
     if not problem.phases:
         return theta
-    shifts = np.arange(N_PHASES) / N_PHASES
-    thetas = np.tile(theta, (N_PHASES, 1))
+    shifts = np.arange(n_phases) / n_phases
+    thetas = np.tile(theta, (n_phases, 1))
     thetas[:, list(problem.phases.values())] += shifts[:, None]
-    costs = fit_many_starts(problem, thetas, np.tile(problem.starts, (N_PHASES, 1, 1))).costs
+    costs = fit_many_starts(problem, thetas, np.tile(problem.starts, (n_phases, 1, 1))).costs
     found = np.array(theta)
     for recording, i in problem.phases.items():
         own = [p.recording == recording for p in problem.pieces]
@@ -175,14 +172,6 @@ def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array,
 
 
 # ---- all unknowns ----------------------------------------------------------------------------------
-
-TOLERANCE = 1e-9
-"""Relative change of the unknowns at which a fit has converged; for the cost it is a tenth of this."""
-
-MAX_EVALUATIONS = 100
-
-DENSE_COLUMNS = 600
-"""Number of columns above which the Jacobian is sparse and its steps are solved iteratively."""
 
 
 @dataclass(frozen=True)
@@ -281,8 +270,8 @@ def fit_local(
     *,
     starts: Array | None = None,
     fixed: Mapping[str, float] | None = None,
-    max_evaluations: int = MAX_EVALUATIONS,
-    tolerance: float = TOLERANCE,
+    max_evaluations: int = 100,
+    tolerance: float = 1e-9,
     echo: Echo | None = None,
 ) -> Fit:
     """Fit the unknowns and the initial states by least squares from a first guess (`scipy.optimize.least_squares`,
@@ -345,13 +334,14 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: tuple[int, fl
 
 def _least_squares(walk: _Search, x: Array, ending: tuple[int, float]) -> tuple[Array, bool, str]:
     """Run `scipy.optimize.least_squares`; return its final point, whether it converged, and its message."""
+    most_dense = 600  # columns above which the Jacobian is sparse and its steps are solved iteratively
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
 
     sizes, problem = walk.sizes, walk.problem
     lower, upper = np.full(len(sizes), -np.inf), np.full(len(sizes), np.inf)
     lower[: walk.n_free], upper[: walk.n_free] = problem.lower, problem.upper
-    sparse = len(sizes) > DENSE_COLUMNS
+    sparse = len(sizes) > most_dense
     found = least_squares(
         lambda x: walk.at(x).rows,
         x,

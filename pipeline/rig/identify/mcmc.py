@@ -38,8 +38,7 @@ from pipeline.rig.identify.build import build, read_all
 from pipeline.rig.identify.directory import OUTCOMES, Info, Outcomes, read_info, stored_tables
 from pipeline.rig.identify.local import Fit, fit_many_starts
 from pipeline.rig.identify.measured_orbits import MeasuredTable, read_orbits
-from pipeline.rig.identify.objective import LOST
-from pipeline.rig.identify.orbit_residuals import orbit_rows
+from pipeline.rig.identify.orbit_residuals import LOST, orbit_rows
 from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.search import unpack_fit
 from pipeline.rig.identify.specification import load_identification
@@ -197,26 +196,23 @@ def _orbit_data(table: MeasuredTable, known: Any) -> OrbitData:
 
 # ---- chain -----------------------------------------------------------------------------------------
 
-BLOCK = 20
-"""Steps of the chain between two files."""
 
-LONG = 50.0
-"""Autocorrelation times that a chain must be long: the error of their estimate is then about 10 % (Sokal)."""
+@dataclass(frozen=True)
+class ChainSettings:
+    """Numbers of a chain and of the verdict on it."""
 
-ALIKE = 1.05
-"""Split R-hat up to which the halves of the chain agree. An ensemble that is `LONG` has about 1.02."""
+    block: int = 20  # steps of the chain between two files; more lose more work when a chain is stopped
+    # autocorrelation times that a chain must be long: the error of their estimate is then about 10 % (Sokal); more err
+    # less, and take longer
+    long: float = 50.0
+    # split R-hat up to which the halves of the chain agree; an ensemble that is `long` has about 1.02
+    alike: float = 1.05
+    least_accepted: float = 0.1  # least share of accepted moves; with fewer, the walkers hardly move
+    burn_in: float = 5.0  # autocorrelation times that are left out at the beginning, at most half of the chain
+
 
 CHAINS = 1
 """Number of the results of chains, see `magpend_core.versions`."""
-
-LEAST_ACCEPTED = 0.1
-"""Least share of accepted moves; with fewer, the walkers hardly move."""
-
-BURN_IN = 5.0
-"""Autocorrelation times that are left out at the beginning, at most half of the chain."""
-
-SHRINK = 0.5
-"""Factor on the Gaussian of the first walkers' positions while too few of them have a density."""
 
 
 @dataclass(frozen=True)
@@ -253,6 +249,7 @@ def sample_posterior(
     most_steps: int,
     seed: int,
     echo: Callable[[str], None],
+    settings: ChainSettings = ChainSettings(),
 ) -> Chain:
     """Sample a posterior density until the chain has converged, or until it has `most_steps`.
 
@@ -266,23 +263,24 @@ def sample_posterior(
         raise SpecError(
             f"--walkers = {n_walkers}: must be even and at least {2 * n_free}, twice the number of unknowns."
         )
-    store = _Blocks(directory, seed, n_walkers)
+    store = _Blocks(directory, seed, n_walkers, settings=settings)
     found: list[dict[str, Array]] = []
     chain: Chain | None = None
-    while chain is None or (chain.reasons and BLOCK * len(found) < most_steps):
+    while chain is None or (chain.reasons and settings.block * len(found) < most_steps):
         block = store.recall(len(found))
         if block is None:
             start = found[-1] if found else _first(density, covariance, n_walkers, seed)
-            block = _advance(density, start, BLOCK * len(found), most_steps)
+            block = _advance(density, start, settings.block * len(found), most_steps, settings)
             store.keep(len(found), block)
         found.append(block)
         chain = judged(
             np.concatenate([b["values"] for b in found]),
             np.concatenate([b["log_density"] for b in found]),
-            float(np.sum([b["accepted"].sum() for b in found]) / (n_walkers * BLOCK * len(found))),
+            float(np.sum([b["accepted"].sum() for b in found]) / (n_walkers * settings.block * len(found))),
+            settings,
         )
     if store.n_recalled:
-        echo(f"{BLOCK * store.n_recalled} steps of the chain were there before")
+        echo(f"{settings.block * store.n_recalled} steps of the chain were there before")
     n_inside, n_lost = np.sum([block["counts"] for block in found], axis=0)
     return replace(chain, lost=float(n_lost / max(n_inside, 1)))
 
@@ -290,9 +288,16 @@ def sample_posterior(
 class _Blocks:
     """Stored blocks of one chain; its key is everything that decides its numbers."""
 
-    def __init__(self, directory: str | Path, seed: int, n_walkers: int) -> None:
+    def __init__(self, directory: str | Path, seed: int, n_walkers: int, settings: ChainSettings) -> None:
+        self.settings = settings
         info = read_info(directory)
-        key = {"digest": info.digest, "version": CHAINS, "seed": seed, "walkers": n_walkers, "block": BLOCK}
+        key = {
+            "digest": info.digest,
+            "version": CHAINS,
+            "seed": seed,
+            "walkers": n_walkers,
+            "block": self.settings.block,
+        }
         self._outcomes = Outcomes(info.directory / OUTCOMES)
         self._name = f"chain-{digest_of(key)[:8]}"
         self.n_recalled = 0
@@ -320,6 +325,7 @@ def _first(density: LogPosterior, covariance: Array, n_walkers: int, seed: int) 
 
     The Gaussian shrinks while fewer than a quarter of its draws have one.
     """
+    shrink = 0.5  # factor on the Gaussian of the first walkers' positions while too few of them have a density
     best, random = density.best.theta, np.random.default_rng(seed)
     root = root_of(covariance)
     factor = 1.0
@@ -333,14 +339,16 @@ def _first(density: LogPosterior, covariance: Array, n_walkers: int, seed: int) 
             if len(there) == n_walkers:
                 keys, places = _packed(np.random.RandomState(seed).get_state())
                 return {"values": own[there][None], "log_density": heights[there][None], "keys": keys, "places": places}
-        factor *= SHRINK
+        factor *= shrink
     raise SpecError(
         "--mcmc: almost no parameters beside the best ones have all measured orbits and lie within the bounds; "
         "widen the bounds, or hold out the orbits close to folds."
     )
 
 
-def _advance(density: LogPosterior, start: Mapping[str, Array], done: int, most_steps: int) -> dict[str, Array]:
+def _advance(
+    density: LogPosterior, start: Mapping[str, Array], done: int, most_steps: int, settings: ChainSettings
+) -> dict[str, Array]:
     """Return the next block of a chain, from the last walkers of the block before."""
     import emcee
 
@@ -352,7 +360,7 @@ def _advance(density: LogPosterior, start: Mapping[str, Array], done: int, most_
     state = emcee.State(
         start["values"][-1], log_prob=start["log_density"][-1], random_state=_unpacked_random(start), copy=True
     )
-    for i, moved in enumerate(sampler.sample(state, iterations=BLOCK, skip_initial_state_check=True)):
+    for i, moved in enumerate(sampler.sample(state, iterations=settings.block, skip_initial_state_check=True)):
         report("steps of the chain", done + i + 1, most_steps)
         state = moved
     keys, places = _packed(state.random_state)
@@ -380,25 +388,27 @@ def _unpacked_random(block: Mapping[str, Array]) -> tuple[str, Array, int, int, 
 # ---- convergence -------------------------------------------------------------------------------
 
 
-def judged(values: Array, log_density: Array, accepted: float) -> Chain:
+def judged(values: Array, log_density: Array, accepted: float, settings: ChainSettings = ChainSettings()) -> Chain:
     """Leave out the first steps of a chain, and compute its convergence figures.
 
     Positions have the shape (step, walker, n_free), log densities (step, walker); `accepted` is the share of accepted
     moves.
     """
     n = len(values)
-    rough = BURN_IN * float(np.max(autocorrelation_time(values[n // 2 :])))
+    rough = settings.burn_in * float(np.max(autocorrelation_time(values[n // 2 :])))
     discarded = n // 2 if not rough < n // 2 else math.ceil(rough)
     kept = values[discarded:]
     time, rhat = autocorrelation_time(kept), split_rhat(kept)
     longest, worst = float(np.max(time)), float(np.max(rhat))
     reasons = []
     # negated, so that NaN counts as not converged
-    if not len(kept) >= LONG * longest:
-        reasons.append(f"{len(kept)} steps are {len(kept) / longest:.3g} autocorrelation times, fewer than {LONG:g}")
-    if not worst <= ALIKE:
-        reasons.append(f"the halves of the chain differ: split R-hat is {worst:.3f}, above {ALIKE:g}")
-    if not accepted >= LEAST_ACCEPTED:
+    if not len(kept) >= settings.long * longest:
+        reasons.append(
+            f"{len(kept)} steps are {len(kept) / longest:.3g} autocorrelation times, fewer than {settings.long:g}"
+        )
+    if not worst <= settings.alike:
+        reasons.append(f"the halves of the chain differ: split R-hat is {worst:.3f}, above {settings.alike:g}")
+    if not accepted >= settings.least_accepted:
         reasons.append(f"only {100.0 * accepted:.2g} % of the moves were accepted")
     return Chain(kept, log_density[discarded:], accepted, discarded, time, rhat, tuple(reasons))
 

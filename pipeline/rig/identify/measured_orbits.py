@@ -30,11 +30,6 @@ from pipeline.specification.section import SectionTable
 if TYPE_CHECKING:
     from pipeline.rig.identify.specification import IdentificationSpec
 
-MARGIN = 0.5
-"""Part of the measured interval of the parameter by which branches are computed beyond it."""
-
-NORMAL_95 = 3.919928
-"""Width of a 95 % interval of a Gaussian, in standard deviations."""
 
 MEDIAN = math.sqrt(math.pi / 2.0)
 """Standard error of the median of Gaussian values in units of that of their mean."""
@@ -272,6 +267,7 @@ def _error(scatter: float, n_cycles: int) -> float:
 
 
 def _bifurcations(table: OrbitsTable, where: str, problems: list[str]) -> list[Datum]:
+    n_sd = 3.919928  # width of a 95 % interval of a Gaussian, in standard deviations
     found = []
     for i, one in enumerate(table.bifurcations):
         low, high = one.interval
@@ -280,16 +276,17 @@ def _bifurcations(table: OrbitsTable, where: str, problems: list[str]) -> list[D
             continue
         kind, middle = _KINDS[one.kind], 0.5 * (low + high)
         period = 0 if one.kind == "hopf" else one.period
-        sd = np.array([(high - low) / NORMAL_95])
+        sd = np.array([(high - low) / n_sd])
         name = one.name or f"{one.kind} {i + 1}"
         found.append(Datum(name, kind, middle, period, 0, (PARAMETER,), np.array([middle]), sd))
     return found
 
 
 def _range(data: Sequence[Datum]) -> tuple[float, float]:
+    margin = 0.5  # part of the measured interval of the parameter by which branches are computed beyond it
     values = [d.value for d in data]
     low, high = min(values), max(values)
-    room = MARGIN * (high - low) or 0.2 * abs(high) or 1.0
+    room = margin * (high - low) or 0.2 * abs(high) or 1.0
     least = 0.5 * low if low > 0.0 else -math.inf
     return max(low - room, least), high + room
 

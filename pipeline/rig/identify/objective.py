@@ -13,22 +13,16 @@ from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.branches.carrying import OrbitData
-from pipeline.rig.identify.orbit_residuals import OrbitRows, orbit_rows
+from pipeline.rig.identify.orbit_residuals import LOST, OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
 
-STEP = 1e-5
+DIFFERENCE_STEP = 1e-5
 """Step of the differences in units of an unknown's size; slopes are accurate to 1e-5 to 1e-3."""
 
 VARIATIONAL = "variational"
 """Value of `Problem.slopes` for slopes by variational equations."""
-
-SLOPES_RTOL = 1e-9
-"""Largest tolerance of the integration if slopes are differences."""
-
-LOST = 1e6
-"""Residual, in units of the noise, of a trajectory that diverged."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +100,7 @@ def _steps(problem: Problem, thetas: Array) -> Array:
     found = np.zeros((len(thetas), len(problem.sloped)))
     for j, i in enumerate(problem.sloped):
         f, values = problem.free[i], thetas[:, i]
-        h = STEP * np.maximum(np.abs(values), f.size)
+        h = DIFFERENCE_STEP * np.maximum(np.abs(values), f.size)
         h = np.where(values + h > f.upper, -h, h)
         found[:, j] = (values + h) - values
     return found
@@ -124,14 +118,15 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
 
 def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
     """Compute trajectories, and their derivatives with one unknown or component of the start changed at a time."""
+    least = 1e-9  # largest tolerance of the integration if slopes are differences
     steps, n = _steps(problem, thetas), len(problem.model.states)
-    moves = STEP * np.diag(problem.model.scales)
+    moves = DIFFERENCE_STEP * np.diag(problem.model.scales)
     packed = problem.pack(thetas)[:, None]
     n_moving = len(problem.sloped)
     parameters = np.concatenate([packed, _changed(problem, thetas, steps), np.repeat(packed, n, axis=1)], axis=1)
     start = np.repeat(starts[:, None], 1 + n_moving + n, axis=1)
     start[:, 1 + n_moving :] += moves[:, None, :]
-    tolerance = min(problem.rtol, SLOPES_RTOL)
+    tolerance = min(problem.rtol, least)
     states, failed = _integrate(problem, parameters, start, tolerance)
     sizes = np.concatenate([steps, np.tile(np.diag(moves), (len(thetas), 1))], axis=1)
     slopes = (states[:, 1:] - states[:, :1]) / sizes[:, :, None, None, None]

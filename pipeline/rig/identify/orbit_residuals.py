@@ -24,11 +24,8 @@ from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.rig.identify.problem import Problem
 from pipeline.rig.measured.branch_computed import shapes_of
 
-BESIDE = 1e-3
-"""Arclength to a neighbour on the branch, for derivatives along it."""
-
-LONGEST, NEAREST, ROUNDS = 0.05, 1e-6, 40
-"""Longest step along a branch towards the nearest orbit, the step that ends the search, and most steps."""
+LOST = 1e6
+"""Residual, in units of the noise, of a trajectory that diverged, and of an orbit that could not be found."""
 
 
 def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
@@ -37,10 +34,12 @@ def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 
     An orbit whose parameter has an error is moved along its branch to where it is nearest to the measured one.
     """
+    # longest step along a branch towards the nearest orbit, the step that ends the search, and most steps
+    longest_step, last_step, rounds = 0.05, 1e-6, 40
     points = solve(table, packed)
-    longest = np.full((len(packed), len(table.data)), LONGEST)
+    longest = np.full((len(packed), len(table.data)), longest_step)
     going = [(i, k) for i in range(len(packed)) for k, d in enumerate(table.data) if d.is_free and points[i][k]]
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         if not going:
             break
         slopes = slopes_along(table, packed, going, points)
@@ -55,7 +54,7 @@ def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
                 longest[i, k] *= 0.25
             else:
                 points[i][k] = point
-            if abs(step) > NEAREST:
+            if abs(step) > last_step:
                 left.append((i, k))
         going = left
     return points
@@ -65,14 +64,15 @@ def slopes_along(
     table: OrbitData, packed: Array, places: Sequence[tuple[int, int]], points: Sequence[Sequence[Point | None]]
 ) -> list[Array]:
     """Return each orbit's derivatives of its quantities by arclength, divided by their standard deviations."""
+    aside = 1e-3  # arclength to a neighbour on the branch, for derivatives along it
     beside = [
-        run_together([_moved(table, k, packed[i], points[i][k], side) for i, k in places]) for side in (BESIDE, -BESIDE)
+        run_together([_moved(table, k, packed[i], points[i][k], side) for i, k in places]) for side in (aside, -aside)
     ]
     found = []
     for n, (i, k) in enumerate(places):
         part = replace(table, data=(table.data[k],))
         ahead, behind = (quantities_of(part, packed[i][None], [[side[n]]])[0][0] for side in beside)
-        found.append((ahead - behind) / (2.0 * BESIDE) / table.data[k].sd)
+        found.append((ahead - behind) / (2.0 * aside) / table.data[k].sd)
     return found
 
 
@@ -132,12 +132,6 @@ def quantities_of(table: OrbitData, packed: Array, points: Sequence[Sequence[Poi
 
 
 # ---- residuals -------------------------------------------------------------------------------------
-
-LOST = 1e6
-"""Residual, in standard deviations, of an orbit that could not be found."""
-
-STEP = 1e-4
-"""Step of the central differences by an unknown, in units of its size; their error is about its square."""
 
 
 @dataclass(frozen=True)
@@ -210,10 +204,11 @@ def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[A
 
 def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
     """Return the unknowns for central differences, with one unknown moved up or down in turn, and all displacements."""
+    share = 1e-4  # step of the central differences by an unknown, in units of its size; their error is about its square
     ends, widths = [], []
     for i in problem.moving:
         free = problem.free[i]
-        h = STEP * max(abs(float(theta[i])), free.size)
+        h = share * max(abs(float(theta[i])), free.size)
         both = np.tile(theta, (2, 1))
         both[:, i] = np.clip(theta[i] + h * np.array([1.0, -1.0]), free.lower, free.upper)
         ends.append(both)

@@ -33,11 +33,6 @@ Echo = Callable[[str], None]
 GAUSS, MCMC = "gauss", "mcmc"
 """Values of the attribute ``method`` of draws."""
 
-LEAST_WALKERS = 32
-
-LEAST_SHARE = 0.01
-"""Least share of the draws that must lie within the bounds."""
-
 
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
     """Draw parameter sets from the Gaussian that the estimates and their covariance define, truncated to the bounds.
@@ -78,6 +73,7 @@ def sample_draws(
 
     Raise `SpecError` as `draw_posterior`, if emcee is missing, or if a specification is needed.
     """
+    least = 32
     from pipeline.rig.identify.mcmc import figures_of, log_posterior, require_emcee, sample_posterior
 
     asked = sampling or Sampling()
@@ -91,7 +87,7 @@ def sample_draws(
         directory,
         density,
         matrix,
-        n_walkers=asked.n_walkers or max(LEAST_WALKERS, 4 * n_free),
+        n_walkers=asked.n_walkers or max(least, 4 * n_free),
         most_steps=asked.most_steps,
         seed=seed,
         echo=echo,
@@ -158,6 +154,7 @@ def _within_bounds(
     result: Mapping[str, Any], names: list[str], matrix: np.ndarray, n: int, seed: int
 ) -> tuple[np.ndarray, float]:
     """Draw from the Gaussian until `n` draws lie within the bounds; return them and the fraction that was rejected."""
+    least = 0.01  # share of the draws that must lie within the bounds
     estimates = [result["estimates"][name] for name in names]
     mean = np.array([e["value"] for e in estimates])
     low = np.array([-np.inf if e["bounds"][0] is None else e["bounds"][0] for e in estimates])
@@ -165,7 +162,7 @@ def _within_bounds(
     root = root_of(matrix)
     random, kept, tried = np.random.default_rng(seed), np.zeros((0, len(names))), 0
     while len(kept) < n:
-        if tried and len(kept) < LEAST_SHARE * tried:
+        if tried and len(kept) < least * tried:
             raise SpecError(
                 f"only {len(kept)} of {tried} draws lie within the bounds: the estimates' errors are larger than "
                 "the bounds allow; widen the bounds, give priors, or identify fewer parameters."

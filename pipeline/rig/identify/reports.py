@@ -23,9 +23,6 @@ from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.identify.statistics import Covariance
 from pipeline.store.provenance import versions
 
-SAME = 1e-3
-"""Relative excess of the cost up to which a start has reached the best optimum."""
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -64,7 +61,8 @@ class Finding:
 
     def is_same(self, fit: Fit) -> bool:
         """Return whether a fit converged to the best optimum, up to a relative difference of 1e-3 in the cost."""
-        return fit.converged and fit.cost <= (1 + SAME) * self.best.cost
+        same = 1e-3  # relative excess of the cost up to which a start has reached the best optimum
+        return fit.converged and fit.cost <= (1 + same) * self.best.cost
 
 
 def beside_of(problem: Problem, fit: Fit, *words: str) -> dict[str, float]:

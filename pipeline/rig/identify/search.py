@@ -25,12 +25,6 @@ from pipeline.specification.problems import import_extra
 
 Array = NDArray[np.float64]
 
-STRETCHES = (0.35, 0.8, 1.8)
-"""Lengths of stretches, in periods of the recordings' slowest oscillation, before whole pieces."""
-
-STAGE_EVALUATIONS, STAGE_TOLERANCE = 25, 1e-4
-STAGE_SAMPLES = 40
-"""Samples of a stretch that are used before whole pieces."""
 
 POPULATION = 32
 """Members that are integrated at the same time."""
@@ -227,11 +221,12 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
     Noise may lead short stretches to a wrong optimum from which longer ones do not return. The last fit
     therefore begins from the stage whose outcome has the least cost over whole pieces.
     """
+    evaluations, tolerance = 25, 1e-4
     # measured orbits are known at the guess itself, and may be lost where the stages end
     candidates = [np.clip(theta, problem.lower, problem.upper)] if problem.orbits else []
     for stage in _stages(problem) if stages is None else stages:
         theta = choose_phases(stage, theta)
-        fit = fit_local(stage, theta, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE)
+        fit = fit_local(stage, theta, max_evaluations=evaluations, tolerance=tolerance)
         if np.isfinite(fit.cost):
             theta = fit.theta
             candidates.append(theta)
@@ -249,11 +244,13 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
 
 def _stages(problem: Problem) -> list[Problem]:
     """Return the problem with short, longer and still longer stretches, whose starts the recordings give."""
+    # lengths of stretches, in periods of the recordings' slowest oscillation, before whole pieces
+    stretches = (0.35, 0.8, 1.8)
     if not problem.pieces:
         return [problem]
     longest = max(p.time[-1] for p in problem.pieces)
     period = slowest_period(problem)
-    lengths = [share * period for share in STRETCHES if share * period < 0.8 * longest]
+    lengths = [share * period for share in stretches if share * period < 0.8 * longest]
     return [cut(problem, length) for length in lengths or [longest]]
 
 
@@ -287,6 +284,7 @@ def cut(problem: Problem, length_s: float) -> Problem:
 
 
 def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
+    n_samples = 40  # of a stretch that are used before whole pieces
     n = len(piece.time)
     count = max(int(piece.time[-1] / length_s), 1)
     bounds = np.linspace(0, n, count + 1).astype(int)
@@ -295,7 +293,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
         if b - a < 4 or not np.isfinite(piece.measured[a]).all():
             continue
         start = piece.start if a == 0 else _read_off(problem, piece, int(a), (b - a) // 6 + 2)
-        step = max((b - a) // STAGE_SAMPLES, 1)
+        step = max((b - a) // n_samples, 1)
         drive = piece.drive
         if drive is not None:
             begin = drive.start_s + piece.time[a]

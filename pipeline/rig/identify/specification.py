@@ -89,12 +89,6 @@ class OrbitsTable(Table):
 
 # ---- parameters ------------------------------------------------------------------------------------
 
-_LEAST = 1e-9
-"""Smallest value of a positive parameter, relative to its start."""
-
-_FRACTION_MARGIN = 1e-6
-"""Distance that a fraction keeps from 0 and 1."""
-
 
 class Prior(Table):
     """Prior of a parameter from an independent measurement: mean and standard deviation."""
@@ -192,10 +186,12 @@ class ParameterTables:
 
     def _bounds(self, name: str, start: float) -> tuple[float, float]:
         """Return the model's bounds on a parameter, just inside where the bound is not an allowed value."""
+        least = 1e-9  # smallest value of a positive parameter, relative to its start
+        margin = 1e-6  # distance that a fraction keeps from 0 and 1
         return {
-            POSITIVE: (_LEAST * start, math.inf),
+            POSITIVE: (least * start, math.inf),
             NON_NEGATIVE: (0.0, math.inf),
-            FRACTION: (_FRACTION_MARGIN, 1.0 - _FRACTION_MARGIN),
+            FRACTION: (margin, 1.0 - margin),
         }.get(self._model.parameter(name).bound, (-math.inf, math.inf))
 
     def _ties(self, table: Mapping[str, Any], identified: Mapping[str, Any]) -> dict[str, tuple[float, str]]:

@@ -10,7 +10,7 @@ taken as independent, intervals would be too narrow by the square root of the nu
 independent one. If residuals are found to be autocorrelated, the variance of the scores is estimated from the
 scores:
 
-- with at least `FEWEST_PIECES` independent pieces, over pieces by the delete-one jackknife (Bell & McCaffrey,
+- with at least 8 independent pieces, over pieces by the delete-one jackknife (Bell & McCaffrey,
   Survey Methodology 28, 2002, 169, "CR3"; one step from the optimum, exact for a linear model), with
   Student's t for one degree of freedom less than their number;
 - otherwise along time after Newey & West (Econometrica 55, 1987, 703), with critical values for a bandwidth
@@ -33,18 +33,8 @@ from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.orbit_residuals import OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 
-FEWEST_PIECES = 8
-"""Fewest pieces whose scatter gives a variance."""
-
 LEVEL = 0.95
-WHITE_LEVEL = 0.01
-"""Probability that white residuals are taken for autocorrelated ones."""
 
-LAGS = 20
-"""Largest number of lags in the test for autocorrelation."""
-
-SINGULAR = 1e-12
-"""Ratio to the largest eigenvalue of the scaled information below which a direction is not determined."""
 
 Estimator = Literal["white", "pieces", "newey-west", "orbits"]
 
@@ -150,14 +140,16 @@ def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray
 
 def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
     """Return whether residuals, (n, n_channels) by piece, are autocorrelated: a Ljung-Box test over all pieces."""
+    level = 0.01  # probability that white residuals are taken for autocorrelated ones
+    most = 20  # lags in the test
     n_channels = residuals[0].shape[1]
     shortest = min(len(r) for r in residuals)
-    lags = max(1, min(LAGS, shortest // 5))
+    lags = max(1, min(most, shortest // 5))
     for c in range(n_channels):
         own = [r[:, c] for r in residuals]
         rho, pairs = pooled_pairs(own, lags)
         portmanteau = float(np.nansum(pairs[1:] * rho[1:] ** 2))
-        if stats.chi2.sf(portmanteau, lags) < WHITE_LEVEL / n_channels:
+        if stats.chi2.sf(portmanteau, lags) < level / n_channels:
             return True
     return False
 
@@ -235,6 +227,7 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
     `scale` is the size of each parameter, (n_free,), to detect singular directions. By default the residuals choose the
     estimator, see the module.
     """
+    fewest = 8  # pieces whose scatter gives a variance
     if not fit.residuals:
         return _of_orbits(fit, scale)
     parts = _scores(fit)
@@ -242,7 +235,7 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
     correlated = is_autocorrelated(fit.residuals)
     if estimator is None:
         asked = correlated or fit.loss != "linear"
-        estimator = "white" if not asked else "pieces" if n_groups >= FEWEST_PIECES else "newey-west"
+        estimator = "white" if not asked else "pieces" if n_groups >= fewest else "newey-west"
     reason = (
         "the residuals are autocorrelated"
         if correlated
@@ -295,8 +288,10 @@ def root_of(matrix: np.ndarray) -> np.ndarray:
 
 def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pseudo-inverse of the information matrix, and a mask of the parameters that are not determined."""
+    # ratio to the largest eigenvalue of the scaled information below which a direction is not determined
+    singular = 1e-12
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    good = values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)
+    good = values > singular * max(float(values.max(initial=0.0)), 1e-300)
     inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T
     lost = (np.abs(vectors[:, ~good]) > 1e-3).any(axis=1)
     return inverse * np.outer(scale, scale), lost
@@ -379,15 +374,6 @@ def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
 
 # ---- linearisation of a fit ------------------------------------------------------------------------
 
-STEP = 1e-4
-"""Step of the central differences in units of the sizes; their error is about its square."""
-
-RTOL = 1e-10
-"""Tolerance of the integration under the differences; a slope's noise is this over `STEP`."""
-
-MAD = 1.4826
-"""Ratio of the standard deviation of Gaussian noise to its median absolute value."""
-
 
 def linearise(problem: Problem, fit: Fit) -> Linearised:
     """Return the residuals at a fit's optimum and their derivatives by the parameters, with the initial states
@@ -457,10 +443,11 @@ def _information(
 
 def loss_scale_of(problem: Problem, fit: Fit) -> float:
     """Return the residual, in units of the noise, above which a robust loss grows slower than the square."""
+    mad = 1.4826  # ratio of the standard deviation of Gaussian noise to its median absolute value
     if problem.loss == "linear":
         return 1.0
     z = np.concatenate(fit.residuals) / problem.noise
-    return max(MAD * float(np.nanmedian(np.abs(z))), 1.0)
+    return max(mad * float(np.nanmedian(np.abs(z))), 1.0)
 
 
 def groups_of(problem: Problem) -> tuple[int, ...]:
@@ -479,10 +466,12 @@ def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
     They are central differences from one call of the engine. The starts of all pieces are changed at once,
     since no piece depends on another's start. At a bound the differences are one-sided.
     """
+    share = 1e-4  # step of the central differences in units of the sizes; their error is about its square
+    rtol = 1e-10  # tolerance of the integration under the differences; a slope's noise is this over `share`
     n_free, scales = len(problem.free), problem.model.scales
     thetas, starts, widths = [], [], []
     for i, free in enumerate(problem.free):
-        h = STEP * max(abs(float(fit.theta[i])), free.size)
+        h = share * max(abs(float(fit.theta[i])), free.size)
         ends = np.clip(fit.theta[i] + h * np.array([1.0, -1.0]), free.lower, free.upper)
         for end in ends:
             theta = fit.theta.copy()
@@ -493,11 +482,11 @@ def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
     for s, scale in enumerate(scales):
         for sign in (1.0, -1.0):
             moved = fit.starts.copy()
-            moved[:, s] += sign * STEP * scale
+            moved[:, s] += sign * share * scale
             thetas.append(fit.theta)
             starts.append(moved)
-        widths.append(2 * STEP * scale)
-    exact = replace(problem, rtol=min(problem.rtol, RTOL), continuity=None, orbits=())
+        widths.append(2 * share * scale)
+    exact = replace(problem, rtol=min(problem.rtol, rtol), continuity=None, orbits=())
     found = evaluate(exact, np.array(thetas), np.array(starts), slopes=False)
     slopes = []
     for k in range(len(problem.pieces)):

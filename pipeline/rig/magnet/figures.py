@@ -23,14 +23,9 @@ from pipeline.rig.magnet.fitting import Outcome
 from pipeline.rig.magnet.measurement import SAME_ANGLE
 from pipeline.store.provenance import provenance, versions
 
-SHOWN, COMPARED = 5, 3
-"""Number of locked angles whose curves are drawn, in figure 6 and in figure 9."""
-
 FINE = 241
 """Points of a computed curve."""
 
-_EDGE = 0.03
-"""Margin of a map beyond the readings [rad]."""
 
 COLOURS = (style.BLUE, style.SKY, style.GREEN, style.ORANGE, style.VERMILLION)
 MARKERS = ("o", "s", "D", "^", "v")
@@ -52,7 +47,8 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
 
     Filled points are right of the fixed magnet, open ones left of it.
     """
-    m, shown = outcome.measured, _spread(outcome, SHOWN)
+    n_shown = 5  # locked angles whose curves are drawn
+    m, shown = outcome.measured, _spread(outcome, n_shown)
     drawn = [fit for fit in outcome.curves if _place(shown, fit.curve.locked) is not None]
     fine = np.array([_fine(m.angle[fit.curve.rows]) for fit in drawn])
     bumps = np.array([laws.bump(at, *fit.values.values()) for at, fit in zip(fine, drawn, strict=True)])
@@ -129,8 +125,9 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
 @style.drawn
 def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the fitted torque over both angles, with its zeros and the readings (as Fig. 8 of Wojna et al. 2018)."""
+    edge = 0.03  # margin of a map beyond the readings [rad]
     m, values = outcome.measured, outcome.joint.values
-    angle, locked = (np.linspace(a.min() - _EDGE, a.max() + _EDGE, FINE) for a in (m.angle, m.locked))
+    angle, locked = (np.linspace(a.min() - edge, a.max() + edge, FINE) for a in (m.angle, m.locked))
     torque = laws.magnet_moment(angle, locked[:, None], values)
     data = _readings(outcome, np.arange(len(m.torque))).assign(
         torque_map=(("fine_locked", "fine_angle"), torque, {"units": "N m", "long_name": _FIT}),
@@ -157,7 +154,8 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
 @style.drawn
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the joint fit and point dipoles against the readings (as Fig. 9 of Wojna et al. 2018)."""
-    shown = _spread(outcome, COMPARED)
+    n_shown = 3  # locked angles whose curves are drawn
+    shown = _spread(outcome, n_shown)
     figure = style.new_figure(4.4, _comparison(outcome, shown), frame)
     grid = figure.subplots(2, len(shown), sharex="col", sharey="row", height_ratios=[1.5, 1.0], squeeze=False)
     data = figure.data

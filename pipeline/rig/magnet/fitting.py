@@ -125,16 +125,6 @@ def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.nda
     return np.asarray(np.sqrt(squares * (len(clusters) - 1) / len(clusters)))
 
 
-STEEPNESS = (30.0, 10.0, 100.0, 300.0)
-"""First guesses of the steepness of the change between the bumps, for the joint fit [1/rad]."""
-
-LARGE_ERROR = 0.5
-"""Ratio of standard error to the parameter's scale above which it is not determined."""
-
-FARTHEST_DIPOLES = 3.0
-"""Largest distance at which the fixed dipole is sought, in lengths of the stretched pendulum."""
-
-
 @dataclass(frozen=True)
 class CurveFit:
     """Fit of one Gaussian bump to one torque curve (Wojna et al. 2018, Eq. 17), with standard errors and quality."""
@@ -298,6 +288,7 @@ def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping
 
     Several first guesses of the steepness are tried besides `start`. Raise `ArithmeticError` if none leads to a result.
     """
+    guesses = (30.0, 10.0, 100.0, 300.0)  # first guesses of the steepness of the change between the bumps [1/rad]
     held = dict(hold or {})
     free = tuple(name for name in laws.FITTED if name not in held)
     columns = [laws.FITTED.index(name) for name in free]
@@ -314,7 +305,7 @@ def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping
 
     best: Solution | None = None
     problem = ArithmeticError()
-    for steepness in STEEPNESS if "eps_mag" in free else STEEPNESS[:1]:
+    for steepness in guesses if "eps_mag" in free else guesses[:1]:
         first = {**start, "eps_mag": steepness}
         try:
             found = solve(residuals, slopes, [first[n] for n in free], "joint fit")
@@ -340,11 +331,12 @@ def _upright(values: dict[str, float]) -> dict[str, float]:
 
 
 def _judged(measured: Measurement, found: Solution, free: tuple[str, ...], values: dict[str, float]) -> JointFit:
+    large = 0.5  # ratio of standard error to the parameter's scale above which it is not determined
     errors = dict(zip(free, map(float, found.errors), strict=True))
     correlation = found.correlation
     clusters = [curve.rows for curve in measured.curves]
     by_curve = dict(zip(free, map(float, errors_by_cluster(found, clusters)), strict=True))
-    doubtful = [n for n in free if np.fmax(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
+    doubtful = [n for n in free if np.fmax(errors[n], by_curve[n]) > large * _scale(n, values)]
     off = np.abs(correlation) * [name not in doubtful for name in free]
     return JointFit(
         free,
@@ -388,6 +380,7 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
     The torque is linear in the strength. The place is sought below the end of the stretched pendulum. Raise
     `ArithmeticError` if no strength of repelling dipoles fits.
     """
+    farthest = 3.0  # largest distance at which the fixed dipole is sought, in lengths of the stretched pendulum
     p: dict[str, Any] = {**measured.parameters, "pole1": 1.0, "pole2": 1.0}
 
     def at(h: float) -> tuple[float, np.ndarray]:
@@ -399,7 +392,7 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
     if place:
         reach = laws.reach(p)
         # the sum of squares has several minima over the place: scan a grid, then descend
-        grid = reach * np.geomspace(1.001, FARTHEST_DIPOLES, 400)
+        grid = reach * np.geomspace(1.001, farthest, 400)
         best = int(np.argmin([(r := at(float(g))[1]) @ r for g in grid]))
         low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
         found = minimize_scalar(

@@ -28,13 +28,6 @@ from pipeline.specification.files import find_file, read_toml, shipped_files
 from pipeline.specification.problems import SpecError, unknown_choice, validated
 from pipeline.specification.tables import Table
 
-MIN_READINGS = 5
-"""Fewest readings of a curve. A bump has three parameters; further readings show how well it fits."""
-
-MIN_CURVES = 4
-"""Fewest curves of a side. The height over the locked angle has three parameters."""
-
-MAX_NAMED = 3
 SAME_ANGLE = 1e-6
 """Locked angles that differ by less belong to one curve [rad]."""
 
@@ -355,22 +348,22 @@ def _number(text: str, decimal: str) -> float:
 
 def _places(rows: Any) -> str:
     """Name rows of the table, from 1, in a message: at most three, then the number of further ones."""
-    named = ", ".join(str(i) for i in rows[:MAX_NAMED])
-    more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
+    most = 3
+    named = ", ".join(str(i) for i in rows[:most])
+    more = f" and {len(rows) - most} more" if len(rows) > most else ""
     return f"row{'s' if len(rows) > 1 else ''} {named}{more}"
 
 
 def _curve_problems(curves: tuple[Curve, ...]) -> list[str]:
+    least = 5  # readings of a curve. A bump has three parameters; further readings show how well it fits.
+    fewest = 4  # curves of a side; the height over the locked angle has three parameters
     problems = [
-        f"curve {curve}: has {len(curve.rows)} readings; at least {MIN_READINGS} are needed: "
-        "add some, or leave the curve out."
+        f"curve {curve}: has {len(curve.rows)} readings; at least {least} are needed: add some, or leave the curve out."
         for curve in curves
-        if len(curve.rows) < MIN_READINGS
+        if len(curve.rows) < least
     ]
     for code, side in enumerate(laws.SIDES):
         n = sum(curve.side == code for curve in curves)
-        if n < MIN_CURVES:
-            problems.append(
-                f"side {side!r}: has {n} curves; the fit over the locked angle needs at least {MIN_CURVES}."
-            )
+        if n < fewest:
+            problems.append(f"side {side!r}: has {n} curves; the fit over the locked angle needs at least {fewest}.")
     return problems

@@ -22,9 +22,6 @@ from pipeline.store.provenance import provenance, versions
 
 REPORT, PRESET, DIPOLE_PRESET = "fit.json", "preset.toml", "preset-dipoles.toml"
 
-ALIKE = 0.3
-"""Correlation of neighbouring residuals above which the law is wrong; white noise stays below."""
-
 
 def report_of(outcome: Outcome) -> dict[str, Any]:
     """Return all numbers of a torque fit as plain data, in SI units, or in degrees where the key says so."""
@@ -182,13 +179,14 @@ def _table(joint: JointFit, m: Measurement) -> list[str]:
 
 def warnings_of(outcome: Outcome) -> list[str]:
     """Return warnings: columns accepted by similar names, undetermined parameters, correlated residuals."""
+    alike = 0.3  # correlation of neighbouring residuals above which the law is wrong; white noise stays below
     joint, found = outcome.joint, list(outcome.measured.warnings)
     for name, partner in joint.undetermined.items():
         found.append(
             f"{name} is hardly determined by these readings (standard error {joint.errors[name]:.2g} of "
             f"{joint.values[name]:.3g}): it correlates with {partner}; hold one of them by its name in hold."
         )
-    if joint.neighbours > ALIKE:
+    if joint.neighbours > alike:
         found.append(
             f"residuals of neighbouring readings correlate ({joint.neighbours:.2f}): the law does not fit, and"
             " they are more than noise; use the standard errors by curve."

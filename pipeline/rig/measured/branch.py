@@ -31,11 +31,6 @@ from pipeline.specification.problems import SpecError, checked, unknown_name
 N_HARMONICS = 3
 """Harmonics that are measured, the first included."""
 
-HYSTERESIS = 0.3
-"""Band about the mean that a cycle must cross, in units of the signal's standard deviation: noise crosses less."""
-
-LEAST_CYCLES = 3
-
 
 class CyclesError(ValueError):
     """Error raised for a signal with too few whole cycles."""
@@ -61,13 +56,14 @@ def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
     """Measure the cycles of a signal at rising, even times; each lies between two upward crossings of the signal's
     mean.
 
-    Samples that are not finite end the signal. Raise `CyclesError` if there are fewer than `LEAST_CYCLES` whole cycles.
+    Samples that are not finite end the signal. Raise `CyclesError` if there are fewer than 3 whole cycles.
     """
+    least = 3
     last = len(values) if np.isfinite(values).all() else int(np.argmin(np.isfinite(values)))
     time, values = time[:last], values[:last]
     starts = _upward_crossings(time, values)
-    if len(starts) < LEAST_CYCLES + 1:
-        raise CyclesError(f"the signal has {max(len(starts) - 1, 0)} whole cycles; at least {LEAST_CYCLES} are needed.")
+    if len(starts) < least + 1:
+        raise CyclesError(f"the signal has {max(len(starts) - 1, 0)} whole cycles; at least {least} are needed.")
     found = np.array([_cycle(time, values, a, b) for a, b in itertools.pairwise(starts)])
     middle, scatter = np.median(found, axis=0), np.std(found, axis=0, ddof=1)
     return Cycles(len(found), middle[0], scatter[0], middle[1], scatter[1], middle[2], scatter[2], middle[3:])
@@ -75,10 +71,12 @@ def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
 
 def _upward_crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the times [s] at which a signal that was below a band about its mean rises through the mean."""
+    # band about the mean that a cycle must cross, in units of the signal's standard deviation: noise crosses less
+    hysteresis = 0.3
     if len(values) < 2:
         return np.zeros(0)
     away = values - values.mean()
-    band = HYSTERESIS * away.std()
+    band = hysteresis * away.std()
     found, is_low = [], False
     for i in range(1, len(away)):
         is_low = is_low or away[i - 1] < -band
@@ -306,9 +304,6 @@ _LONG: Mapping[str, str] = {
 
 # ---- comparison ------------------------------------------------------------------------------------
 
-REST = 1e-3
-"""Amplitude, in units of the measured one, below which a computed orbit is an equilibrium that a trajectory nears."""
-
 
 def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> xr.Dataset:
     """Find the computed orbit nearest to each measured one. It must have the measured stability, if that is known.
@@ -362,6 +357,8 @@ def nearest_orbit(
     `period`, unless it is 0. Return branch, index of the point before the value, and the share of the way to the next
     point.
     """
+    # amplitude, in units of the measured one, below which a computed orbit is an equilibrium that a trajectory nears
+    at_rest = 1e-3
     best, least = None, np.inf
     for i in range(branches.sizes["branch"]):
         n, own = int(branches["n_points"][i]), int(branches["orbit_period"][i])
@@ -374,7 +371,7 @@ def nearest_orbit(
                 continue
             share = (value - x[j]) / (x[j + 1] - x[j]) if x[j + 1] != x[j] else 0.0
             size = float(computed[i, j] + share * (computed[i, j + 1] - computed[i, j]))
-            if abs(size - amplitude) < least and size > REST * amplitude:
+            if abs(size - amplitude) < least and size > at_rest * amplitude:
                 best, least = (i, int(j), share), abs(size - amplitude)
     return best
 

@@ -20,12 +20,6 @@ from pipeline.analysis.branches.known import Start
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.rig.measured.branch import N_HARMONICS
 
-SETTLING = 2000
-"""Most drive periods or returns for which a trajectory settles."""
-
-TOLERANCE = 1e-8
-"""Tolerance of the integration while trajectories settle; continuation then finds the orbits exactly."""
-
 
 def branches_along(along: Along, parameters: Parameters, values: Sequence[float], states: np.ndarray) -> xr.Dataset:
     """Compute all branches connected to the orbits that trajectories converge to and, without a drive, to equilibria.
@@ -44,15 +38,17 @@ def branches_along(along: Along, parameters: Parameters, values: Sequence[float]
 
 def _settled(along: Along, packed: np.ndarray, values: Sequence[float], states: np.ndarray) -> list[Start]:
     """Integrate trajectories until they close, and return the closed ones as starting orbits."""
+    most = 2000  # drive periods or returns for which a trajectory settles
+    tolerance = 1e-8  # of the integration while trajectories settle; continuation then finds the orbits exactly
     rows, frequency = along.rows(packed, values)
     found = run_branches(
         rows[:, None],
         frequency[:, None],
         states,
-        n_transient=SETTLING,
+        n_transient=most,
         n_keep=1,
-        rtol=TOLERANCE,
-        atol=TOLERANCE,
+        rtol=tolerance,
+        atol=tolerance,
         stop_when_closed=True,
         max_orbit_period=along.max_period,
         system=along.model.system,
@@ -66,12 +62,6 @@ def _settled(along: Along, packed: np.ndarray, values: Sequence[float], states: 
 
 
 # ---- shapes ----------------------------------------------------------------------------------------
-
-SAMPLES = 256
-"""Samples of a computed orbit in each drive period or return."""
-
-RTOL = 1e-10
-"""Tolerance of the integration: slopes are differences of these numbers."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +87,10 @@ def shapes_of(
     Each orbit has a row of packed parameters, a section point `states` [SI], and its duration `seconds`; `period`
     counts the drive periods or returns of all. The model has a drive, or a Poincare section.
     """
+    n_samples = 256  # of a computed orbit in each drive period or return
+    rtol = 1e-10  # slopes are differences of these numbers
     flow = model.flow if isinstance(model, SectionedModel) else model
-    grid = np.arange(SAMPLES * period + 1) / (SAMPLES * period)
+    grid = np.arange(n_samples * period + 1) / (n_samples * period)
     known = np.isfinite(states).all(axis=1) & np.isfinite(seconds)
     if not known.any():
         none = np.full(len(states), np.nan)
@@ -110,11 +102,11 @@ def shapes_of(
         [s * grid for s in seconds[known]],
         drives=None if flow is not model else [Drive(np.full(period, s / period)) for s in seconds[known]],
         columns=[flow.state_names.index(state)],
-        rtol=RTOL,
-        atol=RTOL,
+        rtol=rtol,
+        atol=rtol,
         limits_first_step=False,
     )
-    values = np.full((len(states), SAMPLES * period), np.nan)
+    values = np.full((len(states), n_samples * period), np.nan)
     values[known] = samples.states[:, :-1, 0]
     lines = np.fft.rfft(values, axis=1) / values.shape[1]
     return Shapes(

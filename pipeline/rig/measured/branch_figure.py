@@ -25,9 +25,6 @@ class Bands:
     intervals: Sequence[tuple[str, float, float]]
 
 
-BARS = 2.0
-"""Half length of the error bars, in scatters of single cycles."""
-
 _LOOKS = {"stable": (style.VERMILLION, "o"), "unstable": ("white", "o"), "unknown": ("white", "s")}
 """Face colour and marker."""
 
@@ -45,9 +42,10 @@ def plot_branch(
     any.
 
     Computed branches are solid where stable and dashed where not. Measured orbits are filled where they were stable,
-    open where not, squares where unknown; bars are `BARS` scatters of single cycles to both sides. The data are the
+    open where not, squares where unknown; bars are 2 scatters of single cycles to both sides. The data are the
     measured orbits, with the computed ``branch_parameter`` and ``branch_amplitude``.
     """
+    half = 2.0  # half length of the error bars, in scatters of single cycles
     data = measured.drop_vars([k for k, v in measured.variables.items() if v.dtype == object])
     if branches is not None and computed is not None:
         data = data.assign(
@@ -71,7 +69,7 @@ def plot_branch(
             ax.errorbar(
                 part["value"].values,
                 part["amplitude"].values,
-                BARS * scatter,
+                half * scatter,
                 linestyle="none",
                 color=style.VERMILLION,
                 markersize=5.0,
@@ -90,13 +88,13 @@ def plot_branch(
         labels.with_unit(f"amplitude of {state}", unit),
     )
     room = 0.12 * (high - low) or 0.1 * abs(high) or 1.0
-    bars = measured["amplitude"].values + BARS * np.nan_to_num(measured["amplitude_sd"].values)
+    bars = measured["amplitude"].values + half * np.nan_to_num(measured["amplitude_sd"].values)
     style.limits(ax, frame, (low - room, high + room), (0.0, 1.15 * float(np.nanmax(bars))))
     style.hold(ax, *_drawn(branches, computed, bands))
     if bands is not None and bands.tubes:
         width = max(float(np.nanmax(tube["high"] - tube["low"])) for tube in bands.tubes)
         entries[0].set_label(f"95 %{thin(width, ax.get_ylim(), unit)}")
-    style.caption(ax, f"bars: ±{BARS:g} scatters of single cycles")
+    style.caption(ax, f"bars: ±{half:g} scatters of single cycles")
     style.legend_above(fig, [*_computed_entries(ax), *entries])
     style.finish(fig)
     return fig

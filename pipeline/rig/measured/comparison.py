@@ -37,9 +37,6 @@ from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-_DRAWS = 8
-"""Number of samples whose distances are averaged."""
-
 
 def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
     """Return the Wasserstein-1 distance, in units of the scales, of points (m, state) and (n, state)."""
@@ -132,7 +129,8 @@ def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> floa
     It is the mean over randomly drawn halves. If the first and the second half differ more, as in a recording
     that drifted, it is their distance.
     """
-    drawn = [wasserstein(*cloud.shuffled(rng), geometry) for _ in range(_DRAWS)]
+    draws = 8  # number of samples whose distances are averaged
+    drawn = [wasserstein(*cloud.shuffled(rng), geometry) for _ in range(draws)]
     return max(float(np.mean(drawn)), wasserstein(*cloud.halves(), geometry))
 
 
@@ -142,9 +140,10 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
     For each half, as many points of the attractor are drawn, and the noise of the sections is added. The distance from
     a correct model then equals that between the halves.
     """
+    draws = 8  # number of samples whose distances are averaged
     parts, blur = cloud.halves(), np.median(cloud.noise, axis=0)
     ways = []
-    for _ in range(_DRAWS // len(parts)):
+    for _ in range(draws // len(parts)):
         for part in parts:
             drawn = _drawn(candidate, len(part), rng)
             ways.append(wasserstein(part, drawn + rng.normal(0.0, 1.0, drawn.shape) * blur, geometry))
@@ -304,8 +303,6 @@ def _same(a: Regime, b: Regime, with_side: bool) -> bool:
 # ---- comparison ------------------------------------------------------------------------------------
 
 NOBODY = -1
-SEED = 0
-"""Seed of the samples drawn from sets that do not close."""
 
 
 def compare(measured: xr.Dataset, run: AnalysedRun) -> xr.Dataset:
@@ -367,15 +364,16 @@ def compare_with(measured: xr.Dataset, computed: Computed) -> xr.Dataset:
 
 def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray) -> dict[str, float]:
     """Compare one frequency step; write the distances from the attractors, and return the other results."""
+    seed = 0  # of the samples drawn from sets that do not close
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]
     cloud = cloud_of(points, noise, int(measured["orbit_period"].values[step]))
-    floor = floor_of(cloud, geometry, np.random.default_rng(SEED))
+    floor = floor_of(cloud, geometry, np.random.default_rng(seed))
     candidates = computed.candidates(float(measured["frequency"].values[step]), states)
     ids = computed.attractors["attractor"].values.tolist()
     for c in candidates:
-        rng = np.random.default_rng([SEED, c.attractor])
+        rng = np.random.default_rng([seed, c.attractor])
         distances[ids.index(c.attractor)] = distance_to(c, cloud, geometry, rng)
     row = {"noise_floor": floor, "winner": NOBODY, "distance": np.nan, "runner_up": np.nan}
     row |= {"distance_in_noise": np.nan, "computed_period": NOBODY, "computed_side": 0}
@@ -415,10 +413,6 @@ def _with_edges(found: xr.Dataset, edges: list[WindowEdge]) -> xr.Dataset:
     for n in hz:
         found[f"edge_{n}"].attrs["units"] = "Hz"
     return found
-
-
-FAR = 5.0
-"""Distance in noise floors above which the nearest attractor is not the rig's."""
 
 
 def words_of(measured: xr.Dataset) -> tuple[str, ...]:
@@ -461,6 +455,7 @@ def _between(row: Row, name: str) -> str:
 
 def summary_lines(compared: xr.Dataset) -> list[str]:
     """Return a printed summary of the comparison of a measured with a computed diagram."""
+    limit = 5.0  # distance in noise floors above which the nearest attractor is not the rig's
     covered = compared["winner"].values >= 0
     sure = covered & (compared["confidence"].values >= CONFIDENT)
     d = compared["distance_in_noise"].values[covered]
@@ -473,10 +468,10 @@ def summary_lines(compared: xr.Dataset) -> list[str]:
         if known.any():
             share = compared[name].values[known].mean()
             lines.append(f"{what} agree at {100 * share:.0f} % of the {int(known.sum())} steps that are sure")
-    far = int((d > FAR).sum())
+    far = int((d > limit).sum())
     if far:
         lines.append(
-            f"at {far} steps the nearest attractor is more than {FAR:g} noise floors away: the model is off, "
+            f"at {far} steps the nearest attractor is more than {limit:g} noise floors away: the model is off, "
             "or the run did not find the attractor, which more initial conditions may"
         )
     return lines

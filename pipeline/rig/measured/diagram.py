@@ -38,7 +38,6 @@ LIMIT = 2.5
 """Root mean square of second differences, in units of noise, below which a motion is closed."""
 _LEAST = 6
 """Fewest second differences that decide on a period."""
-_RESAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -115,22 +114,21 @@ def _share(squares: Floats, found: int) -> float:
     drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor
     of two.
     """
+    n_resamples = 200
     n, rng = squares.shape[1], np.random.default_rng(0)
     block = min(max(4, squares.shape[0]), n)
     number = -(-n // block)
     same = 0
-    for _ in range(_RESAMPLES):
+    for _ in range(n_resamples):
         begins = rng.integers(0, n, number)
         chosen = (begins[:, None] + np.arange(block)).ravel() % n
         closure = _closure(squares[:, np.sort(chosen)])
         same += _least(closure, LIMIT * 2.0 ** rng.uniform(-1, 1)) == found
-    return same / _RESAMPLES
+    return same / n_resamples
 
 
 # ---- diagram ---------------------------------------------------------------------------------------
 
-_MEMORY = 3.0
-"""Scatter of a jittered motion relative to the effect of one edge: each period has two, and effects last."""
 _PARTS = ("section", "section_noise", "kink")
 DIRECTIONS = {1: "up", -1: "down", 0: "none"}
 
@@ -238,13 +236,15 @@ def _shaken(
     A late edge lets an angle advance by its rate times the delay. It changes a rate by the jump of the rate's
     derivative times the delay.
     """
+    # scatter of a jittered motion relative to the effect of one edge: each period has two, and effects last
+    memory = 3.0
     if not shake_s:
         return noise
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
         change = np.abs(points[:, names.index(rate)]) if rate in names else np.nanmedian(kink[:, i])
-        both[:, i] = np.hypot(noise[:, i], _MEMORY * np.nan_to_num(change) * shake_s)
+        both[:, i] = np.hypot(noise[:, i], memory * np.nan_to_num(change) * shake_s)
     return both
 
 

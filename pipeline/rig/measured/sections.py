@@ -25,7 +25,6 @@ from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-ORDER = 3
 _LEAST_SPARE = 3
 """Fewest samples on either side beyond the number of its own coefficients."""
 
@@ -62,7 +61,7 @@ def name_of(recording: xr.Dataset) -> str:
     return str(recording.attrs.get("file") or "the recording")
 
 
-def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER) -> xr.Dataset:
+def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = 3) -> xr.Dataset:
     """Return the states at the rising edges of the drive, from local polynomials with a kink at the edge.
 
     Long windows `window_s` [s] average noise, short ones follow the motion; they end at neighbouring edges. The dims
@@ -197,10 +196,6 @@ def _basis(x: Floats, order: int, smooth: bool) -> Floats:
 
 # ---- phase of the model's section ------------------------------------------------------------------
 
-_SAMPLES = 4096
-_SNAP = 2e-3
-"""Fraction of a period below which a phase counts as 0, since a flank is as wide."""
-
 
 def section_phase(parameters: Parameters, frequency_hz: float) -> float:
     """Return the phase of the model's stroboscopic section after the drive's rising edge, a fraction of the period in
@@ -208,13 +203,15 @@ def section_phase(parameters: Parameters, frequency_hz: float) -> float:
 
     It is 0 for sections at the rising edge and without a drive, 0.25 at the maximum of a sine.
     """
+    n = 4096
+    snap = 2e-3  # fraction of a period below which a phase counts as 0, since a flank is as wide
     from magpend_core.pointwise import drive_level
 
     period = 1 / frequency_hz
-    time = np.arange(2 * _SAMPLES) * period / _SAMPLES
+    time = np.arange(2 * n) * period / n
     try:
         rising = find_edges(time, drive_level(time, parameters, frequency_hz)).rising
     except SpecError:
         return 0.0
     share = float(-rising[0] / period % 1.0)
-    return 0.0 if min(share, 1.0 - share) < _SNAP else share
+    return 0.0 if min(share, 1.0 - share) < snap else share

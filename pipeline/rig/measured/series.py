@@ -16,8 +16,6 @@ from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 
-PERIODS = 10
-RTOL = 1e-9
 _LEAST = 3
 """Fewest edges that determine a frequency."""
 
@@ -27,7 +25,7 @@ def series_of(
     parameters: Parameters,
     *,
     start_s: float | None = None,
-    n_periods: int = PERIODS,
+    n_periods: int = 10,
     window_s: float = WINDOW_S,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
@@ -114,6 +112,7 @@ def _dataset(
     frequency_hz: float,
     n_periods: int,
 ) -> xr.Dataset:
+    rtol = 1e-9
     from magpend_core import trajectory
     from pipeline.rig.recordings import smooth
 
@@ -124,7 +123,7 @@ def _dataset(
     smoothed = smooth(recording.isel(sample=np.flatnonzero(margin)), edges_s=np.sort(around))
     inner = chosen[margin]
     time = recording["time"].values[chosen] - begin
-    states = trajectory(parameters, frequency_hz, start, time, rtol=RTOL, atol=RTOL)
+    states = trajectory(parameters, frequency_hz, start, time, rtol=rtol, atol=rtol)
     variables, rms = {}, {}
     for i, s in enumerate(model.states):
         source = recording[s.name].values[chosen] if s.name in recording else smoothed[s.name].values[inner]

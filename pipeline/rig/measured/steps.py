@@ -16,17 +16,8 @@ Floats = npt.NDArray[np.float64]
 
 WINDOW, LEAST = 40, 8
 """Default numbers of periods: in a window of a slow sweep; at least in a stretch."""
-_OFF = 5.0
-"""Deviation from the line through earlier edges, in standard deviations, that marks a step.
-
-Two successive edges must deviate.
-"""
 _TRUE_JITTER = 1.5
 """Ratio of an edge's scatter to the error of measuring above which the drive itself jitters."""
-_BENT = 4.0
-"""Curvature of a stretch, in standard errors, above which it is significant."""
-_AROUND = 16
-"""Number of edges on either side of a step that determine its place."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +83,11 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
 
 def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
     """Return whether the frequency changes continuously: most stretches are short, or bend in one direction."""
+    limit = 4.0  # curvature of a stretch, in standard errors, above which it is significant
     if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
         return True
     bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST])
-    clear = np.sign(bends[np.abs(bends) > _BENT])
+    clear = np.sign(bends[np.abs(bends) > limit])
     return bool(clear.size >= 3 and clear.size > 0.5 * bends.size and abs(clear.sum()) > 0.9 * clear.size)
 
 
@@ -131,6 +123,9 @@ def _noise(edges: Edges) -> float:
 
 def _reach(t: Floats, first: int, noise: float) -> int:
     """Return the index of the last edge before the frequency changes; up to there, edge times lie on a line."""
+    # deviation from the line through earlier edges, in standard deviations, that marks a step. Two successive edges
+    # must deviate.
+    limit = 5.0
     if first + 2 >= t.size:
         return int(t.size - 1)
     period = t[first + 1] - t[first]
@@ -146,7 +141,7 @@ def _reach(t: Floats, first: int, noise: float) -> int:
         miss = abs(x[k] - sx / s0 - slope * ahead)
         if t[first + k] - t[first + k - 1] > 1.5 * (period + slope):
             return first + k - 1
-        off = off + 1 if miss > _OFF * error else 0
+        off = off + 1 if miss > limit * error else 0
         if off == 2:
             return first + k - 2
         if not off:
@@ -157,7 +152,8 @@ def _reach(t: Floats, first: int, noise: float) -> int:
 
 def _placed(t: Floats, first: int, last: int) -> int:
     """Return the index of the edge at which the frequency steps, by the best fit of two lines to the edge times."""
-    low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
+    around = 16  # number of edges on either side of a step that determine its place
+    low, high = max(first, last - around), min(t.size - 1, last + around)
     choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
     costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}
     return min(costs, key=costs.__getitem__) if costs else last

@@ -10,20 +10,8 @@ import numpy as np
 from pipeline.rig.recordings.channels import Finding, runs
 from pipeline.rig.recordings.mapping import ChannelMap
 
-CLIPPED_SAMPLES = 5
-"""Fewest equal readings at the extreme that may be a clipped peak."""
-
-CLIPPED_RISE = 8.0
-"""Rise, in grains of the reading, that the slope before a clipped peak would have added at least."""
-
 JUMP_TURNS = 0.6
 """Step between neighbouring samples of an angle above which it is a wrap [turns]."""
-
-LEAP_TURNS = 0.1
-"""Deviation of a step from the steps around it above which it is no motion [turns]."""
-
-LEAP_AROUND = 9
-"""Number of steps whose median is the usual step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +85,9 @@ def _cut_off(signal: Signal) -> list[Finding]:
     Near a turning point with acceleration a, a reading of grain q stays constant for about 2*sqrt(2*q/a). The
     slope before it, times half that time, is a few grains. If it is many grains, the peak is clipped.
     """
+    # equal readings at the extreme that may be a clipped peak, and the rise, in grains of the reading, that the slope
+    # before it would have added at least
+    fewest, rise = 5, 8.0
     raw, piece = signal.raw, signal.piece
     values = np.unique(raw[np.isfinite(raw)])
     if values.size < 3:  # a switching signal
@@ -107,10 +98,10 @@ def _cut_off(signal: Signal) -> list[Finding]:
         for i, k in runs(raw == level, piece):
             length = k - i
             lead = max(3, length // 2)
-            if length < CLIPPED_SAMPLES or i < lead or piece[i - lead] != piece[i]:
+            if length < fewest or i < lead or piece[i - lead] != piece[i]:
                 continue
             slope = abs(raw[i - 1] - raw[i - lead]) / (lead - 1)
-            if slope * length / 2.0 > CLIPPED_RISE * grain:
+            if slope * length / 2.0 > rise * grain:
                 findings.append(
                     signal.found(
                         "saturated",
@@ -182,6 +173,8 @@ def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
 
     An example is a wrap whose flank was sampled: it looks like a motion, and a turn is lost.
     """
+    least = 0.1  # deviation of a step from the steps around it above which it is no motion [turns]
+    around = 9  # number of steps whose median is the usual step
     from scipy.ndimage import median_filter
 
     step = np.diff(angle)
@@ -189,10 +182,10 @@ def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
     known = np.isfinite(step)
     if not known.any():
         return []
-    usual = median_filter(step[known], size=LEAP_AROUND, mode="nearest")
+    usual = median_filter(step[known], size=around, mode="nearest")
     off = np.zeros(len(step))
     off[known] = np.abs(step[known] - usual) / (2.0 * math.pi)
-    is_leap = (off > LEAP_TURNS) & (off <= JUMP_TURNS)
+    is_leap = (off > least) & (off <= JUMP_TURNS)
     return [
         signal.found(
             "leap",

@@ -11,29 +11,19 @@ import numpy as np
 from pipeline.rig.recordings.channels import Channel, Finding, runs
 from pipeline.specification.problems import SpecError
 
-MIXED = 1e-3
-"""Relative difference of sampling intervals above which channels have different rates."""
-
 GAP_STEPS = 1.5
 """Distance of two time stamps above which there is a gap [sampling intervals]."""
 
-OFTEN = 0.02
-"""Fraction of samples with a gap before them above which the sampling is irregular."""
 
 SHAKY = 0.05
 """Median deviation of time stamps from even steps above which a late stamp may be jitter, not a gap."""
 
-AROUND = 8
-"""Number of time stamps on either side of a late one that distinguish jitter from a gap."""
 
 REPEATING = 0.01
 """Fraction of equal neighbouring time stamps above which they are coarser than the sampling."""
 
 EVEN = 0.01
 """Deviation of a time stamp from even steps that is not reported [sampling intervals]."""
-
-UNEVEN = 0.5
-"""Deviation from even steps above which samples are misplaced [sampling intervals]."""
 
 
 @dataclass(eq=False)
@@ -106,9 +96,10 @@ def resampled(channel: Channel, rate_hz: float) -> Channel:
 
 def _refuse_irregular(time: np.ndarray, is_gap: np.ndarray, step: float, source: str) -> None:
     """Raise `SpecError` if samples were taken at irregular times: every few samples would begin a piece."""
+    often = 0.02  # fraction of samples with a gap before them above which the sampling is irregular
     steps = np.diff(time)
     off = np.abs(steps / step - np.round(steps / step))
-    if is_gap.mean() > OFTEN and np.median(off) > SHAKY:
+    if is_gap.mean() > often and np.median(off) > SHAKY:
         low, high = 1e3 * np.quantile(steps, (0.01, 0.99))
         raise SpecError(
             f"{source}: samples are taken at irregular times, with steps of {low:.3g} to {high:.3g} ms: no rate fits, "
@@ -170,7 +161,8 @@ def _common_step(stretches: Sequence[Mapping[str, Channel]], stated: float | Non
 
 
 def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
-    if steps and max(steps.values()) > (1.0 + MIXED) * min(steps.values()):
+    mixed = 1e-3  # relative difference of sampling intervals above which channels have different rates
+    if steps and max(steps.values()) > (1.0 + mixed) * min(steps.values()):
         told = ", ".join(f"{name} {1.0 / s:.6g} Hz" for name, s in steps.items())
         raise SpecError(
             f"{source}: the mapped channels have different sampling rates ({told}); map channels of one "
@@ -320,16 +312,17 @@ def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarra
     Stamps beyond another gap are not used. Of neighbouring doubtful stamps the one with the largest shift
     counts.
     """
+    around = 8  # number of time stamps on either side of a late one that distinguish jitter from a gap
     phase = np.concatenate([[0.0], np.cumsum(time / step - np.arange(len(time)))])
     walls = np.concatenate([[0], late[is_sure], [len(time)]])
     place = np.searchsorted(walls, late)
-    before = np.maximum(late - AROUND, walls[place - 1])
-    after = np.minimum(late + AROUND, walls[place + is_sure])
+    before = np.maximum(late - around, walls[place - 1])
+    after = np.minimum(late + around, walls[place + is_sure])
     shift = (phase[after] - phase[late]) / (after - late) - (phase[late] - phase[before]) / (late - before)
     skipped = np.round(shift)
     doubtful = np.flatnonzero(~is_sure & (skipped >= 1.0))
     for i in doubtful:
-        beside = doubtful[np.abs(late[doubtful] - late[i]) < AROUND]
+        beside = doubtful[np.abs(late[doubtful] - late[i]) < around]
         if shift[beside].max() > shift[i]:
             skipped[i] = 0.0
     return np.asarray(skipped)
@@ -392,6 +385,7 @@ def _even(
 
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
     """Report time stamps that deviate from even steps, as a warning from half a step on."""
+    uneven = 0.5  # deviation from even steps above which samples are misplaced [sampling intervals]
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []
@@ -399,13 +393,13 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
         f"time stamps deviate from even steps of {step:.6g} s by {spread:.3g} s (standard deviation), "
         f"{worst:.3g} s at most"
     )
-    if worst < UNEVEN * step:
+    if worst < uneven * step:
         return [
             Finding(
                 "jitter", "", float(time[0]), float(time[-1]), severity="note", text=f"{text}; even steps are used."
             )
         ]
-    far = runs(np.abs(residual) >= UNEVEN * step)
+    far = runs(np.abs(residual) >= uneven * step)
     return [
         Finding(
             "jitter",

@@ -132,8 +132,6 @@ SIMULATED = "# simulated"
 """First line of a file with simulated readings."""
 
 DELIMITERS = (";", "\t", ",", " ")
-LOOKED_AT = 50
-"""Number of lines from which the form of a file is detected."""
 
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
@@ -224,7 +222,8 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
 
 def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
     """Return the form of rows read with one delimiter and decimal sign, or None if they do not fit."""
-    sample = rows[:LOOKED_AT]
+    n_lines = 50  # from which the form of a file is detected
+    sample = rows[:n_lines]
     parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
     late = parsed[len(parsed) // 2 :]
     n_columns = max((len(row) for row in late), default=0)
@@ -240,9 +239,9 @@ def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> 
     if header is not None:
         n_head = max(n_head, 1) if header else 0
     body = parsed[n_head:]
-    if not body or not numbers or n_head > LOOKED_AT // 2:
+    if not body or not numbers or n_head > n_lines // 2:
         return None
-    whole = body[:-1] if len(rows) <= LOOKED_AT and len(body) > 1 else body
+    whole = body[:-1] if len(rows) <= n_lines and len(body) > 1 else body
     if any(len(row) != n_columns for row in whole):
         return None
     n_bad = sum(row[j] is None for row in body for j in numbers if j < len(row))

@@ -41,9 +41,6 @@ INSTANTS = ("wrap", "start", "leap")
 
 SHADE = 0.4
 
-LEAST_MARK = 0.003
-"""Least width of a mark, relative to the width of the axes."""
-
 
 @style.drawn
 def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
@@ -133,7 +130,8 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _mark(axes: Sequence[Axes], rows: Sequence[Sequence[str]], ds: xr.Dataset, span: tuple[float, float]) -> list[str]:
     """Shade the times of the faults and draw the ends of pieces; return the kinds of faults that are marked."""
-    least = LEAST_MARK * (span[1] - span[0])
+    share = 0.003  # least width of a mark, relative to the width of the axes
+    least = share * (span[1] - span[0])
     kinds: dict[str, None] = {}
     for f in findings_of(ds):
         if f.kind not in MARKS or np.isnan(f.start_s) or f.end_s < span[0] or f.start_s > span[1]:

@@ -23,30 +23,6 @@ from pipeline.rig.recordings.channels import runs
 from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.specification.problems import SpecError
 
-LEAP, LEAP_SAMPLES = 0.4, 5
-"""Change of the drive, relative to its range, that counts as a switch, and its most samples."""
-
-QUIET = 10.0
-"""Least range of a drive whose switches are sought, in units of its change between samples."""
-
-GROWTH = 1.25
-"""Ratio of successive windows that are tried."""
-
-ENOUGH = 1.5
-"""Ratio of a window's score to the least one above which no longer window is tried."""
-
-SHORT = (0.7, 0.2)
-"""Lengths relative to the window; a stretch shorter than each has polynomials of one order less.
-
-On free swings of the paper's pendulum with noise of 1 and 11 mrad this halves the error of the rates there.
-"""
-
-LONG = 63
-"""Length above which windows are convolved by Fourier transforms [samples]."""
-
-MOST_SAMPLES = 200_000
-"""Most samples from which the window is chosen: the first of a longer recording."""
-
 
 def smooth(
     ds: xr.Dataset,
@@ -126,19 +102,22 @@ def _switches(ds: xr.Dataset) -> np.ndarray:
     A drive that is switched off has three levels, so edges about one middle, as in `pipeline.rig.edges`, do
     not suffice.
     """
+    quiet = 10.0  # least range of a drive whose switches are sought, in units of its change between samples
+    # change of the drive, relative to its range, that counts as a switch, and its most samples
+    least, n_samples = 0.4, 5
     if DRIVE not in ds:
         return np.empty(0)
     time, drive, piece = ds["time"].values, ds[DRIVE].values, ds["piece"].values
     known = drive[np.isfinite(drive)]
-    if len(known) <= LEAP_SAMPLES:
+    if len(known) <= n_samples:
         return np.empty(0)
     low, high = np.quantile(known, (0.01, 0.99))
     noise = float(np.median(np.abs(np.diff(known))))
-    if not high - low > QUIET * noise:
+    if not high - low > quiet * noise:
         return np.empty(0)
-    leap = np.abs(drive[LEAP_SAMPLES:] - drive[:-LEAP_SAMPLES]) > LEAP * (high - low)
+    leap = np.abs(drive[n_samples:] - drive[:-n_samples]) > least * (high - low)
     step = np.abs(np.diff(drive))
-    found = [i + int(np.argmax(step[i : k + LEAP_SAMPLES - 1])) for i, k in runs(leap, piece[LEAP_SAMPLES:])]
+    found = [i + int(np.argmax(step[i : k + n_samples - 1])) for i, k in runs(leap, piece[n_samples:])]
     return np.array([0.5 * (time[i] + time[i + 1]) for i in found])
 
 
@@ -213,8 +192,12 @@ def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
 
 def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
     """Return the window length [samples] with the least error in leave-one-out cross-validation."""
+    # ratio of successive windows that are tried, and ratio of a window's score to the least one above which no longer
+    # window is tried
+    growth, enough = 1.25, 1.5
+    most = 200_000  # samples from which the window is chosen: the first of a longer recording
     first = _least(order)
-    used = _first_samples(parts, MOST_SAMPLES)
+    used = _first_samples(parts, most)
     if len(used):
         values, used = values[used[0, 0] : used[-1, 1]], used - used[0, 0]
     longest = int(np.diff(used, axis=1).max(initial=first))
@@ -223,9 +206,9 @@ def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
         score = _smoothed(values, used, width, order, 1.0).score
         if score < best_score:
             best, best_score = width, score
-        if score > ENOUGH * best_score:
+        if score > enough * best_score:
             break
-        width = 2 * math.ceil((GROWTH * width - 1.0) / 2.0) + 1
+        width = 2 * math.ceil((growth * width - 1.0) / 2.0) + 1
     return best
 
 
@@ -250,7 +233,10 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
 
 def _order_of(own: int, width: int, order: int) -> int:
     """Return the polynomial order for a stretch shorter than the window: the shorter, the lower."""
-    return max(order - sum(own < share * width for share in SHORT), 1)
+    # lengths relative to the window; a stretch shorter than each has polynomials of one order less. On free swings of
+    # the paper's pendulum with noise of 1 and 11 mrad this halves the error of the rates there.
+    short = (0.7, 0.2)
+    return max(order - sum(own < share * width for share in short), 1)
 
 
 def _fit_ends(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
@@ -286,9 +272,10 @@ def _fit_middles(values: np.ndarray, parts: np.ndarray, width: int, order: int, 
 
 
 def _convolved(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    long = 63  # length above which windows are convolved by Fourier transforms [samples]
     from scipy.ndimage import correlate1d
     from scipy.signal import oaconvolve
 
-    if len(weights) <= LONG:
+    if len(weights) <= long:
         return np.asarray(correlate1d(y, weights, mode="constant"))
     return np.asarray(oaconvolve(y, weights[::-1], mode="same"))

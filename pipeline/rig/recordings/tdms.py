@@ -17,11 +17,6 @@ from pipeline.specification.problems import SpecError, import_extra
 SIMULATED = "simulated"
 """Property of a file with simulated readings."""
 
-LEAD_IN = 28
-"""Length of a segment's lead-in [bytes]."""
-
-BIG_ENDIAN = 1 << 6
-"""Flag in the first byte of a segment's table of contents."""
 
 _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 
@@ -109,13 +104,15 @@ def _bytes_after_last_segment(path: Path) -> int:
     The lead-in of a segment has 28 bytes: tag, table of contents, version, and the lengths of the parts that
     follow (National Instruments, "TDMS File Format Internal Structure").
     """
+    # length of a segment's lead-in [bytes], and the flag in the first byte of its table of contents
+    lead_in, big_endian = 28, 1 << 6
     size, place = path.stat().st_size, 0
     with path.open("rb") as file:
-        while size - place >= LEAD_IN:
+        while size - place >= lead_in:
             file.seek(place)
-            lead = file.read(LEAD_IN)
-            order: Literal["big", "little"] = "big" if lead[4] & BIG_ENDIAN else "little"
-            place += LEAD_IN + int.from_bytes(lead[12:20], order)
+            lead = file.read(lead_in)
+            order: Literal["big", "little"] = "big" if lead[4] & big_endian else "little"
+            place += lead_in + int.from_bytes(lead[12:20], order)
     return max(size - place, 0)
 
 
