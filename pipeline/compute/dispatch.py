@@ -64,7 +64,7 @@ WINDOW = 3
 TICK_S = 1.0
 """Time between two looks at the scheduler [s]."""
 
-ANSWER_S = 30.0
+SCHEDULER_S = 30.0
 """Longest wait for an answer of the scheduler [s]; after it the scheduler counts as gone."""
 
 WAITING_S = 30.0
@@ -212,7 +212,7 @@ class Window:
     def _look(self) -> None:
         """Ask the scheduler how many threads its workers have, and say if there are none for long."""
         try:
-            found = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_S)
+            found = self._client.sync(self._client.scheduler.ncores, callback_timeout=SCHEDULER_S)
         except (OSError, TimeoutError) as error:
             raise SchedulerError(self._lost()) from error
         self._looked, self._n_threads = self._now, sum(found.values())
@@ -264,7 +264,7 @@ async def _outcome(client: Any, future: Any) -> tuple[Any, BaseException | None]
 def _restarted(client: Any, address: str) -> None:
     """Restart a dask worker in a new thread, and wait there until it is back: a suspended worker answers slowly."""
     with contextlib.suppress(Exception):
-        client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
+        client.restart_workers([address], timeout=SCHEDULER_S, raise_for_error=False)
 
 
 def _reason(error: BaseException) -> str:

@@ -9,13 +9,6 @@ from magpend_core.lyapunov import MOST_LOSS
 from pipeline.compute.integrate import Job
 from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag, LyapunovOptions
 
-AUDIT = 0.01
-"""Largest allowed difference between the sum of the exponents and the divergence, in units of the sum of
-their moduli."""
-
-SIGMA = 5.0
-"""Standard errors by which a flow's exponent nearest to 0 may differ from 0."""
-
 
 def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     """Compute the Lyapunov exponents of the cells of a task, with their errors and quality flags.
@@ -58,17 +51,21 @@ def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:
 
     One exponent of a flow must be 0, unless the motion comes to rest.
     """
+    # largest allowed difference between the sum of the exponents and the divergence, in units of the sum of their
+    # moduli
+    audit = 0.01
+    sigma = 5.0  # standard errors by which a flow's exponent nearest to 0 may differ from 0
     flag = np.full(len(found.status), LyapunovFlag.GOOD, np.int8)
     if found.is_whole:
         missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
         moduli = np.abs(found.exponents)
-        allowed = AUDIT * moduli.sum(axis=1)
+        allowed = audit * moduli.sum(axis=1)
         flag[missing > allowed] = LyapunovFlag.AUDIT_FAILED
         if is_flow:
             nearest = moduli.argmin(axis=1)[:, None]
             error = np.take_along_axis(found.stderr, nearest, axis=1)[:, 0]
             least = np.take_along_axis(moduli, nearest, axis=1)[:, 0]
-            flag[least > np.maximum(allowed, SIGMA * error)] = LyapunovFlag.AUDIT_FAILED
+            flag[least > np.maximum(allowed, sigma * error)] = LyapunovFlag.AUDIT_FAILED
     flag[found.loss > MOST_LOSS] = LyapunovFlag.UNRESOLVED
     flag[found.status != Status.BOUNDED] = LyapunovFlag.FAILED
     return flag

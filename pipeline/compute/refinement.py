@@ -33,7 +33,7 @@ from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
 from magpend_core.status import Status
 
-SAME = 4.0
+SAME_ORBIT_CLOSURES = 4.0
 """Two cells are on one orbit if their sections differ by at most this many closure tolerances.
 
 Each lies within the tolerance of its orbit, or within twice that on the slow spirals that
@@ -100,7 +100,7 @@ def infer(
     `magpend_core.run_branches` for the flat indices of some cells. An inferred cell has the status ``INFERRED``, no
     work, and all that says where it ends (section, period, turns, exponents) from the first corner of its box.
     """
-    orbits = Orbits(SAME * closure_tolerance, system)
+    orbits = Orbits(SAME_ORBIT_CLOSURES * closure_tolerance, system)
     values: dict[str, np.ndarray] = {}
     n_cells = int(np.prod(shape))
 

@@ -36,11 +36,6 @@ if TYPE_CHECKING:
 LOOKED_AT = 129
 """Number of last sections of a trajectory that are compared."""
 
-FEWEST = 8
-"""Fewest sections for a decision."""
-
-NEAR = 0.1
-"""Largest distance from an orbit at which a rate is trusted: chaotic sections also approach by chance."""
 
 LONGEST: int = Integration.model_fields["max_orbit_period"].default
 TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
@@ -83,10 +78,11 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
 
     The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter to quarter,
     the sum of all that follow bounds the distance from the orbit, as in `magpend_core.engine.observers.closed_period`.
-    Return None for fewer than `FEWEST` sections.
+    Return None for fewer than 8 sections.
     """
+    fewest = 8  # sections for a decision
     n = len(sections)
-    if n < FEWEST:
+    if n < fewest:
         return None
     lags = [_lag_distances(sections, p, system) for p in range(1, min(LONGEST, n // 4) + 1)]
     found = [_judged(p, distances) for p, distances in enumerate(lags, 1)]
@@ -121,13 +117,14 @@ def _late(distances: np.ndarray) -> float:
 
 def _judged(p: int, distances: np.ndarray) -> Closing:
     """Decide from the distances between points `p` periods apart whether a trajectory closes with period `p`."""
+    near = 0.1  # largest distance from an orbit at which a rate is trusted: chaotic sections also approach by chance
     quarter = len(distances) // 4
     last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
     if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks
         return Closing(p, float(last[-1]), 0.0)
     rate = math.log(last[1] / last[3]) / (2 * quarter) if last[3] > 0.0 else 0.0
     bound = float(last[-1] / -math.expm1(-rate * p)) if rate > 0.0 else math.inf
-    if bound > NEAR or not (np.diff(last) < 0.0).all():
+    if bound > near or not (np.diff(last) < 0.0).all():
         return Closing(p, float(last[-1]), math.inf)
     return Closing(p, bound, max(0.0, math.log(bound / TOLERANCE) / rate))
 

@@ -13,6 +13,7 @@ from magpend_core.models.text.definition import OMEGA
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of
 from pipeline.layout.cells import initial_states, parameter_axes
+from pipeline.specification.drift import MOST_CORNERS
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
@@ -29,8 +30,6 @@ them an edge is to be expected.
 """
 PERIODIC, TWICE = 1e-6, 2
 """Largest relative difference after a period, and least number of instants with a larger one."""
-MOST_CORNERS = 64
-"""Most corners of the box of swept parameters at which the equations are evaluated."""
 
 
 def check_starts(spec: Spec) -> None:

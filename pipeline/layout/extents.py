@@ -31,20 +31,14 @@ from pipeline.specification.tables import FREQUENCY
 MOST_CELLS, MOST_POINTS = 32, 8
 """Most cells whose motion is integrated, and most parameter points that they are spread over."""
 
-ATTEMPTS, TOLERANCE = 400, 3e-3
-"""Attempted steps or iterates, and a step's error relative to the extent of its cell's motion so far."""
-
-FIRST = 12
-"""Attempts after which a cell takes its first step whatever the error: of a state that leaves its start by a high power
-of the time, the error is a share of its motion that no shorter step makes less."""
-
-PER_PERIOD = 12
-"""Least number of steps per period of a drive."""
+ATTEMPTS = 400
+"""Attempted steps or iterates."""
 
 GROWS = 1.2
 """A state whose later motion leaves the range of the earlier one by this factor is on its way to somewhere else."""
 
-LEAST_SHARE = 0.1
+
+LEAST_OF_MOTION = 0.1
 """Least share of the whole motion, or of the largest value, that counts: more than what errors of the steps move."""
 
 LEAST_EXTENT = 1e-9
@@ -133,7 +127,7 @@ def _size(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
         return start, start
     high = float(values[:, settles].max())
     low = float(np.where(times >= 0.5 * last, values, 0.0)[:, settles].max())
-    return max(low, LEAST_SHARE * high), high
+    return max(low, LEAST_OF_MOTION * high), high
 
 
 def _extent(times: np.ndarray, values: np.ndarray) -> tuple[float, float] | None:
@@ -151,7 +145,7 @@ def _extent(times: np.ndarray, values: np.ndarray) -> tuple[float, float] | None
     else:
         low, high = early[0].min(), early[1].max()
         settles = np.isfinite(values[0])
-    short = LEAST_SHARE * (max(high, early[1][settles].max()) - min(low, early[0][settles].min())) - (high - low)
+    short = LEAST_OF_MOTION * (max(high, early[1][settles].max()) - min(low, early[0][settles].min())) - (high - low)
     if short > 0.0:
         low, high = low - 0.5 * short, high + 0.5 * short
     return (float(low), float(high)) if high - low > LEAST_EXTENT * max(abs(low), abs(high)) else None
@@ -185,11 +179,16 @@ class _Motion:
 
         A cell that has arrived at its end, or fails, stays where it is.
         """
+        tolerance = 3e-3  # a step's error relative to the extent of its cell's motion so far
+        # attempts after which a cell takes its first step whatever the error: of a state that leaves its start by a
+        # high power of the time, the error is a share of its motion that no shorter step makes less
+        first = 12
+        per_period = 12  # least number of steps per period of a drive
         t, slope = np.zeros(y.shape[1]), self._rates(np.zeros(y.shape[1]), y)
-        longest = 1.0 / (self.columns["f"] * PER_PERIOD) if self.definition.has_drive else ends / PER_PERIOD
-        least = TOLERANCE * np.ptp(y, axis=1, keepdims=True)  # a cell that begins at rest hardly moves
-        pace = np.where(least > 0.0, np.abs(slope) * TOLERANCE / least, 0.0).max(axis=0)
-        h = np.minimum(longest, TOLERANCE * np.where(pace > 0.0, 1.0 / pace, longest))
+        longest = 1.0 / (self.columns["f"] * per_period) if self.definition.has_drive else ends / per_period
+        least = tolerance * np.ptp(y, axis=1, keepdims=True)  # a cell that begins at rest hardly moves
+        pace = np.where(least > 0.0, np.abs(slope) * tolerance / least, 0.0).max(axis=0)
+        h = np.minimum(longest, tolerance * np.where(pace > 0.0, 1.0 / pace, longest))
         low, high, times, path = y, y, [t], [y]
         for attempt in range(ATTEMPTS):
             h = np.minimum(h, ends - t)
@@ -198,8 +197,8 @@ class _Motion:
             after, k4, error = self._step(t, y, h, slope)
             extent = np.fmax(high, after) - np.fmin(low, after)
             size = np.maximum(np.maximum(extent, least), LEAST_EXTENT * np.abs(y))
-            worst = np.where(size > 0.0, error / (TOLERANCE * size), 0.0).max(axis=0)
-            is_near = (worst <= 1.0) | ((t == 0.0) & (attempt >= FIRST))
+            worst = np.where(size > 0.0, error / (tolerance * size), 0.0).max(axis=0)
+            is_near = (worst <= 1.0) | ((t == 0.0) & (attempt >= first))
             taken = np.isfinite(after).all(axis=0) & np.isfinite(k4).all(axis=0) & is_near
             landed = self._after_impacts(t + h, y, after)
             if landed is not after:

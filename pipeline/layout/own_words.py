@@ -44,9 +44,6 @@ _ERRORS = {
 _TOLD = re.compile(rf"\b{FREQUENCY} = ([-+.,e\d ]*\d)(?: to ([-+.e\d]*\d))?(?: ± ([-+.e\d]*\d))?")
 """Values of the frequency in a text, or a range of them, with an error."""
 
-ROUNDED = 7
-"""Number of digits of a value in a text that may be rounded."""
-
 
 def rate_attribute(word: str) -> dict[str, str]:
     """Return the dataset attribute that names the word; `in_own_words` reads it."""
@@ -130,13 +127,14 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
 
 def _told(text: str, rate: Rate) -> str:
     """Return a text with the values of the frequency in it as those of its rate."""
+    rounded = 7  # number of digits of a value in a text that may be rounded
 
     def converted(found: re.Match[str]) -> str:
         texts = [*found[1].split(", "), *([found[2]] if found[2] else [])]
         values = np.array([float(x) for x in texts])
         # a rounded value loses its last digit, so that what was round in the word is round again
         digits = [len(re.sub(r"e.*|\D", "", x).lstrip("0")) for x in texts]
-        told = [f"{x:.{n - 1 if ROUNDED <= n < 10 else 10}g}" for x, n in zip(rate.given(values), digits, strict=True)]
+        told = [f"{x:.{n - 1 if rounded <= n < 10 else 10}g}" for x, n in zip(rate.given(values), digits, strict=True)]
         error = f" ± {float(found[3]) * rate.slope(values[-1]):.0e}" if found[3] else ""
         between = " to " if found[2] else ", "
         return f"{rate.column} = {between.join(told[::-1] if found[2] and rate.inverse else told)}{error}"

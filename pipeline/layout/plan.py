@@ -34,7 +34,7 @@ LEAST_LATTICE = 64
 A basin boundary is followed within a tile but not into the next one, so smaller tiles miss more of it.
 """
 
-LANES = 16
+LANES_OF_TASK = 16
 """Tasks take multiples of this number of trajectories, so that the kernel's lanes are full."""
 
 MOST_TASKS = 100_000
@@ -42,7 +42,7 @@ MOST_TASKS = 100_000
 
 WANTED_TASKS = 32
 LEAST_SECONDS, MOST_SECONDS = 2.0, 20.0
-CHUNK_BYTES = 8_000_000
+PLAN_CHUNK_BYTES = 8_000_000
 TASK_BYTES = 64_000_000
 
 
@@ -156,7 +156,7 @@ class Plan:
         if self.path is not None:
             n_points = chunk[self.path]
             per_point = math.prod(chunk) // n_points * variable.itemsize(sizes)
-            most = max(1, CHUNK_BYTES // per_point)
+            most = max(1, PLAN_CHUNK_BYTES // per_point)
             # as few chunks as possible; successive tasks share none
             apart = self.task_grid[self.path] > 1
             chunk[self.path] = _part(n_points, most) if apart else _share(n_points, most)
@@ -226,11 +226,11 @@ def _seconds_at(spec: Spec) -> np.ndarray | None:
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
     wanted_seconds = _wanted_seconds(n_cells * seconds_per_cell)
     per_cell = _bytes_per_cell(spec)
-    limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
+    limit = PLAN_CHUNK_BYTES if n_points == 1 else TASK_BYTES
     n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
     # blocks are filled dim by dim, which can double the number of tasks
     n = max(n, 2 * n_cells / n_points / MOST_TASKS)
-    return max(1, round(n / LANES)) * LANES
+    return max(1, round(n / LANES_OF_TASK)) * LANES_OF_TASK
 
 
 def _wanted_seconds(core_seconds: float) -> float:
@@ -258,7 +258,7 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
         by_time = _wanted_seconds(math.prod(cells.shape) * seconds_per_cell) / (n_branches * seconds_per_cell)
         at = _seconds_at(spec)
         at_most = MOST_SECONDS / (n_branches * (seconds_per_cell if at is None else float(at.max())))
-        by_size = CHUNK_BYTES / (n_branches * largest)
+        by_size = PLAN_CHUNK_BYTES / (n_branches * largest)
         points = _share(n_points, max(1, int(min(by_time, at_most, by_size))))
     block[cells.path] = min(points, n_points)
     return tuple(block)

@@ -28,9 +28,6 @@ DRAWN = 8
 MOST_PERIODS, MOST_RATES = 4, 20_000
 """Returns or drive periods for which a cell is integrated, and most evaluations of its rates."""
 
-RTOL = 1e-4
-"""Tolerance of the logarithms: only the order of magnitude counts."""
-
 
 def small_states(ds: xr.Dataset) -> list[str]:
     """Return a warning for each state of a run's cube that falls below the run's `atol` and comes back."""
@@ -119,6 +116,7 @@ def _path(
     """Return the sizes of the states along a trajectory (step, state), integrated with logarithms of some states; empty
     if a state is 0 or the trajectory takes too many steps.
     """
+    rtol = 1e-4  # of the logarithms: only the order of magnitude counts
     from scipy.integrate import LSODA
 
     if not np.isfinite(start).all() or (start[logs] == 0.0).any() or not np.isfinite(seconds):
@@ -134,7 +132,7 @@ def _path(
         return np.where(logs, rates / np.where(logs, y, 1.0), rates)
 
     first = np.where(logs, np.log(np.abs(np.where(logs, start, 1.0))), start)
-    solver = LSODA(slopes, 0.0, first, seconds, rtol=RTOL, atol=RTOL * np.where(logs, 1.0, model.scales))
+    solver = LSODA(slopes, 0.0, first, seconds, rtol=rtol, atol=rtol * np.where(logs, 1.0, model.scales))
     path = [np.abs(states(first))]
     while solver.status == "running" and solver.nfev < MOST_RATES:
         if solver.step() is not None:

@@ -27,7 +27,7 @@ _TEMPLATES = Path(__file__).with_name("templates")
 _DPI = 150
 """Resolution of pictures: 1050 pixels for the width of a journal's page, sharp on most screens."""
 
-MOST_ROWS = 60
+ROWS_OF_PAGE = 60
 """Most rows of a table on a page; the command beside the table lists all."""
 
 
@@ -181,11 +181,11 @@ def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -
 def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "") -> Grid:
     """Make a table block from rows of values; empty columns are left out."""
     names = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [[text_of(row.get(name)) for name in names] for row in rows[:MOST_ROWS]]
+    cells = [[text_of(row.get(name)) for name in names] for row in rows[:ROWS_OF_PAGE]]
     kept = [k for k in range(len(names)) if any(line[k] not in ("", "-") for line in cells)]
     shown = [[line[k] for k in kept] for line in cells]
     heads = [names[k].replace("_", " ") for k in kept]
-    return Grid(heads, shown, caption, command, max(0, len(rows) - MOST_ROWS))
+    return Grid(heads, shown, caption, command, max(0, len(rows) - ROWS_OF_PAGE))
 
 
 def text_of(value: Any) -> str:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.models.model import Model
 
-TWO_PI = 2.0 * np.pi
-
 _MIXING = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
 """Shifts and factors of the generator splitmix64, which `hashes` mixes bits with."""
 
@@ -55,7 +53,7 @@ class Geometry:
     @cached_property
     def circumference(self) -> np.ndarray:
         """Circumference of each angle's circle in units of its scale; 0 for states that are no angles."""
-        return np.where(self.is_angle, TWO_PI / self._divisors, 0.0)
+        return np.where(self.is_angle, 2.0 * np.pi / self._divisors, 0.0)
 
     @cached_property
     def _divisors(self) -> np.ndarray:

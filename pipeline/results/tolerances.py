@@ -41,7 +41,7 @@ EXTEND_RTOL = 1e-8
 
 # ---- closed cells and orbits -------------------------------------------------------------------
 
-CLOSURE = 1e-5
+CELL_CLOSURE = 1e-5
 """Extended cells count as closed within this distance."""
 
 EXTEND_CLOSURE = 1e-5
@@ -109,7 +109,7 @@ MATRIX_ERROR = 1e-9
 RATE_ERROR = 1e-9
 """Relative error of a Jacobian's entries at a polished equilibrium."""
 
-ROUNDING = 1e-15
+RATE_ROUNDING = 1e-15
 """Relative error of a rate by rounding, near an equilibrium."""
 
 PLACE_ERROR = 30.0

@@ -23,10 +23,10 @@ from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, checked, unknown_key, unknown_name
 from pipeline.specification.tables import Table
 
-SAMPLES = 128
+SAMPLES_OF_PERIOD = 128
 """Samples of the controller in each period; its output is constant between two of them."""
 
-N_HARMONICS = 5
+TARGET_HARMONICS = 5
 """Harmonics of the target, besides its mean."""
 
 
@@ -72,7 +72,7 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
     patience, least_gain = 3, 0.7
     sizes = np.asarray(targets, np.float64)
     plant = _Plant.of(rig, sizes)
-    target = np.zeros((len(sizes), N_HARMONICS + 1), np.complex128)
+    target = np.zeros((len(sizes), TARGET_HARMONICS + 1), np.complex128)
     target[:, 1] = sizes
     random = np.random.default_rng(rig.seed)
     state = np.zeros((len(sizes), len(rig.parameters.model.state_names)))
@@ -86,7 +86,7 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
         worst.append(float(residue.max()))
         if worst[-1] < smallest or (len(worst) > patience and worst[-1] > least_gain * worst[-1 - patience]):
             break
-        target = np.where(np.arange(N_HARMONICS + 1) == 1, target, response)
+        target = np.where(np.arange(TARGET_HARMONICS + 1) == 1, target, response)
     cycles = np.stack(np.split(seen, rig.n_measure))
     peaks = 0.5 * np.ptp(cycles, axis=1)
     drives = np.abs([_harmonics(part)[:, 1] for part in np.split(output, rig.n_measure)])
@@ -128,12 +128,12 @@ class _Plant:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Integrate the rigs for some periods; return final states, and measured state and output at each sample."""
         period = 1.0 / self.rig.frequency_hz
-        step, omega = period / SAMPLES, 2.0 * np.pi * self.rig.frequency_hz
-        orders = np.arange(N_HARMONICS + 1)
-        seen, output = (np.empty((n_periods * SAMPLES, len(state))) for _ in range(2))
+        step, omega = period / SAMPLES_OF_PERIOD, 2.0 * np.pi * self.rig.frequency_hz
+        orders = np.arange(TARGET_HARMONICS + 1)
+        seen, output = (np.empty((n_periods * SAMPLES_OF_PERIOD, len(state))) for _ in range(2))
         for k in range(len(seen)):
             # the controller aims at the middle of its step, since its output is held
-            turn = np.exp(1j * omega * orders * (k % SAMPLES) * step)
+            turn = np.exp(1j * omega * orders * (k % SAMPLES_OF_PERIOD) * step)
             aim, aim_rate = (target * turn).sum(axis=1).real, (target * turn * 1j * omega * orders).sum(axis=1).real
             noise = self.rig.noise * random.normal(size=(2, len(state))) if self.rig.noise else np.zeros((2, 1))
             x, v = state[:, self.place[0]] + noise[0], state[:, self.place[1]] + omega * noise[1]
@@ -181,7 +181,7 @@ def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray
 def _harmonics(signal: np.ndarray) -> np.ndarray:
     """Return the complex Fourier coefficients (target, harmonic) of a signal (sample, target) over whole periods."""
     n = len(signal)
-    lines = np.fft.rfft(signal, axis=0)[:: n // SAMPLES][: N_HARMONICS + 1].T / n
+    lines = np.fft.rfft(signal, axis=0)[:: n // SAMPLES_OF_PERIOD][: TARGET_HARMONICS + 1].T / n
     lines[:, 1:] *= 2.0
     return np.asarray(lines)
 

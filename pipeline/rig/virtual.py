@@ -79,7 +79,7 @@ class Step:
         return self.n_periods / self.frequency_hz
 
 
-TOLERANCE = 1e-11
+RECORD_RTOL = 1e-11
 """Relative and absolute tolerance of the integration."""
 
 Sensors = AnyMapping[str, Sensor | DriveSensor]
@@ -210,8 +210,8 @@ def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndar
         start[None],
         [times],
         drives=drives,
-        rtol=TOLERANCE,
-        atol=TOLERANCE,
+        rtol=RECORD_RTOL,
+        atol=RECORD_RTOL,
     )
     status = Status(int(found.status[0]))
     if not np.isfinite(found.states[0]).all():

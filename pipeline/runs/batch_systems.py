@@ -16,7 +16,7 @@ from pipeline.specification.clusters import QUEUES, SYSTEMS, Cluster, cluster_of
 from pipeline.specification.problems import SpecError, unknown_key
 
 LOOKED_FOR = "sbatch (SLURM), bsub (LSF), qsub (PBS, Torque, Grid Engine)"
-ANSWER_S = 20.0
+QUESTION_S = 20.0
 """Longest time for a batch system to answer a question [s]."""
 
 _WRAPPER = re.compile(rb"\bSlurm\b|\bSLURM\b")
@@ -79,7 +79,7 @@ def answer(command: Sequence[str]) -> str | None:
             stderr=subprocess.STDOUT,
             encoding="utf-8",
             errors="replace",
-            timeout=ANSWER_S,
+            timeout=QUESTION_S,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired):

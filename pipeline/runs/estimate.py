@@ -25,23 +25,14 @@ from pipeline.specification.spec import Spec
 BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
 """Size of a sample: branches (two groups of lanes or more), most branches, points of each branch."""
 
-SPEED_S = 0.25
-"""Time of each of the two stretches in which the speed is measured, by the rule of thumb [s]."""
-
-CLOSING_S = 0.8
-"""Most time for measuring when cells close, by the rule of thumb [s]."""
 
 LEAST_PERIODS = 8
-NEVER_CLOSES = 1e-300
 
 WRITTEN, WRITING_S = 20, 0.5
 """Number of tasks that are written to time the writing, and the most time for it [s]."""
 
 MOST_WRITTEN_BYTES, MOST_WRITTEN_CELLS = 20_000_000, 1_000_000
 """Size of a task [bytes] and of a run [cells] above which a rule gives the time of writing."""
-
-FILE_S = 0.004
-"""Time to write a file, by the rule [s]."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +77,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
     float
         Time of a task's files and its commit record [s].
     """
+    file_s = 0.004  # time to write a file, by the rule [s]
     from pipeline.runs.run import identity_here
     from pipeline.store.commits import write_task
     from pipeline.store.keys import keys_of
@@ -93,7 +85,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
 
     n_files = len(keys_of(plan, 0)) + 1
     if plan.n_cells > MOST_WRITTEN_CELLS or plan.n_bytes / plan.n_tasks > MOST_WRITTEN_BYTES:
-        return n_files * FILE_S
+        return n_files * file_s
     rng, taken = np.random.default_rng(0), []
     with tempfile.TemporaryDirectory(prefix="magpend-estimate-") as folder:
         info = create(Path(folder) / "run", spec, plan, identity_here(spec, plan), "")
@@ -169,10 +161,11 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
     Two stretches are measured: one from the initial states, and one from the end of the first, which
     represents the rest of the cell.
     """
+    speed_s = 0.25  # time of each of the two stretches in which the speed is measured, by the rule of thumb [s]
     by_rule = float(spec.motion.seconds_per_period(inputs.frequency_hz).sum())
-    n_periods = int(min(max(SPEED_S / by_rule, LEAST_PERIODS), most))
+    n_periods = int(min(max(speed_s / by_rule, LEAST_PERIODS), most))
     ends, first, seconds = _stretch(spec, inputs, n_periods)
-    if seconds > 4 * SPEED_S:  # far slower than the rule: one stretch must suffice
+    if seconds > 4 * speed_s:  # far slower than the rule: one stretch must suffice
         return first, n_periods, seconds
     _, first, first_s = _stretch(spec, inputs, n_periods)
     _, later, later_s = _stretch(spec, replace(inputs, initial_states=ends), n_periods)
@@ -185,11 +178,12 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
     The time is processor time, so that other programs do not count.
     """
+    never = 1e-300
     from pipeline.compute.integrate import integrate
 
     # a tolerance that no cell meets, since an integration without the test would need another kernel
     integration = spec.integration.model_copy(
-        update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": NEVER_CLOSES}
+        update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": never}
     )
     started = time.process_time()
     values = integrate(spec.replace(integration=integration), inputs)
@@ -206,15 +200,16 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
     A first sample gives the number of cells for which there is time.
     """
+    closing_s = 0.8  # most time for measuring when cells close, by the rule of thumb [s]
     from pipeline.compute.integrate import integrate
 
     rng, n_keep = np.random.default_rng(1), spec.integration.n_keep
-    found, n_branches, left = np.empty(0), BRANCHES, CLOSING_S
+    found, n_branches, left = np.empty(0), BRANCHES, closing_s
     while left > 0:
         inputs = _sample(spec, plan, rng, n_branches, pairs=True)
         a_period = ratio * float(spec.motion.seconds_per_period(inputs.frequency_hz).mean())
         if not len(found):
-            cap = int(min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))
+            cap = int(min(most, max(closing_s / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))
             integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})
         started = time.process_time()
         values = integrate(spec.replace(integration=integration), inputs)

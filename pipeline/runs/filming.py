@@ -27,7 +27,7 @@ from pipeline.products.diagrams import AnimationOptions
 from pipeline.products.reporting import silent
 from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun, Echo, Source, refused
-from pipeline.runs.instants import RTOL, Moving
+from pipeline.runs.instants import FILM_RTOL, Moving
 from pipeline.runs.naming import named
 from pipeline.specification.problems import SpecError, validated
 
@@ -367,7 +367,7 @@ def of_start(parameters: Parameters, frequency_hz: float, state: Sequence[float]
     start = np.asarray(state, dtype=np.float64)
     if n_transient:
         begin = np.array([n_transient / frequency_hz])
-        start = trajectory(of_flow(parameters), frequency_hz, start, begin, rtol=RTOL, atol=RTOL)[0]
+        start = trajectory(of_flow(parameters), frequency_hz, start, begin, rtol=FILM_RTOL, atol=FILM_RTOL)[0]
     said = ", ".join(f"{s.name} = {v:.4g}" for s, v in zip(parameters.model.states, start, strict=True))
     return Moving(said, COLOURS[0], parameters, frequency_hz, start, np.empty((0, start.size)))
 

@@ -19,17 +19,10 @@ if TYPE_CHECKING:
 
     from magpend_core.models.model import Parameters
 
-RTOL = 1e-9
-PERIOD_IN_FILM_S = 2.0
-"""Time of a period in the film if no speed is given: slow enough to follow, fast enough to wait for."""
+FILM_RTOL = 1e-9
 
 MOST_CHANGE, MOST_CHANGE_OF_SPEED = 2.0, 1.1
 """Largest factor by which the speed is changed so that whole periods are shown: chosen here, or given."""
-
-SAMPLES_PER_PERIOD = 240
-"""Samples per period, so many that lines look smooth."""
-
-MOST_SAMPLES = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -74,10 +67,13 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
     SpecError
         If the film has too many frames or shows too much time.
     """
+    # time of a period in the film if no speed is given: slow enough to follow, fast enough to wait for
+    period_in_film_s = 2.0
+    per_period, most_samples = 240, 2_000_000  # samples per period, so many that lines look smooth, and in all
     cycle = min((_cycle(m) for m in moving), default=1.0)
     n_frames = max(2, round(options.seconds * options.fps))
     length = n_frames / options.fps
-    duration = asked = length * (options.speed or _nice(cycle / PERIOD_IN_FILM_S))
+    duration = asked = length * (options.speed or _nice(cycle / period_in_film_s))
     common = _common([m.period_s for m in moving if m.period_s != 0.0], cycle)
     # what rests repeats whatever is shown
     whole = asked if not common else common * max(1, round(asked / common))
@@ -86,14 +82,14 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
     if repeats:
         duration = whole
     speed = duration / length
-    substeps = max(1, math.ceil(duration / n_frames / cycle * SAMPLES_PER_PERIOD))
+    substeps = max(1, math.ceil(duration / n_frames / cycle * per_period))
     problems = []
     if n_frames > MOST_FRAMES:
         problems.append(
             f"--seconds {options.seconds:g} at --fps {options.fps:g}: {n_frames} frames; at most "
             f"{MOST_FRAMES}. Lower one of the two."
         )
-    if len(moving) * n_frames * substeps > MOST_SAMPLES:
+    if len(moving) * n_frames * substeps > most_samples:
         problems.append(
             f"--seconds {options.seconds:g} at --speed {speed:g}: {duration / cycle:.4g} periods are too "
             "many for a film; lower one of the two."
@@ -162,7 +158,7 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
         [
             np.tile(m.start, (times.size, 1))
             if m.period_s == 0.0
-            else trajectory(of_flow(m.parameters), m.frequency_hz, m.start, times, rtol=RTOL, atol=RTOL)
+            else trajectory(of_flow(m.parameters), m.frequency_hz, m.start, times, rtol=FILM_RTOL, atol=FILM_RTOL)
             for m in moving
         ]
     )

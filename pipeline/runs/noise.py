@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.layout.cells import CellMap
 from pipeline.motion.noisy import Noisy
 from pipeline.motion.steady import Inputs
-from pipeline.specification.noise import STEPS, NoiseTable
+from pipeline.specification.noise import STEPS_PER_PERIOD, NoiseTable
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.store.run import RunDirectory
@@ -103,11 +103,11 @@ def _stiff_problem(motion: Noisy, inputs: Inputs) -> str | None:
 def _step_key(noise: NoiseTable) -> str:
     if noise.step is not None:
         return f"step = {noise.step:g}"
-    return f"steps_per_period = {noise.steps_per_period or STEPS}"
+    return f"steps_per_period = {noise.steps_per_period or STEPS_PER_PERIOD}"
 
 
 def _remedy(noise: NoiseTable, factor: float) -> str:
     """Return the key and value with steps shorter by a factor."""
     if noise.step is not None:
         return f"step = {noise.step / factor:.2g}"
-    return f"steps_per_period = {int(np.ceil((noise.steps_per_period or STEPS) * factor))}"
+    return f"steps_per_period = {int(np.ceil((noise.steps_per_period or STEPS_PER_PERIOD) * factor))}"

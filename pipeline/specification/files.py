@@ -15,7 +15,7 @@ from typing import Any
 from magpend_core.models.imported import KEY
 from pipeline.specification.problems import SpecError, unknown_name
 
-MOST_BYTES = 1_000_000
+MOST_TOML_BYTES = 1_000_000
 MOST_TEXT_BYTES = 20_000_000
 """Most bytes of a CSV file that a table names."""
 MOST_ELEMENTS = 100_000
@@ -43,7 +43,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     """
     try:
         with open(path, "rb") as file:
-            content = file.read(MOST_BYTES + 1)
+            content = file.read(MOST_TOML_BYTES + 1)
     except OSError as error:
         raise SpecError(f"{path}: {_unreadable(error)}") from None
     return toml_tables(content, str(path))
@@ -207,9 +207,9 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
         If the text is not TOML, or holds data that no specification can have.
     """
     try:
-        if len(content) > MOST_BYTES:
+        if len(content) > MOST_TOML_BYTES:
             raise SpecError(
-                f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the limit of a specification; "
+                f"{name}: has more than {MOST_TOML_BYTES // 1_000_000} MB, the limit of a specification; "
                 "give ranges, or random starts with a seed, instead of lists."
             )
         data = tomllib.loads(content.decode("utf-8"))

@@ -18,9 +18,8 @@ from pipeline.specification.tables import Table
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
 
-STEPS = 256
+STEPS_PER_PERIOD = 256
 """Steps per period if the specification gives neither their number nor their size."""
-MOST_STEPS = 10_000_000
 
 
 def _number_or_text(value: Any) -> str:
@@ -44,8 +43,8 @@ class NoiseTable(Table):
         default=None, description="Stochastic integral; required where a strength depends on its own state."
     )
     seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Seed of the noise.")
-    steps_per_period: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None = Field(
-        default=None, description=f"Equal steps per period; {STEPS} by default."
+    steps_per_period: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
+        default=None, description=f"Equal steps per period; {STEPS_PER_PERIOD} by default."
     )
     step: Annotated[float, Field(gt=0)] | None = Field(
         default=None,
@@ -72,7 +71,7 @@ class NoiseTable(Table):
     def steps_at(self, frequency_hz: np.ndarray) -> np.ndarray:
         """Return the number of steps per period at each drive frequency."""
         if self.step is None:
-            return np.full(np.shape(frequency_hz), self.steps_per_period or STEPS, np.int64)
+            return np.full(np.shape(frequency_hz), self.steps_per_period or STEPS_PER_PERIOD, np.int64)
         # a period that is a whole number of steps, up to rounding, is divided into that number
         wanted = 1.0 / (np.asarray(frequency_hz) * self.step)
         return np.maximum(np.ceil(wanted * (1.0 - 1e-12)), 1.0).astype(np.int64)

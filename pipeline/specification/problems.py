@@ -27,17 +27,14 @@ class SpecError(ValueError):
         super().__init__("\n".join(self.problems))
 
 
-SHOWN = 120
-"""Most characters of a value that a message repeats."""
-
-
 def shown(value: Any) -> str:
     """Format a value for a message; a long one is cut in the middle."""
+    most = 120  # characters of a value that a message repeats
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # a whole number of thousands of digits; a list in itself
         return f"a {type(value).__name__}"
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 40]} ... {text[-30:]}"
+    return text if len(text) <= most else f"{text[: most - 40]} ... {text[-30:]}"
 
 
 def unknown_key(path: str, key: str, known: Iterable[str]) -> str:

@@ -37,10 +37,7 @@ DUTY = "duty_cycle"
 
 HOW = "; make one with: magpend recordings drive"
 """Remedy for a drive file that cannot be read."""
-MOST_PROBLEMS = 5
 _COINCIDENT_S = 1e-9
-_BAND = 0.5
-"""Fraction of the torque's range that an edge must cross to count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +186,10 @@ def rising_edges(time: np.ndarray, level: np.ndarray) -> np.ndarray:
         An edge counts if it crosses the middle half of the distance between them. If the signal crosses the
         middle several times on an edge, the mean of the first and the last crossing is returned.
     """
+    crossed = 0.5  # fraction of the torque's range that an edge must cross to count
     even = np.interp(np.linspace(time[0], time[-1], max(20_000, 2 * len(time))), time, level)
     low, high = np.percentile(even, [2, 98])
-    above, band = level - 0.5 * (low + high), 0.5 * _BAND * (high - low)
+    above, band = level - 0.5 * (low + high), 0.5 * crossed * (high - low)
     if not band > 0:
         return np.zeros(0)
     state = np.where(above > band, 1, np.where(above < -band, -1, 0))
@@ -239,9 +237,10 @@ def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[n
 
 
 def _few(problems: list[str], file: str) -> list[str]:
-    if len(problems) <= MOST_PROBLEMS:
+    most = 5
+    if len(problems) <= most:
         return problems
-    return [*problems[:MOST_PROBLEMS], f"{file}: and {len(problems) - MOST_PROBLEMS} more lines like these."]
+    return [*problems[:most], f"{file}: and {len(problems) - most} more lines like these."]
 
 
 def _edge_problems(rising: np.ndarray, falling: np.ndarray, file: str) -> list[str]:

@@ -33,8 +33,6 @@ CHUNK_BYTES = 500_000
 SLAB_BYTES = 200_000_000
 """Bytes that are held in memory at a time."""
 
-LEVEL = 6
-"""Compression level of gzip."""
 
 PRIVATE = ("host",)
 """Attributes of an opened cube that are not published."""
@@ -142,6 +140,7 @@ def _create(
     attrs: Mapping[Any, Any],
 ) -> Any:
     """Create a zarr array with codecs that browsers can decode, and a checksum at the end of each chunk."""
+    level = 6  # of gzip
     dtype: np.dtype[Any] = like.dtype
     texts = dtype.kind == "U"
     shuffled = [] if texts or dtype.itemsize == 1 else [Shuffle(elementsize=dtype.itemsize)]
@@ -155,7 +154,7 @@ def _create(
         dtype="string" if texts else dtype,
         fill_value=fill,
         serializer=serializer,
-        compressors=[*shuffled, GzipCodec(level=LEVEL), Crc32cCodec()],
+        compressors=[*shuffled, GzipCodec(level=level), Crc32cCodec()],
         chunk_key_encoding={"name": "default", "separator": "."},
         dimension_names=tuple(map(str, dims)),
         attributes=_plain(attrs),

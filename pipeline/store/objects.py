@@ -48,7 +48,7 @@ CREDENTIALS = (
 )
 """Environment variables, any one of them enough to tell who may use the store."""
 
-AT_ONCE = 16
+REQUESTS_AT_ONCE = 16
 """Requests that are under way at the same time."""
 
 CONNECT_S, REQUEST_S = 5.0, 60.0
@@ -191,9 +191,9 @@ class ObjectFiles:
                 return error
 
         rest = iter(keys)
-        with ThreadPoolExecutor(AT_ONCE) as pool:
+        with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
             # memory holds no more contents than are read at once
-            while some := list(islice(rest, AT_ONCE)):
+            while some := list(islice(rest, REQUESTS_AT_ONCE)):
                 yield from zip(some, pool.map(read, some), strict=True)
 
     def write(self, key: str, content: bytes) -> None:

@@ -63,7 +63,7 @@ from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
-from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.attractors.finding.requests import Settings, answer_all
 from pipeline.analysis.attractors.finding.searching import Search
 from pipeline.analysis.attractors.labelling import Found, analyse, follow
@@ -73,7 +73,7 @@ from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, DECISIONS, EVIDENCE, KINDS, STABILITIES, split_dims
 from pipeline.results.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, index_of_rows
 from pipeline.results.sides import flags_of
-from pipeline.results.tolerances import CLOSURE
+from pipeline.results.tolerances import CELL_CLOSURE
 
 __all__ = ["identify", "match"]
 
@@ -84,7 +84,7 @@ def identify(
     *,
     parameters: Parameters | np.ndarray | None = None,
     system: System | None = None,
-    block_bytes: int = SLAB_BYTES,
+    block_bytes: int = SECTION_BYTES,
     **changes: Any,
 ) -> xr.Dataset:
     """Find the attractors at each parameter point of a run's result cube, and assign each trajectory (cell) to one of
@@ -131,7 +131,7 @@ def identify(
         ds,
         dynamics.system,
         dynamics.geometry,
-        closure=CLOSURE,
+        closure=CELL_CLOSURE,
         longest=options.max_orbit_period,
         residual=options.residual,
     )

@@ -32,7 +32,7 @@ from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODI
 from pipeline.results.outcomes import DIVERGED
 from pipeline.results.ragged import dense, isel
 from pipeline.results.sets import Geometry
-from pipeline.results.tolerances import CLOSURE
+from pipeline.results.tolerances import CELL_CLOSURE
 
 UNDECIDED, ELSEWHERE = -1, -3
 """Labels of trajectories that end on no known attractor: undecided, and on an attractor that no cell shows."""
@@ -305,7 +305,7 @@ def destinations_at(
         cube,
         dynamics.system,
         dynamics.geometry,
-        closure=CLOSURE,
+        closure=CELL_CLOSURE,
         longest=options.max_orbit_period,
         residual=options.residual,
     )

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.model import Mirror, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.ordering import SAME_DIGITS
@@ -30,7 +31,7 @@ from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
 from pipeline.analysis.flown import flown
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
-from pipeline.results.sets import TWO_PI, Geometry, hashes, mean_distance, order_of_points, rows_by_number
+from pipeline.results.sets import Geometry, hashes, mean_distance, order_of_points, rows_by_number
 from pipeline.results.sides import UNKNOWN
 from pipeline.results.tolerances import PORTRAIT_RTOL
 

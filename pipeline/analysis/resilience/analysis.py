@@ -17,7 +17,7 @@ import xarray as xr
 
 from magpend_core.models.text.grammar import Tree
 from pipeline.analysis.attractors.destinations import Destinations, Followed, destinations_at
-from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.resilience.expressions import density_at, mean_over_cells, read_expression
@@ -127,7 +127,7 @@ def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
     by_name = _by_name(run, states)
     timed = np.sort(np.random.default_rng(options.seed).permutation(len(states))[: options.timed])
     result = _Result(run, options, attractors)
-    for points in slabs(cube, Dynamics.of(cube), SLAB_BYTES):
+    for points in slabs(cube, Dynamics.of(cube), SECTION_BYTES):
         for index, there in destinations_at(cube, attractors, points):
             assert there.point.parameters is not None
             known, own = {**there.point.parameters, "f": there.point.frequency}, labels[index].ravel()

@@ -19,7 +19,7 @@ from pipeline.analysis.attractors.destinations import Destinations, destinations
 from pipeline.analysis.attractors.extension.clouds import group
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
-from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.resilience.analysis import start_states
 from pipeline.analysis.resilience.declaration import EdgeOptions
@@ -82,7 +82,7 @@ def edge(run: OpenRun, options: EdgeOptions) -> xr.Dataset:
     dims, starts = split_dims(attractors["attractor_id"])
     here = attractors.isel(dict.fromkeys(dims, 0))
     between = ids_of(here, options.between)
-    (points,) = slabs(cube, Dynamics.of(cube), SLAB_BYTES)
+    (points,) = slabs(cube, Dynamics.of(cube), SECTION_BYTES)
     ((_, there),) = destinations_at(cube, attractors, points)
     untold = [name for name, number in zip(options.between, between, strict=True) if number not in there.told]
     if untold:

@@ -24,7 +24,7 @@ from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameter_name,
 from pipeline.products.product import Table
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, Words, aligned, words_of
-from pipeline.results.tolerances import CLOSURE, PORTRAIT_RTOL
+from pipeline.results.tolerances import CELL_CLOSURE, PORTRAIT_RTOL
 
 PATIENCE, LONGEST = 20_000, 64
 """Drive periods or returns after which a trajectory is given up, and the longest period at which it may close."""
@@ -173,7 +173,7 @@ def _jumps(located: xr.Dataset, base: Parameters, events: Sequence[Orbit], step:
     amplitude = np.array([nothing if orbit is None else next(measured) for _, orbit in landed])
     words = [word for word, _ in landed]
     if base.model.crossing is not None:  # a flow that spirals to rest crosses the section for ever
-        words = ["at_rest" if a.max() < CLOSURE else word for a, word in zip(amplitude, words, strict=True)]
+        words = ["at_rest" if a.max() < CELL_CLOSURE else word for a, word in zip(amplitude, words, strict=True)]
     codes = np.array([[*LANDINGS].index(word) for word in words], np.int8)
     periods = [0 if orbit is None else orbit.period for _, orbit in landed]
     return {
@@ -211,7 +211,7 @@ def _landed(starts: Sequence[Orbit], frequency_hz: Sequence[float]) -> list[tupl
         n_keep=LONGEST,
         **limits_at(PORTRAIT_RTOL),
         stop_when_closed=True,
-        closure_tolerance=CLOSURE,
+        closure_tolerance=CELL_CLOSURE,
         max_orbit_period=LONGEST,
         system=model.system,
     )

@@ -19,7 +19,7 @@ FEWEST, MOST = 512, 8192
 """Samples per drive period or return: at first, and at most."""
 
 
-AT_ONCE = 2_000_000
+MOST_SAMPLED = 2_000_000
 """Samples of all orbits that are integrated in one call, which bounds the memory."""
 
 
@@ -93,7 +93,7 @@ def _blocks(orbits: Sequence[Orbit], rows: Array, n: int) -> Iterator[Array]:
     periods = np.array([orbits[i].period for i in rows])
     for period in np.unique(periods):
         own = rows[periods == period]
-        step = max(1, AT_ONCE // (n * max(period, 1)))
+        step = max(1, MOST_SAMPLED // (n * max(period, 1)))
         yield from (own[k : k + step] for k in range(0, len(own), step))
 
 

@@ -15,14 +15,14 @@ import numpy as np
 import xarray as xr
 from scipy import signal
 
-from pipeline.analysis.response.orbits import AT_ONCE, Orbit, measures_of
+from pipeline.analysis.response.orbits import MOST_SAMPLED, Orbit, measures_of
 from pipeline.analysis.spectrum.declaration import (
     SpectraOptions,
     SpectrumFigureOptions,
     SpectrumOptions,
     WaterfallOptions,
 )
-from pipeline.analysis.spectrum.estimate import ALL, Averaged, averaged, frequencies_of, power_unit
+from pipeline.analysis.spectrum.estimate import TWO_FREQUENCIES, Averaged, averaged, frequencies_of, power_unit
 from pipeline.analysis.spectrum.motions import (
     Motion,
     channels_of,
@@ -144,7 +144,7 @@ def _average(motion: Motion, place: int, options: SpectrumOptions) -> dict[str, 
         settings = {"window": options.window, "scaling": options.scaling}
         found = averaged([values], rate * n_samples, nperseg=options.segment * n_samples, **settings)
         high = found.power[len(found.power) // 2 :].sum()
-        too_long = 2 * n_samples * n_periods * len(motion.state) > 8 * AT_ONCE
+        too_long = 2 * n_samples * n_periods * len(motion.state) > 8 * MOST_SAMPLED
         if high <= FOLDED * found.power.sum() or 2 * n_samples > most or too_long:
             return _row(motion, found, values, rate, n_samples, options)
         n_samples *= 2
@@ -161,7 +161,7 @@ def _row(
         drive = rate if motion.parameters.model.clock.has_drive else None
         own = frequencies_of(values, rate * n_samples, drive)
         row |= {"first_hz": own.first_hz, "explained": own.share}
-        row["second_hz"] = own.second_hz if own.share >= ALL else np.nan
+        row["second_hz"] = own.second_hz if own.share >= TWO_FREQUENCIES else np.nan
     return row
 
 

@@ -21,7 +21,7 @@ LOBE = 4
 """Half width of a line in bins, of the window by which lines are told apart (Blackman-Harris, side lobes at -92 dB)."""
 
 
-ALL = 0.99
+TWO_FREQUENCIES = 0.99
 """Share of the power in combinations of two frequencies from which on a motion is said to have these two."""
 
 Array = np.ndarray

@@ -21,7 +21,7 @@ from pipeline.plots.figure import at_points, frame_of, noted, values_of
 from pipeline.results.run import OpenRun
 
 BELOW = "0.72"
-MOST_DOTS = 200_000
+MOST_VECTOR_DOTS = 200_000
 """Most dots of a vector file that are not pixels."""
 
 
@@ -103,7 +103,7 @@ def _draw_cells(ax: Axes, data: xr.Dataset, parameter: str, swept: list[str], co
     order = [*swept, ...]
     x, y = (data[name].transpose(*order).values.reshape(len(colours), -1) for name in (at_section(parameter), "value"))
     for k, colour in enumerate(colours):
-        ax.plot(x[k], y[k], ".", markersize=2.2, color=colour, zorder=3, rasterized=x.size > MOST_DOTS)
+        ax.plot(x[k], y[k], ".", markersize=2.2, color=colour, zorder=3, rasterized=x.size > MOST_VECTOR_DOTS)
 
 
 def _draw_below(
@@ -115,7 +115,7 @@ def _draw_below(
     section = below["section"].sel(state=measure.name).transpose(parameter, ...).values
     section = section.reshape(below.sizes[parameter], -1)
     x = np.repeat(below[parameter].values[:, None], section.shape[1], axis=1)
-    ax.plot(x, measure.shown(section), ".", color=BELOW, markersize=1.6, zorder=1, rasterized=x.size > MOST_DOTS)
+    ax.plot(x, measure.shown(section), ".", color=BELOW, markersize=1.6, zorder=1, rasterized=x.size > MOST_VECTOR_DOTS)
 
 
 def _label(part: xr.Dataset, parameter: str) -> str:

@@ -19,7 +19,7 @@ from pipeline.results.run import OpenRun
 from pipeline.results.selection import choose, place, start_dims
 from pipeline.results.tabular import Row, aligned, with_interval
 
-UNKNOWN = -1
+NO_LABEL_KNOWN = -1
 
 
 def overlap_counts(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -28,7 +28,7 @@ def overlap_counts(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, n
     Labels before and after are those of the same initial states; states with a label -1, without an outcome, are left
     out. Returns the labels that occur before and after, rising, and the counts (before, after).
     """
-    known = (before != UNKNOWN) & (after != UNKNOWN)
+    known = (before != NO_LABEL_KNOWN) & (after != NO_LABEL_KNOWN)
     first, i = np.unique(before[known], return_inverse=True)
     last, j = np.unique(after[known], return_inverse=True)
     counts = np.zeros((len(first), len(last)), np.int64)
@@ -64,7 +64,7 @@ def overlaps(run: OpenRun, options: OverlapOptions) -> xr.Dataset:
     total = counts.sum(axis=1, keepdims=True)
     low, high = binomial_interval(counts, np.broadcast_to(total, counts.shape), confidence=options.confidence)
     values = {"count": counts, "probability": counts / np.maximum(total, 1), "low": low, "high": high}
-    values["n_unknown"] = np.array(((before == UNKNOWN) | (after == UNKNOWN)).sum())
+    values["n_unknown"] = np.array(((before == NO_LABEL_KNOWN) | (after == NO_LABEL_KNOWN)).sum())
     attrs = {"parameter": axis, "value_before": options.before, "value_after": options.after}
     coords = {"before": first, "after": last}
     return xr.Dataset(on_points(OVERLAPS_COLUMNS, values, ()), coords, {**attrs, "confidence": options.confidence})

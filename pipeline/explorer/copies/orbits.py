@@ -19,7 +19,7 @@ NONE = np.uint32(0xFFFFFFFF)
 SAME_ATTRACTOR, ALIKE, NEAREST = 1, 2, 3
 """What an orbit is to a cell: of its attractor, of a cell like it at its parameters, or the nearest."""
 
-BLOCK = 32
+ORBITS_OF_OBJECT = 32
 """Orbits in an object."""
 
 SERIES = ("time", "states", "quantities", "drawing")
@@ -121,12 +121,12 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     if each * len(chosen.cells) > room.n_bytes:
         chosen = choosing(int(room.n_bytes / each))
     n = len(chosen.cells)
-    blocks = list(range(0, n, BLOCK))
+    blocks = list(range(0, n, ORBITS_OF_OBJECT))
     report("integrating orbits", 0, n)
     for number, first in enumerate(blocks):
         held: dict[str, np.ndarray] = {}
         said: dict[str, Any] = {}
-        for k in range(first, min(first + BLOCK, n)):
+        for k in range(first, min(first + ORBITS_OF_OBJECT, n)):
             arrays, said[str(k)] = _orbit(copied.run, int(chosen.cells[k]), count, room)
             held |= {f"{k}.{name}": values for name, values in arrays.items()}
             report("integrating orbits", k + 1, n)

@@ -24,7 +24,7 @@ from pipeline.results.outcomes import share_interval
 from pipeline.results.ragged import dense, dims_of, isel
 from pipeline.store.run import RunDirectory
 
-PER_PERIOD = 128
+SAMPLES_PER_PERIOD = 128
 """Instants per drive period or return."""
 
 
@@ -101,7 +101,7 @@ def orbit_series(
     atol: float = 1e-9,
 ) -> dict[str, np.ndarray]:
     """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
-    n = max(1, min(n_periods * parameters.model.clock.samples(PER_PERIOD), 65_536))
+    n = max(1, min(n_periods * parameters.model.clock.samples(SAMPLES_PER_PERIOD), 65_536))
     times = seconds * np.arange(n + 1) / n
     return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)
 

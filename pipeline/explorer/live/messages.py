@@ -20,9 +20,6 @@ MOST_BYTES = 65_536
 MOST_RESOLUTION, LEAST_RESOLUTION = 512, 16
 """Finest and coarsest slice [cells along a side]."""
 
-MOST_PERIODS = 20_000
-"""Longest start [drive periods or returns]."""
-
 MOST_NOISE = 10.0
 """Strongest noise on a start [scales over the square root of a second]."""
 
@@ -50,7 +47,7 @@ class StartRequest(Job):
     parameters: Values = {}
     frequency: float | None = Field(None, gt=0)
     state: Values = {}
-    periods: int | None = Field(None, ge=1, le=MOST_PERIODS)
+    periods: int | None = Field(None, ge=1, le=20_000)  # drive periods or returns
     # strength of white noise on the rates, in units of their scales over the square root of a second. With noise
     # no attractor is named.
     noise: float = Field(0.0, ge=0, le=MOST_NOISE)

@@ -35,7 +35,7 @@ from pipeline.store.run import RunDirectory
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
 
-MOST_CELLS = 2_000_000
+MOST_OF_REGION = 2_000_000
 """Cells of a region that the explorer runs; more are for the command line."""
 
 
@@ -160,9 +160,9 @@ class RegionRunner:
         spec, _ = zoomed(run, request)
         plan = make_plan(spec)
         check_plan(plan)
-        if plan.n_cells > MOST_CELLS:
+        if plan.n_cells > MOST_OF_REGION:
             raise RequestError(
-                f"the region has {plan.n_cells} cells; the explorer runs at most {MOST_CELLS}: download the "
+                f"the region has {plan.n_cells} cells; the explorer runs at most {MOST_OF_REGION}: download the "
                 "specification and run it yourself."
             )
         return spec

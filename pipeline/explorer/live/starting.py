@@ -18,12 +18,12 @@ from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.explorer import RequestError
-from pipeline.explorer.data.orbits import PER_PERIOD, fixed_points, series
+from pipeline.explorer.data.orbits import SAMPLES_PER_PERIOD, fixed_points, series
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import StartRequest
 from pipeline.explorer.live.settling import LiveFlight, Place, conclude, run_start, system_at
 from pipeline.layout.vocabulary import ABSENT
-from pipeline.specification.noise import STEPS
+from pipeline.specification.noise import STEPS_PER_PERIOD
 
 if TYPE_CHECKING:
     from pipeline.explorer.live.live import LiveRun
@@ -100,11 +100,11 @@ class _NoisyPath:
         self._frequency, self._seed = np.array([place.frequency]), seed
         self._state = np.array(state, np.float64)[None]
         self._words = cell_words(self._packed, self._frequency, self._state)
-        self.steps, self.done = STEPS, 0
+        self.steps, self.done = STEPS_PER_PERIOD, 0
 
     def choose_steps(self, job: Job) -> None:
         """Double the steps until those of the first period are short enough; raise RequestError if none are."""
-        most_steps = 64 * STEPS  # most steps per period that are tried
+        most_steps = 64 * STEPS_PER_PERIOD  # most steps per period that are tried
         while True:
             job.check()
             found = self._call(1)
@@ -220,7 +220,7 @@ class _Path:
     def show(self, n_periods: int) -> None:
         """Integrate the first `n_periods` periods and send them; send nothing if the integration fails."""
         live, place = self._live, self._place
-        samples = live.model.clock.samples(PER_PERIOD)
+        samples = live.model.clock.samples(SAMPLES_PER_PERIOD)
         times = self._period * np.arange(n_periods * samples + 1) / samples
         try:
             found = series(

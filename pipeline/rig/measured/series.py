@@ -16,7 +16,7 @@ from pipeline.rig.measured.sections import find_sections, name_of, section_phase
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 
-_LEAST = 3
+_LEAST_EDGES = 3
 """Fewest edges that determine a frequency."""
 
 
@@ -78,18 +78,18 @@ def _part(
     for first in known:
         for a, b in constant_spans(edges):
             # the drive changes its frequency within stretches of a few periods
-            if a <= first < b and b - a >= _LEAST:
+            if a <= first < b and b - a >= _LEAST_EDGES:
                 return first, min(b, first + n_periods)
     raise SpecError(
-        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
+        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST_EDGES} "
         f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
         f"{edges.rising[-1]:.3f} s."
     )
 
 
 def _first_timing(edges: Edges) -> float:
-    if edges.rising.size < _LEAST:
-        raise SpecError(f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them.")
+    if edges.rising.size < _LEAST_EDGES:
+        raise SpecError(f"drive: {edges.rising.size} rising edges; a series needs {_LEAST_EDGES} of them.")
     return 1 / float(np.median(np.diff(edges.rising)))
 
 

@@ -14,7 +14,7 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.sections import run_branches
 from pipeline import open_run
-from pipeline.compute.refinement import NO_ORBIT, SAME, Orbits, infer, refine
+from pipeline.compute.refinement import NO_ORBIT, SAME_ORBIT_CLOSURES, Orbits, infer, refine
 from pipeline.compute.task import compute
 from pipeline.layout.cells import CellMap
 from pipeline.layout.identity import identity_of
@@ -199,7 +199,7 @@ def test_infer__duffing_against_the_full_grid():
 
     full = integrate(np.arange(n * n))
     found = infer((n, n), 8, counted, closure_tolerance=TOLERANCE, system=DUFFING)
-    orbits = Orbits(SAME * TOLERANCE, DUFFING)
+    orbits = Orbits(SAME_ORBIT_CLOSURES * TOLERANCE, DUFFING)
     labels = orbits.classes(full)
     assert set(np.unique(labels)) == {0, 1}
     inferred = found["status"] == Status.INFERRED

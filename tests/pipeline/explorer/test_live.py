@@ -11,7 +11,7 @@ import pytest
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from pipeline.analysis.attractors.destinations import destinations_at
-from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
@@ -384,7 +384,7 @@ def test_run__a_region_beside_the_run(directories, watch, monkeypatch):
     assert watcher.wait(first)["cancelled"] is True
     watcher.session.join()
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.explorer.live.regions.MOST_CELLS", 50)
+        patch.setattr("pipeline.explorer.live.regions.MOST_OF_REGION", 50)
         assert "112 cells" in watcher.ask(do="run", **REGION)["error"]
     # what was begun is gone on with, under the same name
     second = watcher.send(do="run", **REGION)
@@ -460,7 +460,7 @@ def test_settle_cells__ends_where_the_analysis_follows(directories, name):
     opened = RunDirectory.open(directories[name])
     live, cube, attractors = LiveRun(opened), opened.cube(), derive(directories[name], "attractors")
     rng, n_named = np.random.default_rng(3), 0
-    for points in slabs(cube, Dynamics.of(cube), SLAB_BYTES):
+    for points in slabs(cube, Dynamics.of(cube), SECTION_BYTES):
         for index, there in destinations_at(cube, attractors, points):
             (axis,) = split_dims(cube["status"])[0]
             place = live.place({axis: float(cube[axis][index[0]])}, None)

@@ -19,7 +19,7 @@ from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.colours import NO_CODE
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.explorer.data.orbits import PER_PERIOD, cell_of, linearise, orbit
+from pipeline.explorer.data.orbits import SAMPLES_PER_PERIOD, cell_of, linearise, orbit
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane
 from pipeline.explorer.data.tables import table
@@ -264,7 +264,7 @@ def test_orbit__ends_where_the_cube_goes_on(which, request):
         cell = cell_of(explored, number)
         for point in (0, 5):
             arrays, attrs = unpack_arrays(orbit(explored, number, point))
-            ends = arrays["states"][::PER_PERIOD]
+            ends = arrays["states"][::SAMPLES_PER_PERIOD]
             assert len(ends) == attrs["n_periods"] + 1
             np.testing.assert_array_equal(ends[0], cell.section[point])
             n = min(len(ends), len(cell.section) - point)

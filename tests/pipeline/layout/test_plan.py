@@ -63,7 +63,7 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
                 assert s.start % c == 0
                 assert s.stop % c == 0 or s.stop == n
         size = np.dtype(variable.dtype).itemsize * np.prod(chunks)
-        assert size <= planning.CHUNK_BYTES or chunks[0] == 1
+        assert size <= planning.PLAN_CHUNK_BYTES or chunks[0] == 1
 
 
 def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from pipeline.report.estimates import Verdict, judged
-from pipeline.report.page import MOST_ROWS, Facts, Grid, Note, Outcome, Page, Part, Picture, Source, grid_of, render
+from pipeline.report.page import ROWS_OF_PAGE, Facts, Grid, Note, Outcome, Page, Part, Picture, Source, grid_of, render
 
 HOSTILE = "</title><script>alert('x')</script><img src=http://e.org/x onerror=alert(1)> & \"q\""
 
@@ -63,5 +63,5 @@ def test_judged__the_whole_interval_decides(interval, claim, verdict):
 def test_grid_of__rows():
     grid = grid_of([{"a_b": 1.23456789, "none": math.nan}, {"a_b": 2, "c": True}] * 40)
     assert grid.columns == ["a b", "c"]
-    assert list(grid.rows) == [["1.23457", ""], ["2", "yes"]] * (MOST_ROWS // 2)
-    assert grid.n_more == 80 - MOST_ROWS
+    assert list(grid.rows) == [["1.23457", ""], ["2", "yes"]] * (ROWS_OF_PAGE // 2)
+    assert grid.n_more == 80 - ROWS_OF_PAGE

@@ -10,7 +10,17 @@ import pytest
 from magpend_core import load_preset, trajectory
 from magpend_core.models.preset_writing import write_preset
 from pipeline.rig.recordings import findings_of, parse_mapping, read_recording, write_raw
-from pipeline.rig.virtual import TOLERANCE, DriveSensor, Sensor, Step, load_rig, parse_rig, readings, record, simulated
+from pipeline.rig.virtual import (
+    RECORD_RTOL,
+    DriveSensor,
+    Sensor,
+    Step,
+    load_rig,
+    parse_rig,
+    readings,
+    record,
+    simulated,
+)
 from pipeline.specification.problems import SpecError
 
 TIMES = np.arange(3000) / 500.0
@@ -33,7 +43,7 @@ def recorded(parameters, sensors, start=START, times=TIMES):
 
 def test_record__ideal_sensors_see_the_engines_states(parameters):
     ds = recorded(parameters, {**ideal("psi1", "psi2", "psi1_dot"), "drive": DriveSensor("torque")})
-    states = trajectory(parameters, 2.2, np.array(START), TIMES, rtol=TOLERANCE, atol=TOLERANCE)
+    states = trajectory(parameters, 2.2, np.array(START), TIMES, rtol=RECORD_RTOL, atol=RECORD_RTOL)
     for i, name in ((0, "psi1"), (1, "psi2"), (2, "psi1_dot")):
         # both walk the drive's periods with the same steps; what differs is rounding, which chaos lets grow
         np.testing.assert_allclose(ds[name][:1500], states[:1500, i], atol=1e-8)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import rates_at
 from magpend_core.precision import tolerances_at
@@ -32,7 +33,7 @@ from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Leg, Settings, Slopes, Work
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
-from pipeline.results.sets import TWO_PI, Geometry
+from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import PORTRAIT_RTOL, ROUGH_SLOPE_RTOL, SLOPE_RTOL
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
+from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.rotation import section_turns, weights
-from pipeline.results.sets import TWO_PI, Geometry
+from pipeline.results.sets import Geometry
 
 LEAST_FITTED, MOST_FITTED = 256, 2048
 """Fewest section points that are fitted, and most."""

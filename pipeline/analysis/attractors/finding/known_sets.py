@@ -11,7 +11,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
 from pipeline.results.sets import Geometry
-from pipeline.results.tolerances import RATE_ERROR, ROUNDING
+from pipeline.results.tolerances import RATE_ERROR, RATE_ROUNDING
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Equilibrium:
         fastest = float(np.abs(self.jacobian).max(initial=self.rate))
         size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * fastest
         # rounding moves a nearly degenerate equilibrium, and its eigenvalues with it; near a fold as a square root
-        rounding = fastest * float(np.sqrt(ROUNDING))
+        rounding = fastest * float(np.sqrt(RATE_ROUNDING))
         moved = rounding**2 / max(float(np.abs(self.eigenvalues).min()), rounding)
         return largest_error(self.jacobian, size, real=True) + moved
 

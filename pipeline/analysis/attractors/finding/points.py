@@ -31,7 +31,7 @@ _MARK = "mark"
 PASSING = "passing through the cells of a point"
 """Name of the work while the blocks of a parameter point are read one after another."""
 
-SLAB_BYTES = 256 * 2**20
+SECTION_BYTES = 256 * 2**20
 """Most memory for sections held at once [bytes]."""
 
 

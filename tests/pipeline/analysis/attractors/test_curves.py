@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from magpend_core.engine.vecmath import TWO_PI
 from pipeline.analysis.attractors.extension.curves import Curve
 from pipeline.layout.vocabulary import ATTRACTS, NOT_SETTLED, TORUS
-from pipeline.results.sets import TWO_PI, Geometry
+from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.maps import MapPoint, settle
 
 PLANE = Geometry((False, False), (1.0, 1.0))

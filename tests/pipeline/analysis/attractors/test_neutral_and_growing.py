@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from magpend_core.engine.vecmath import TWO_PI
 from pipeline.analysis.attractors.extension.bounded_sets import _is_in_family
 from pipeline.analysis.attractors.extension.conservative import _split, conservative_sets
 from pipeline.analysis.attractors.extension.courses import GROWS
@@ -12,7 +13,7 @@ from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.analysis.attractors.labelling import _preserves_volume
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, NEUTRAL
-from pipeline.results.sets import TWO_PI, Geometry
+from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.maps import N_KEEP, MapPoint, drive, settle
 
 PLANE = Geometry((False, False), (1.0, 1.0))

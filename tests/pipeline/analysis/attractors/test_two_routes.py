@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.destinations import destinations_at
-from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.explorer.live.live import LiveRun
 from pipeline.explorer.live.settling import settle_cells
@@ -65,7 +65,7 @@ def test_destinations__of_the_live_page_are_those_of_the_analyses(spec, n_ends, 
     """Starts beside those of the run: both find the attractor of the run on which each ends."""
     run = RunDirectory.open(computed(spec))
     cube, attractors = run.cube(), derive(run.directory, "attractors")
-    (points,) = slabs(cube, Dynamics.of(cube), SLAB_BYTES)
+    (points,) = slabs(cube, Dynamics.of(cube), SECTION_BYTES)
     ((_, there),) = destinations_at(cube, attractors, points)
     states = np.random.default_rng(2).uniform([-0.9, -0.5], [0.9, 1.0], (60, 2))
     analysed = there.follow(states).label

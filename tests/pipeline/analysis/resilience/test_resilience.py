@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.linalg import expm
 
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
-from pipeline.analysis.attractors.finding.points import SLAB_BYTES, Dynamics, slabs
+from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.resilience.analysis import resilience_table
 from pipeline.analysis.resilience.declaration import ResilienceOptions
 from pipeline.analysis.resilience.edge import edge_table, ids_of
@@ -66,7 +66,7 @@ def magnets(computed):
 def at_point(a_run):
     """The only parameter point of a run, as ends of trajectories."""
     cube = a_run.cube()
-    (points,) = slabs(cube, Dynamics.of(cube), SLAB_BYTES)
+    (points,) = slabs(cube, Dynamics.of(cube), SECTION_BYTES)
     ((_, there),) = destinations_at(cube, dense(a_run.derive("attractors"), points=True), points)
     return there
 

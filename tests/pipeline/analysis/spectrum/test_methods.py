@@ -12,7 +12,16 @@ import magpend
 from magpend_core.models import load_model
 from pipeline.analysis.spectrum.analysis import axes_of, needs_axis, needs_channel, spectrum_table
 from pipeline.analysis.spectrum.declaration import SpectrumFigureOptions, SpectrumOptions, WaterfallOptions
-from pipeline.analysis.spectrum.estimate import ALL, LOBE, _near, _peak, averaged, frequencies_of, pieces_of, power_unit
+from pipeline.analysis.spectrum.estimate import (
+    LOBE,
+    TWO_FREQUENCIES,
+    _near,
+    _peak,
+    averaged,
+    frequencies_of,
+    pieces_of,
+    power_unit,
+)
 from pipeline.analysis.spectrum.gaps import Settings, _fit, _weights, filled
 from pipeline.analysis.spectrum.motions import _of_cell, clock_of, needs_motion, row_axis, settle_motion, swept_by
 from pipeline.layout.vocabulary import BOUNDED_SET
@@ -92,7 +101,7 @@ def test_frequencies_of__three_frequencies_are_not_explained_by_two() -> None:
     found = frequencies_of(whole, 20.0)
     # lines of amplitudes 1, .8, .6: the third is left
     assert found.share == pytest.approx((1.0 + 0.64) / (1.0 + 0.64 + 0.36), abs=1e-3)
-    assert found.share < ALL
+    assert found.share < TWO_FREQUENCIES
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import magpend
 from pipeline.analysis.series.analysis import series_table
 from pipeline.analysis.spectrum.analysis import LINES, spectrum_table
-from pipeline.analysis.spectrum.estimate import ALL, frequencies_of
+from pipeline.analysis.spectrum.estimate import TWO_FREQUENCIES, frequencies_of
 from pipeline.analysis.spectrum.figure import plot_spectrum
 from pipeline.analysis.spectrum.gaps import filled
 from pipeline.specification.problems import SpecError
@@ -156,7 +156,7 @@ def test_frequencies_of__a_torus_are_those_of_its_lines(drive):
     assert found.second_hz == pytest.approx(f2, abs=1e-9)
     assert found.share > 1.0 - 1e-6
     third = frequencies_of(x + 0.5 * np.cos(TURN * 0.3 * np.sqrt(2.0) * t), 20.0, drive)
-    assert third.share < ALL
+    assert third.share < TWO_FREQUENCIES
 
 
 @pytest.fixture(scope="module")
