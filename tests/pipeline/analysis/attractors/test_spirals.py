@@ -6,7 +6,7 @@ import pytest
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG
-from pipeline.analysis.attractors.finding.spirals import Recurrence, leap, near_closed
+from pipeline.analysis.attractors.finding.spirals import Recurrence, SpiralSettings, leap, near_closed
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.cubes import STATES, cube_of
@@ -86,6 +86,7 @@ def test_recurrence__a_rotating_spiral_contracts_to_its_centre():
     n = np.arange(60)
     section = np.stack([0.02 * (-1.0) ** n + 1e-4 * 0.999**n, np.zeros(60)], axis=-1)[None]
     assert near_closed(section, 8, PLANE).period.tolist() == [2]
+    assert Recurrence.of(section, 8, PLANE, SpiralSettings(same_lag=1e6)).period.tolist() == [1]
 
 
 def test_leap__along_the_unstable_direction():
@@ -101,3 +102,6 @@ def test_leap__along_the_unstable_direction():
     for multiplier in (-1.5, -0.9):
         other = Orbit(np.zeros((1, 1)), np.array([multiplier + 0j]), 1e-12, np.array([[multiplier]]))
         assert np.isnan(leap(follows[None], [other], LINE)).all()
+    assert leap(follows[None], [orbit], LINE, SpiralSettings(leap=4.0))[0, 0] == pytest.approx(
+        4.0 * follows[-1, 0], rel=1e-3
+    )

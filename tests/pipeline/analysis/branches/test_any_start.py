@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 
 import magpend
 from magpend_core.models.text.intervals import Rates
-from pipeline.analysis.branches.boxes import Box, enclose_equilibria, krawczyk, search_equilibria
+from pipeline.analysis.branches.boxes import Box, BoxSettings, enclose_equilibria, krawczyk, search_equilibria
 from pipeline.analysis.branches.completeness import counted_lines
 from pipeline.specification.problems import SpecError
 from tests.core.flows import model_of
@@ -140,6 +140,12 @@ def test_enclose__a_pair_in_a_needle_that_newton_misses():
     assert found.is_proved
     np.testing.assert_allclose(states(found)[:, 0], known, atol=1e-12)
     assert len(search_equilibria(model.system, model.load().pack(), box, np.zeros((0, 1)))) < 3
+    # of too few boxes the rest stays undecided, and boxes that are not divided far enough hold the pair together
+    few, coarse = BoxSettings(most_boxes=20), BoxSettings(smallest=1e-3)
+    for settings in (few, coarse):
+        found = enclose_equilibria(Rates(model.definition, {}), box, settings)
+        assert not found.is_proved
+        assert len(found.states) < 3
 
 
 def test_krawczyk__has_no_bounds_where_slopes_have_none():

@@ -325,6 +325,7 @@ def test_fit_law__tells_the_laws_apart(period, follows_logarithm, follows_root):
         if follows:
             assert value == pytest.approx(0.7, abs=1e-9)
             assert error < 1e-9
+            assert fit_law(law, 0.7 + away, seconds, reach, LimitSettings(least_range=20.0)) is None
             assert slope == pytest.approx(2.0, rel=1e-6)
 
 
