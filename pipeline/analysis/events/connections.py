@@ -22,11 +22,7 @@ from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.starting_orbits import orbits_near
 from pipeline.analysis.events.contact import (
-    AROUND,
-    AWAY,
-    NEAR,
     SETTLE,
-    SHARES,
     Approach,
     Clearance,
     Contact,
@@ -38,37 +34,31 @@ from pipeline.analysis.events.contact import (
     last_stays,
     sample_of,
 )
-from pipeline.analysis.events.transients import ALL, FEWEST_ESCAPES, FEWEST_LIFETIMES, Place
-from pipeline.results.tolerances import BRANCH_RTOL
+from pipeline.analysis.events.transients import LifetimeSettings, Place
+from pipeline.results.tolerances import BRANCH_RTOL, SAME_EQUILIBRIUM
 
-RETURNS, PER_RETURN = 64, 64
-"""Returns of each trajectory on which passages of an equilibrium are looked for, and states of each."""
 
-RADIUS = 0.2
-"""Distance within which a trajectory passes an equilibrium, as a share of the set's extent."""
+@dataclass(frozen=True)
+class ConnectionSettings:
+    """Numbers of the search for equilibria in a set, and of their contact with an orbit."""
 
-BESIDE = 0.05
-"""Largest clearance of the nearest passages on each side of the stable manifold of an equilibrium that counts as in the
-set, as a share of the radius.
-"""
-
-SAME = 1e-6
-"""Scaled distance within which two equilibria are one."""
-
-STEPS = (1e-6, 1e-5)
-"""Lengths of the step from an equilibrium along its unstable direction, as shares of the set's extent. They change the
-clearance by their squares, so that the second one shows the error of the first."""
-
-FOLLOWED = 5
-"""Values between two of the parameter at which an equilibrium is followed."""
-
-HALVINGS = 16
-"""Bisections for the value at which a trajectory from the equilibrium begins to leave, and doublings of the distance
-from there at which its clearance is looked at.
-"""
-
-RATIO, MOST_LIFETIMES = 0.8, 24
-"""Ratio and number of the distances beyond a contact at which lifetimes are taken."""
+    # returns of each trajectory on which passages of an equilibrium are looked for, and states of each; more show
+    # equilibria that the set nears less often
+    returns: int = 64
+    per_return: int = 64
+    radius: float = 0.2  # distance within which a trajectory passes an equilibrium, as a share of the set's extent
+    # largest clearance of the nearest passages on each side of the stable manifold of an equilibrium that counts as in
+    # the set, as a share of the radius
+    beside: float = 0.05
+    # lengths of the step from an equilibrium along its unstable direction, as shares of the set's extent. They change
+    # the clearance by their squares, so that the second one shows the error of the first.
+    steps: tuple[float, ...] = (1e-6, 1e-5)
+    # bisections for the value at which a trajectory from the equilibrium begins to leave, and doublings of the distance
+    # from there at which its clearance is looked at
+    halvings: int = 16
+    ratio: float = 0.8  # ratio and number of the distances beyond a contact at which lifetimes are taken
+    most_lifetimes: int = 24
+    lifetimes: LifetimeSettings = LifetimeSettings()  # of their measurement
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +79,7 @@ class Rest:
 
     def is_same(self, other: Rest, along: SectionMap) -> bool:
         """Tell whether two equilibria at one value are one."""
-        return bool(along.geometry.distance(self.state, other.state) <= SAME)
+        return bool(along.geometry.distance(self.state, other.state) <= SAME_EQUILIBRIUM)
 
 
 def rest_at(along: SectionMap, value: float, state: np.ndarray) -> Rest | None:
@@ -105,16 +95,18 @@ def rest_at(along: SectionMap, value: float, state: np.ndarray) -> Rest | None:
     return Rest(found.states[0], v, w / (w @ v), float(values[k].real))
 
 
-def motion_of(along: SectionMap, value: float, own: Sample) -> tuple[np.ndarray, float]:
+def motion_of(
+    along: SectionMap, value: float, own: Sample, settings: ConnectionSettings = ConnectionSettings()
+) -> tuple[np.ndarray, float]:
     """Return states of a set's trajectories at equal times, shape (trajectory, time, state), and their interval [s]."""
     rows = along.rows(value, own.starts)
     times = section_map(
-        rows.parameters[:1], rows.frequency_hz[:1], rows.states[:1], RETURNS, system=along.family.system
+        rows.parameters[:1], rows.frequency_hz[:1], rows.states[:1], settings.returns, system=along.family.system
     ).times
     seconds = float(times.sum())
     if not np.isfinite(seconds):
         return np.zeros((0, 0, rows.states.shape[1])), seconds
-    grid = np.linspace(0.0, seconds, RETURNS * PER_RETURN)
+    grid = np.linspace(0.0, seconds, settings.returns * settings.per_return)
     found = sample(
         along.family.system,
         rows.parameters,
@@ -127,9 +119,11 @@ def motion_of(along: SectionMap, value: float, own: Sample) -> tuple[np.ndarray,
     return found.states, float(grid[1])
 
 
-def rests_in(along: SectionMap, value: float, own: Sample) -> list[Rest]:
+def rests_in(
+    along: SectionMap, value: float, own: Sample, settings: ConnectionSettings = ConnectionSettings()
+) -> list[Rest]:
     """Return the saddle equilibria that a set contains: it comes near to them on both sides of the stable manifold."""
-    states, step = motion_of(along, value, own)
+    states, step = motion_of(along, value, own, settings)
     states = states[np.isfinite(states).all(axis=(1, 2))]
     if not len(states):
         return []
@@ -141,15 +135,15 @@ def rests_in(along: SectionMap, value: float, own: Sample) -> list[Rest]:
     found = find_equilibria(along.family.system, states[:, 1:-1][is_slow], packed)
     places: list[np.ndarray] = []
     for state in found.states[found.converged]:
-        if all(geometry.distance(state, place) > SAME for place in places):
+        if all(geometry.distance(state, place) > SAME_EQUILIBRIUM for place in places):
             places.append(state)
     rests = [one for one in (rest_at(along, value, place) for place in places) if one is not None]
-    radius = RADIUS * extent
+    radius = settings.radius * extent
     sides = [_sides(states, rest, step, radius, along) for rest in rests]
     contained = []
     for rest, a in zip(rests, sides, strict=True):
         nearest = [float(side.min(initial=np.inf)) for side in (a[a > 0.0], -a[a < 0.0])]
-        if max(nearest) <= BESIDE * radius:
+        if max(nearest) <= settings.beside * radius:
             told = (
                 f"of {len(a)} passages within {radius:.3g}, the nearest ones are {nearest[0]:.1e} and {nearest[1]:.1e}"
             )
@@ -189,8 +183,9 @@ class Leaving:
 
     def rest_at(self, value: float) -> Rest | None:
         """Follow the equilibrium to a parameter value; its unstable direction keeps its sense."""
+        n_values = 5  # of the parameter at which the equilibrium is followed
         rest: Rest | None = self.rest
-        for x in np.linspace(self.value, value, FOLLOWED)[1:].tolist() if value != self.value else []:
+        for x in np.linspace(self.value, value, n_values)[1:].tolist() if value != self.value else []:
             if rest is None:
                 break
             direction, rest = rest.direction, rest_at(self.along, x, rest.state)
@@ -236,7 +231,7 @@ class Edge(Approach):
         return Clearance(float(a[0]), float(abs(a[0] - a[1])), has_left)
 
 
-def _edge(leaving: Leaving, own: Sample, beyond: float, effort: Effort) -> Edge | None:
+def _edge(leaving: Leaving, own: Sample, beyond: float, effort: Effort, settings: ConnectionSettings) -> Edge | None:
     """Find the saddle orbit from which a trajectory turns away at the value where it begins to leave the set.
 
     Just beyond this value, it stays near to the orbit for long: there it nearly returns to itself.
@@ -246,13 +241,13 @@ def _edge(leaving: Leaving, own: Sample, beyond: float, effort: Effort) -> Edge 
 
     def stays(x: float) -> bool:
         paths = leaving.paths(x, length)[:1]
-        last = last_stays(paths, own.points, AROUND * size, geometry)
-        return bool(np.isfinite(paths).all() and last[0] > (1.0 - AWAY) * length)
+        last = last_stays(paths, own.points, effort.around * size, geometry)
+        return bool(np.isfinite(paths).all() and last[0] > (1.0 - effort.away) * length)
 
     low, high = leaving.value, beyond
     if not stays(low) or stays(high):
         return None
-    for _ in range(HALVINGS):
+    for _ in range(settings.halvings):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stays(middle) else (low, middle)
     paths = leaving.paths(high, length)
@@ -263,14 +258,14 @@ def _edge(leaving: Leaving, own: Sample, beyond: float, effort: Effort) -> Edge 
     )
     saddles = [one for one in (along.saddle(high, *orbit) for orbit in orbits) if one is not None]
     away = [float(geometry.distance(path, one.points[0]).min()) for one in saddles]
-    if not away or min(away) > NEAR[0] * size:
+    if not away or min(away) > effort.near[0] * size:
         return None
     effort = replace(effort, is_flow=False)  # one trajectory: nothing to lower
     edge = Edge(along, replace(own, n_bands=1), high, saddles[int(np.argmin(away))], effort, leaving=leaving)
-    return edge if _is_aimed(edge, paths, low) else None
+    return edge if _is_aimed(edge, paths, low, settings) else None
 
 
-def _is_aimed(edge: Edge, paths: np.ndarray, low: float) -> bool:
+def _is_aimed(edge: Edge, paths: np.ndarray, low: float, settings: ConnectionSettings) -> bool:
     """Set the side and the time of the passage from paths just beyond the zero of the clearance, and the value on the
     other side of it at which the clearance is a share of the distance of passages; return whether there is one.
     """
@@ -283,13 +278,13 @@ def _is_aimed(edge: Edge, paths: np.ndarray, low: float) -> bool:
     edge.time = closest % step + step * int(np.append(-1, np.flatnonzero(is_far))[-1] + 1)
     edge.side = -float(np.sign(edge.least(edge.value, paths).least))
     high, living = edge.value, np.nan
-    for number in range(HALVINGS + 1):
+    for number in range(settings.halvings + 1):
         x = high + (low - high) * 2.0**number
         least = edge.least(x).least
         if np.isfinite(living) and not least > 0.0:
             break
         living = x if least > 0.0 else living
-        if least >= SHARES[False] * edge.near * edge.size:
+        if least >= edge.effort.shares[False] * edge.near * edge.size:
             break
     edge.value = living
     return bool(np.isfinite(living))
@@ -311,7 +306,11 @@ class Connection:
 
 
 def connection_of(
-    along: SectionMap, own: Sample, values: tuple[float, float, float], effort: Effort
+    along: SectionMap,
+    own: Sample,
+    values: tuple[float, float, float],
+    effort: Effort,
+    settings: ConnectionSettings = ConnectionSettings(),
 ) -> Connection | str:
     """Find the first contact of the unstable manifold of an equilibrium in a set with a saddle orbit, with proof that
     the set is lost there.
@@ -326,6 +325,8 @@ def connection_of(
         This value, the next one, and a far one beyond, up to which lifetimes may be taken.
     effort
         Trajectories of the set and their length.
+    settings
+        Numbers to choose.
 
     Returns
     -------
@@ -334,20 +335,20 @@ def connection_of(
     """
     seen, beyond, far = values
     exact = replace(along, rtol=BRANCH_RTOL)
-    rests = rests_in(along, seen, own)
+    rests = rests_in(along, seen, own, settings)
     if not rests:
         return "it contains no saddle equilibrium with one unstable direction"
     touching: list[tuple[Edge, Contact]] = []
-    steps = own.size(along.geometry) * np.array(STEPS)
+    steps = own.size(along.geometry) * np.array(settings.steps)
     for rest, sign in product(rests, (1.0, -1.0)):
-        edge = _edge(Leaving(exact, rest, seen, sign * steps), own, beyond, effort)
+        edge = _edge(Leaving(exact, rest, seen, sign * steps), own, beyond, effort, settings)
         contact = contact_of(edge, beyond) if edge is not None else None
         if edge is not None and contact is not None:
             touching.append((edge, _with_tolerance(edge, contact)))
     if not touching:
         return f"the unstable manifolds of equilibria in it, {'; '.join(map(str, rests))}, meet no unstable orbit"
     edge, contact = min(touching, key=lambda one: abs(one[1].value - seen))
-    return _lost(along, own, edge, contact, far, effort)
+    return _lost(along, own, edge, contact, far, effort, settings)
 
 
 def _with_tolerance(edge: Edge, contact: Contact) -> Contact:
@@ -357,7 +358,15 @@ def _with_tolerance(edge: Edge, contact: Contact) -> Contact:
     return replace(contact, error=contact.error + 2.0 * abs(found.least / contact.slope))
 
 
-def _lost(along: SectionMap, own: Sample, edge: Edge, contact: Contact, far: float, effort: Effort) -> Connection | str:
+def _lost(
+    along: SectionMap,
+    own: Sample,
+    edge: Edge,
+    contact: Contact,
+    far: float,
+    effort: Effort,
+    settings: ConnectionSettings,
+) -> Connection | str:
     """Check that a set lives up to a contact and contains the equilibrium there, and that it is lost beyond."""
     value = contact.value - contact.span * float(np.sign(far - contact.value))
     saddle, rest = edge.saddle(value), edge.leaving.rest_at(value)
@@ -366,34 +375,36 @@ def _lost(along: SectionMap, own: Sample, edge: Edge, contact: Contact, far: flo
         near = sample_of(along, value, along.paths(value, own.starts[:1], SETTLE)[0, -1], effort)
     except ValueError:
         return f"{told} the trajectories of the set end before"
-    rests = rests_in(along, value, near)
+    rests = rests_in(along, value, near, settings)
     rest = next((one for one in rests if rest is not None and one.is_same(rest, along)), None)
     if saddle is None or rest is None:
         return f"{told} the set does not contain it there"
-    place = Place(along, near.starts, near.points, near.size(along.geometry), 4 * effort.length)
+    place = Place(along, near.starts, near.points, near.size(along.geometry), effort)
     found, _ = Approach(along, near, value, saddle, effort).passages(value, place.stays(value)[0])
     if any((edge.side * a).min() <= 0.0 for (phase, _), (a, _, _) in found.items() if phase == edge.phase):
         return f"{told} the set lies on both sides of it before"
     if place.lifetime(value)[1]:
         return f"{told} trajectories leave the set before"
-    values, means = _lifetimes(place, contact.value, far)
-    if len(values) < FEWEST_LIFETIMES or not (np.diff(means) > 0.0).all():
+    values, means = _lifetimes(place, contact.value, far, settings)
+    if len(values) < settings.lifetimes.fewest or not (np.diff(means) > 0.0).all():
         listed = ", ".join(f"{mean:.4g} at {x:.6g}" for x, mean in zip(values, means, strict=True)) or "none measured"
         return f"{told} lifetimes beyond ({listed}) do not show that the set is lost there"
     _, until = place.stays(values[0])
-    if (until <= (SETTLE + place.length) // 2).mean() < ALL:
+    if (until <= (SETTLE + place.length) // 2).mean() < settings.lifetimes.stay_away:
         return f"{told} beyond, the trajectories of the set stay near it or come back"
     return Connection(rest, saddle, contact, value, values, means)
 
 
-def _lifetimes(place: Place, contact: float, far: float) -> tuple[list[float], list[float]]:
+def _lifetimes(
+    place: Place, contact: float, far: float, settings: ConnectionSettings
+) -> tuple[list[float], list[float]]:
     """Return values from a far one to a contact, and the mean lifetimes there, as far as they can be measured."""
     values: list[float] = []
     means: list[float] = []
-    for k in range(MOST_LIFETIMES):
-        value = contact + (far - contact) * RATIO**k
+    for k in range(settings.most_lifetimes):
+        value = contact + (far - contact) * settings.ratio**k
         mean, n = place.lifetime(value)
-        if n >= FEWEST_ESCAPES and mean >= SETTLE:
+        if n >= settings.lifetimes.fewest_escapes and mean >= SETTLE:
             values, means = [*values, value], [*means, mean]
         elif values:
             break

@@ -33,78 +33,59 @@ from pipeline.analysis.events.scene import Scene
 from pipeline.results.sets import Geometry, nearest_distances
 from pipeline.results.tolerances import PORTRAIT_RTOL
 
-NEAR, WIDEST = (0.03, 0.018, 0.05), 0.25
-"""Distances within which a trajectory passes an orbit, tried in turn, and the largest one if a set is further away, as
-shares of the set's size."""
-
-SLACK = 5.0
-"""Largest coordinate along the unstable direction at the end of a passage, in units of the reach."""
-
 SETTLE = 24
 """Least sections that trajectories run before they count: they start on the set of a neighbouring value."""
-
-LEAST = 32
-"""Fewest passages that show on which side of the manifold a set lies."""
-
-FEW = 32
-"""Trajectories that are looked at first."""
-
-AROUND, AWAY, BACK_AGAIN = 0.1, 1.0 / 16.0, 0.02
-"""Distance from a set, as a share of its size, beyond which a trajectory is away from it; the share of the time, at
-its end, in which a trajectory that has left is away; and the largest share of trajectories that come back after this
-time, if a set is lost: those of sets that merge stay long in one of them, and come back.
-"""
-
-SUBSAMPLE = 8
-"""The error of the least clearance is its median change if an eighth of the trajectories is taken."""
-
-CLOSE = 0.25
-"""Least clearance, in units of its error, at which the search for its zero ends."""
-
-BACK, LOWERED = 12, 2
-"""Sections before a passage at which the start of a trajectory is moved, and the number of passages of each part of the
-trajectories: the lowest ones."""
-
-RADII, ROUNDS = (6, 16), 7
-"""Powers of 1/4 of the set's size by which a start is moved first, and the number of rounds of the search."""
-
-TURNS_ON = 2
-"""Turns about the orbit after the passage: nearer to the stable manifold the closest approach is later, and closer."""
-
-NEIGHBOURS, REFERENCES = 48, 8
-"""Section points nearest to a reference point, and reference points, whose return times tell the number of bands."""
-
-MOST_STEPS_TO_ROOT = 40, 12
-"""Most parameter values at which the clearance is computed to find its zero, of maps and of flows."""
-
-SHORTEST = 1e-12
-"""Shortest interval of the parameter in which the zero is looked for, as a share of the first one."""
-
-JUMP = 0.01
-"""Largest clearance at the value where it changes its sign, as a share of the distance of passages."""
-
-SPREAD, SHARES = (-1.0, -0.8, -0.6, -0.4, 0.4, 0.6, 0.8, 1.0), (0.5, 0.25)
-"""Values on both sides of the zero at which the clearance is taken, in units of the largest distance; and the clearance
-there as a share of the distance of passages: of maps, and of flows, for which it counts less how few pass."""
-
-CLOSER = (0.25, 0.0625)
-"""Shares of the distance of the values at which lines of flows are taken, too: far away the clearance need not be a
-straight line. Those with the least error count."""
-
-CURVED = 0.2
-"""Largest distance of the zero from those of the lines on each side, as a share of the distance of their values."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Number of trajectories and of section points of each, and limits of the search for orbits."""
+    """Numbers of the search for a contact; those without a default are the effort, with which errors fall.
 
+    Pairs are of maps and of flows.
+    """
+
+    # trajectories, section points of each, and limits of the search for orbits
     lanes: int
     length: int
     longest: int  # period
     starts: int  # of Newton's method for each period
     rounds: int  # of deflation
     is_flow: bool = False  # few trajectories: clearances are lowered between them, see `Approach._lowest`
+    # distances within which a trajectory passes an orbit, tried in turn, and the largest one if a set is further away,
+    # as shares of the set's size
+    near: tuple[float, ...] = (0.03, 0.018, 0.05)
+    widest: float = 0.25
+    least_passages: int = 32  # fewest that show on which side of the manifold a set lies
+    looked_at: int = 32  # trajectories that are looked at first
+    # distance from a set, as a share of its size, beyond which a trajectory is away from it; the share of the time, at
+    # its end, in which a trajectory that has left is away; and the largest share of trajectories that come back after
+    # this time, if a set is lost: those of sets that merge stay long in one of them, and come back
+    around: float = 0.1
+    away: float = 1.0 / 16.0
+    back_again: float = 0.02
+    parts: int = 8  # the error of the least clearance is its median change if one part of the trajectories is taken
+    # sections before a passage at which the start of a trajectory is moved, and the number of passages of each part of
+    # the trajectories: the lowest ones
+    back: int = 12
+    lowered: int = 2
+    radii: tuple[int, int] = (6, 16)  # powers of 1/4 of the set's size by which a start is moved first
+    moves: int = 7  # rounds of the search in which it is moved
+    # turns about the orbit after the passage: nearer to the stable manifold the closest approach is later, and closer
+    turns_on: int = 2
+    # most parameter values at which the clearance is computed to find its zero
+    steps_to_root: tuple[int, int] = (40, 12)
+    close: float = 0.25  # least clearance, in units of its error, at which the search for its zero ends
+    shortest: float = 1e-12  # shortest interval of the parameter in the search, as a share of the first one
+    jump: float = 0.01  # largest clearance where it changes its sign, as a share of the distance of passages
+    # values on both sides of the zero at which the clearance is taken, in units of the largest distance; and the
+    # clearance there as a share of the distance of passages: for flows it counts less how few pass
+    spread: tuple[float, ...] = (-1.0, -0.8, -0.6, -0.4, 0.4, 0.6, 0.8, 1.0)
+    shares: tuple[float, float] = (0.5, 0.25)
+    # shares of the distance of the values at which lines of flows are taken, too: far away the clearance need not be a
+    # straight line; those with the least error count
+    closer: tuple[float, ...] = (0.25, 0.0625)
+    # largest distance of the zero from those of the lines on each side, as a share of the distance of their values
+    curved: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,10 +216,11 @@ def count_bands(points: np.ndarray, geometry: Geometry) -> int:
     All times between visits of one small neighbourhood are multiples of it; it is their greatest common divisor. Two
     bands that are closer than neighbouring points of the trajectory count as one.
     """
+    neighbours, references = 48, 8  # section points nearest to a reference point, and reference points
     rng = np.random.default_rng(0)
     tree, found = geometry.tree(points), []
-    for k in rng.integers(len(points), size=REFERENCES).tolist():
-        _, nearest = tree.query(geometry.scaled(points[k]), k=min(NEIGHBOURS, len(points)), p=np.inf)
+    for k in rng.integers(len(points), size=references).tolist():
+        _, nearest = tree.query(geometry.scaled(points[k]), k=min(neighbours, len(points)), p=np.inf)
         found.append(int(np.gcd.reduce(np.abs(nearest - k))))
     return max(int(np.gcd.reduce(np.array(found))), 1)
 
@@ -253,6 +235,7 @@ Sided = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geometry: Geometry) -> Passages:
     """Find where trajectories, shape (trajectory, time, state), pass a saddle orbit within a scaled distance."""
+    slack = 5.0  # largest coordinate along the unstable direction at the end of a passage, in units of the reach
     step, factor = saddle.turn(n_bands)
     with np.errstate(invalid="ignore"):
         near = np.array([geometry.distance(paths, x) < 2.0 * reach for x in saddle.points])
@@ -277,7 +260,7 @@ def passages(paths: np.ndarray, saddle: Saddle, n_bands: int, reach: float, geom
         gone = (time[closest] - first) // step
         with np.errstate(over="ignore"):
             # where the orbit's linear map holds, a trajectory leaves when the coordinate has grown to the reach
-            passes = np.abs(along[closest]) * factor ** (turns - 1 - gone) <= SLACK * reach
+            passes = np.abs(along[closest]) * factor ** (turns - 1 - gone) <= slack * reach
         passes &= first >= step  # the others came near before
         closest, gone = closest[passes], gone[passes]
         clearance = along[closest] * (1.0 / factor) ** gone
@@ -313,13 +296,14 @@ class Approach:
     value: float
     first: Saddle
     effort: Effort
-    near: float = NEAR[0]  # share of the set's size
+    near: float = 0.0  # share of the set's size; 0: the first one of the effort
     sides: dict[tuple[int, int], float] = field(default_factory=dict)
     is_lost: bool = False  # whether most trajectories were seen to leave for good
     _known: dict[float, Saddle] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._known[self.value] = self.first
+        self.near = self.near or self.effort.near[0]
 
     @cached_property
     def size(self) -> float:
@@ -348,7 +332,7 @@ class Approach:
         if saddle is None:
             return {}, np.nan
         reach = self._reach(saddle, paths)
-        if not reach <= WIDEST * self.size:
+        if not reach <= self.effort.widest * self.size:
             return {}, np.nan
         return passages(paths, saddle, self.sample.n_bands, reach, self.along.geometry), reach
 
@@ -359,15 +343,18 @@ class Approach:
 
     def begin(self, paths: np.ndarray) -> bool:
         """Find the sides on which the living set passes; return whether it keeps to one side in each class."""
-        for near in NEAR[:2]:  # another part of the set may lie on the other side of the manifold, but further away
+        # another part of the set may lie on the other side of the manifold, but further away
+        for near in self.effort.near[:2]:
             self.near = near
-            if all(self._keeps_to_one_side(some) for some in (paths[:FEW], paths)):
+            if all(self._keeps_to_one_side(some) for some in (paths[: self.effort.looked_at], paths)):
                 return bool(self.sides)
         return False
 
     def _keeps_to_one_side(self, paths: np.ndarray) -> bool:
         found, _ = self.passages(self.value, paths)
-        sides = {key: (np.sign(np.median(a)), a) for key, (a, _, _) in found.items() if len(a) >= LEAST}
+        sides = {
+            key: (np.sign(np.median(a)), a) for key, (a, _, _) in found.items() if len(a) >= self.effort.least_passages
+        }
         self.sides = {key: float(side) for key, (side, _) in sides.items()}
         return all((side * a).min() > 0.0 for side, a in sides.values())
 
@@ -379,7 +366,7 @@ class Approach:
         if not len(passed[0]):
             return Clearance(np.nan, np.nan, has_left)
         lowest, part = self._lowest(value, paths, passed)
-        parts = [lowest[part == i].min(initial=np.inf) for i in range(SUBSAMPLE)]
+        parts = [lowest[part == i].min(initial=np.inf) for i in range(self.effort.parts)]
         return Clearance(float(lowest.min()), float(np.median(parts) - lowest.min()), has_left)
 
     def _lowest(self, value: float, paths: np.ndarray, passed: Sided) -> tuple[np.ndarray, np.ndarray]:
@@ -387,17 +374,17 @@ class Approach:
         flows are lowered between trajectories.
 
         A flow's set is a curve along the unstable direction, many times folded, and a fold is what comes nearest. The
-        starts of these passages, `BACK` sections before, are moved to both sides: what this changes across the curve
+        starts of these passages, `back` sections before, are moved to both sides: what this changes across the curve
         has died out at the passage, and what it changes along the curve leads to the fold.
         """
         order = np.argsort(passed[0], kind="stable")
-        parts = passed[1][order] % SUBSAMPLE
-        order = np.concatenate([order[parts == i][:LOWERED] for i in range(SUBSAMPLE)])
+        parts = passed[1][order] % self.effort.parts
+        order = np.concatenate([order[parts == i][: self.effort.lowered] for i in range(self.effort.parts)])
         a, lane, at, k = (x[order] for x in passed)
         saddle = self.saddle(value)
         if not self.effort.is_flow or saddle is None:
-            return a, lane % SUBSAMPLE
-        geometry, starts, reach = self.along.geometry, paths[lane, at - BACK], self._reach(saddle, paths)
+            return a, lane % self.effort.parts
+        geometry, starts, reach = self.along.geometry, paths[lane, at - self.effort.back], self._reach(saddle, paths)
         points, covectors = saddle.points[k], saddle.covectors[k]
         step, factor = saddle.turn(self.sample.n_bands)
         scale = a / (geometry.difference(paths[lane, at], points) * covectors).sum(axis=1)
@@ -405,7 +392,9 @@ class Approach:
 
         def moved(s: np.ndarray) -> np.ndarray:
             begins = (starts[:, None] + s[..., None] * unit).reshape(-1, geometry.n_states)
-            ends = self.along.paths(value, begins, BACK + TURNS_ON * step)[:, BACK - 1 :: step]
+            ends = self.along.paths(value, begins, self.effort.back + self.effort.turns_on * step)[
+                :, self.effort.back - 1 :: step
+            ]
             offset = geometry.difference(ends.reshape(*s.shape, -1, geometry.n_states), points[:, None, None])
             away = np.abs(offset).max(axis=-1)
             away = np.where(np.logical_and.accumulate(away < reach, axis=-1), away, np.inf)
@@ -413,17 +402,17 @@ class Approach:
             along = np.take_along_axis((offset * covectors[:, None, None]).sum(axis=-1), closest, -1) / factor**closest
             return np.where(np.isfinite(away[..., 0]), scale[:, None] * along[..., 0], np.inf)
 
-        shares = self.size * 4.0 ** -np.arange(*RADII)
+        shares = self.size * 4.0 ** -np.arange(*self.effort.radii)
         s = np.tile([0.0, *shares, *-shares], (len(a), 1))
         width = np.zeros(len(a))
-        for number in range(ROUNDS):
+        for number in range(self.effort.moves):
             found = moved(s)
             best = found.argmin(axis=1)[:, None]
             middle, lowest = np.take_along_axis(s, best, 1)[:, 0], np.take_along_axis(found, best, 1)[:, 0]
             width = 0.4 * width if number else np.maximum(0.8 * np.abs(middle), shares[-1])
             s = middle[:, None] + width[:, None] * np.linspace(-1.0, 1.0, 9)
         within = np.abs(middle) < shares[0]
-        return np.where(within & np.isfinite(lowest), lowest, a), lane % SUBSAMPLE
+        return np.where(within & np.isfinite(lowest), lowest, a), lane % self.effort.parts
 
     def _until_left(self, value: float, paths: np.ndarray) -> Sided:
         """Return the passages of each settled trajectory up to its first one on the other side: after it the trajectory
@@ -452,10 +441,12 @@ class Approach:
         paths = self.paths(value, length)
         until = _until(*self._sided(value, paths)[:3], paths)
         if self.effort.is_flow:  # of a lost set, most trajectories leave far from the orbit, and none comes back
-            near = _are_near(paths, self.sample.points, AROUND * self.size, self.along.geometry)
+            near = _are_near(paths, self.sample.points, self.effort.around * self.size, self.along.geometry)
             last = _last(near)
-            gone = last <= paths.shape[1] - AWAY * length
-            self.is_lost |= bool(gone.mean() > 0.5 and have_come_back(near, AWAY * length).mean() <= BACK_AGAIN)
+            gone = last <= paths.shape[1] - self.effort.away * length
+            self.is_lost |= bool(
+                gone.mean() > 0.5 and have_come_back(near, self.effort.away * length).mean() <= self.effort.back_again
+            )
             until = np.where(gone, last, paths.shape[1]) if self.is_lost else until
         left = until < paths.shape[1]
         settled = until >= SETTLE
@@ -472,7 +463,7 @@ class Approach:
         again = np.zeros(len(paths), bool)
         again[lane[(a > 0.0) & (at > half)]] = True
         left = until < half
-        return float(again[left].mean()) if left.sum() >= LEAST else np.nan
+        return float(again[left].mean()) if left.sum() >= self.effort.least_passages else np.nan
 
 
 def last_stays(paths: np.ndarray, points: np.ndarray, radius: float, geometry: Geometry) -> np.ndarray:
@@ -520,12 +511,12 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
     The zero is found by the Illinois method, up to the error of the sample. Lines through the clearances on each side
     must lead to the same zero.
     """
-    low, high = approach.value, beyond
+    low, high, effort = approach.value, beyond, approach.effort
     here, there = approach.least(low), approach.least(high)
     if here.is_beyond or not there.is_beyond:
         return None
     weights, last, best = [1.0, 1.0], 0, here
-    for _ in range(MOST_STEPS_TO_ROOT[approach.effort.is_flow]):
+    for _ in range(effort.steps_to_root[effort.is_flow]):
         a, b = weights[0] * here.least, weights[1] * there.least
         x = low + (high - low) * (a / (a - b) if np.isfinite(a) and np.isfinite(b) else 0.5)
         if x in (low, high):
@@ -536,25 +527,27 @@ def contact_of(approach: Approach, beyond: float) -> Contact | None:
         else:
             low, here, weights = x, best, [1.0, 0.5 * weights[1] if last < 0 else 1.0]
         last = 1 if best.is_beyond else -1
-        if abs(best.least) <= CLOSE * best.error < np.inf or abs(high - low) <= SHORTEST * abs(beyond - approach.value):
+        if abs(best.least) <= effort.close * best.error < np.inf:
             break
-    if not abs(best.least) <= max(best.error, JUMP * NEAR[0] * approach.size):
+        if abs(high - low) <= effort.shortest * abs(beyond - approach.value):
+            break
+    if not abs(best.least) <= max(best.error, effort.jump * effort.near[0] * approach.size):
         return None  # it jumps there
-    for near in NEAR:
+    for near in effort.near:
         approach.near = near
         h = _span(approach, x, beyond)
         if h is None:
             continue
         found = _confirmed_at(approach, x, best, h)
         if found is not None:
-            return _closer(approach, found, (x, best), h) if approach.effort.is_flow else found
+            return _closer(approach, found, (x, best), h) if effort.is_flow else found
     return None
 
 
 def _closer(approach: Approach, found: Contact, zero: tuple[float, Clearance], h: float) -> Contact:
     """Take the lines of a flow again nearer to where they lead; return those with the least error."""
     span = found.span
-    for share in CLOSER:
+    for share in approach.effort.closer:
         x = 0.5 * (found.living + found.beyond)
         x -= approach.least(x).least / found.slope
         closer = [_confirmed_at(approach, *one, h * share) for one in (zero, (x, approach.least(x)))]
@@ -563,12 +556,12 @@ def _closer(approach: Approach, found: Contact, zero: tuple[float, Clearance], h
 
 
 def _confirmed_at(approach: Approach, value: float, best: Clearance, h: float) -> Contact | None:
-    values = value + h * np.array(SPREAD)
+    values = value + h * np.array(approach.effort.spread)
     least = np.array([approach.least(float(one)).least for one in values])
-    return _confirmed(value, best, values, least, approach.effort.is_flow)
+    return _confirmed(value, best, values, least, approach.effort)
 
 
-def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_flow: bool) -> Contact | None:
+def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, effort: Effort) -> Contact | None:
     """Extrapolate the clearances y at values x on both sides to 0; None unless both lines lead to the value found.
 
     A trajectory may come within the distance of passages a turn later at one of the values: then there is no line. Of
@@ -576,7 +569,7 @@ def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_f
     not met at each value.
     """
     h, half = x[-1] - value, len(x) // 2
-    if not (y * SPREAD < 0.0).all():
+    if not (y * effort.spread < 0.0).all():
         return None
     u = (x - value) / h
     sides = slice(half), slice(half, None)
@@ -586,22 +579,23 @@ def _confirmed(value: float, best: Clearance, x: np.ndarray, y: np.ndarray, is_f
     living, far = (float(value - h * line[1] / line[0]) for line in lines)
     slope = float((y[half] - y[half - 1]) / (x[half] - x[half - 1]))
     away, error = max(abs(living - value), abs(far - value)), 2.0 * max(best.error, abs(best.least)) / abs(slope)
-    if is_flow:
+    if effort.is_flow:
         scatter = max(np.std(y[part] - np.polyval(line, u[part])) for part, line in zip(sides, lines, strict=True))
         three = np.array([value, living, far])
         value = float(three.mean())
         error = 2.0 * max(three.std(ddof=1), float(scatter) * np.sqrt(half / (half - 2.0)) / abs(slope))
-    if not error <= 0.5 * abs(h) or (not is_flow and away > CURVED * abs(h)):
+    if not error <= 0.5 * abs(h) or (not effort.is_flow and away > effort.curved * abs(h)):
         return None
     return Contact(value, error, slope, living, far, float(abs(h)))
 
 
 def _span(approach: Approach, value: float, beyond: float) -> float | None:
     """Return the distance from the zero, with its sign, at which the clearance is a share of the reach."""
-    share = SHARES[approach.effort.is_flow]
+    effort = approach.effort
+    share = effort.shares[effort.is_flow]
     reach = approach.near * approach.size
     h = min(abs(beyond - value), abs(value - approach.value)) * float(np.sign(beyond - value))
-    for _ in range(MOST_STEPS_TO_ROOT[approach.effort.is_flow]):
+    for _ in range(effort.steps_to_root[effort.is_flow]):
         found = approach.least(value - h).least
         if found <= share * reach:
             return h

@@ -13,41 +13,28 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from pipeline.analysis.events.contact import (
-    AROUND,
-    AWAY,
-    SETTLE,
-    Approach,
-    Contact,
-    Effort,
-    Sample,
-    SectionMap,
-    last_stays,
-)
+from pipeline.analysis.events.contact import SETTLE, Approach, Contact, Effort, Sample, SectionMap, last_stays
 
-LONGEST_SPAN = 8.0
-"""Largest distance at which lifetimes are taken, in units of that of the clearances."""
 
-FIRST_RATIO = 0.7
-"""Ratio of the first two distances at which lifetimes are taken; the others follow from the lifetimes."""
+@dataclass(frozen=True)
+class LifetimeSettings:
+    """Numbers of the measurement of lifetimes and of the fit of their law."""
 
-SCATTER = 0.05
-"""Relative deviation of lifetimes from a power law that counts as one standard deviation: they have fine structure."""
-
-FEWEST_ESCAPES, FEWEST_LIFETIMES, MOST_LIFETIMES = 40, 4, 8
-"""Trajectories that leave at a parameter value, and fewest and most values of the parameter, for a fit of lifetimes."""
-
-ALL = 0.98
-"""Least share of trajectories that have left, and stay away for half of the time, at the value beyond the loss."""
-
-LANES = 64
-"""Most trajectories at a value."""
-
-HALVINGS = 10
-"""Bisections for the value up to which the set lives as long as trajectories are followed."""
-
-LARGEST_ERROR = 0.2
-"""Largest error of the exponent, as a share of it."""
+    longest_span: float = 8.0  # largest distance at which lifetimes are taken, in units of that of the clearances
+    # ratio of the first two distances at which lifetimes are taken; the others follow from the lifetimes
+    first_ratio: float = 0.7
+    # relative deviation of lifetimes from a power law that counts as one standard deviation: they have fine structure
+    scatter: float = 0.05
+    # trajectories that leave at a parameter value, and fewest and most values of the parameter, for a fit of lifetimes;
+    # more err less, and take longer
+    fewest_escapes: int = 40
+    fewest: int = 4
+    most: int = 8
+    # least share of trajectories that have left, and stay away for half of the time, at the value beyond the loss
+    stay_away: float = 0.98
+    lanes: int = 64  # most trajectories at a value
+    halvings: int = 10  # bisections for the value up to which the set lives as long as trajectories are followed
+    largest_error: float = 0.2  # largest error of the exponent, as a share of it
 
 
 @dataclass(frozen=True)
@@ -63,30 +50,40 @@ class Lifetimes:
     free_exponent: tuple[float, float]  # the exponent fitted with it, and its error
 
 
-def lifetimes_of(approach: Approach, contact: Contact, beyond: float) -> Lifetimes | None:
+def lifetimes_of(
+    approach: Approach, contact: Contact, beyond: float, settings: LifetimeSettings = LifetimeSettings()
+) -> Lifetimes | None:
     """Fit a power law to mean lifetimes at several values beyond contact; None if there are too few of them."""
-    span = min(abs(beyond - contact.value), LONGEST_SPAN * contact.span) * float(np.sign(beyond - contact.value))
+    span = min(abs(beyond - contact.value), settings.longest_span * contact.span) * float(
+        np.sign(beyond - contact.value)
+    )
     values: list[float] = []
     means: list[float] = []
     counts: list[int] = []
-    ratio = FIRST_RATIO
-    for _ in range(2 * MOST_LIFETIMES):
+    ratio = settings.first_ratio
+    for _ in range(2 * settings.most):
         value = contact.value + span
         mean, n = approach.lifetimes(value, 4 * approach.effort.length)
-        if (n < FEWEST_ESCAPES and values) or len(values) == MOST_LIFETIMES:
+        if (n < settings.fewest_escapes and values) or len(values) == settings.most:
             break
-        if n >= FEWEST_ESCAPES and mean >= SETTLE:
+        if n >= settings.fewest_escapes and mean >= SETTLE:
             if means and mean > means[-1]:  # to the distance at which they are twice as long
                 power = np.log(mean / means[-1]) / np.log((values[-1] - contact.value) / span)
                 ratio = float(np.clip(0.5 ** (1.0 / power), 0.5, 0.9))
             values, means, counts = [*values, value], [*means, mean], [*counts, n]
         span *= ratio
-    if len(values) < FEWEST_LIFETIMES:
+    if len(values) < settings.fewest:
         return None
-    return fit_lifetimes(values, means, counts, contact.value)
+    return fit_lifetimes(values, means, counts, contact.value, settings)
 
 
-def fit_lifetimes(values: Sequence[float], means: Sequence[float], counts: Sequence[int], contact: float) -> Lifetimes:
+def fit_lifetimes(
+    values: Sequence[float],
+    means: Sequence[float],
+    counts: Sequence[int],
+    contact: float,
+    settings: LifetimeSettings = LifetimeSettings(),
+) -> Lifetimes:
     """Fit ``c |p - p_c|^-gamma`` to mean lifetimes: gamma with p_c at the contact, and p_c with both free.
 
     Parameters
@@ -95,9 +92,11 @@ def fit_lifetimes(values: Sequence[float], means: Sequence[float], counts: Seque
         Parameter values, mean lifetimes there, and numbers of trajectories that left, the nearest value last.
     contact
         Value of the contact.
+    settings
+        Numbers to choose.
     """
     away, logs = np.asarray(values) - contact, np.log(means)
-    unit, sigma = away[-1], np.sqrt(1.0 / np.asarray(counts) + SCATTER**2)
+    unit, sigma = away[-1], np.sqrt(1.0 / np.asarray(counts) + settings.scatter**2)
 
     def residual(u: np.ndarray) -> np.ndarray:
         shift = u[2] if len(u) == 3 else 0.0
@@ -124,12 +123,17 @@ class Place:
     starts: np.ndarray
     points: np.ndarray
     size: float
-    length: int  # sections
+    effort: Effort
+
+    @property
+    def length(self) -> int:
+        """Sections for which trajectories are followed."""
+        return 4 * self.effort.length
 
     def stays(self, value: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the section points of trajectories at a value, and when each one was last near the set."""
         paths = self.along.paths(value, self.starts, SETTLE + self.length)
-        return paths, last_stays(paths, self.points, AROUND * self.size, self.along.geometry)
+        return paths, last_stays(paths, self.points, self.effort.around * self.size, self.along.geometry)
 
     def lifetime(self, value: float) -> tuple[float, int]:
         """Return the mean lifetime of trajectories at a parameter value [sections], and how many of them left.
@@ -137,7 +141,7 @@ class Place:
         The set is followed: if none left, its points at this value replace those before.
         """
         paths, until = self.stays(value)
-        left = until <= paths.shape[1] - AWAY * self.length
+        left = until <= paths.shape[1] - self.effort.away * self.length
         settled = until >= SETTLE
         if not left.any():
             self.points = paths[:, -max(len(self.points) // len(paths), 1) :].reshape(-1, paths.shape[2])
@@ -146,7 +150,14 @@ class Place:
         return float((until[settled] - SETTLE).sum()) / max(n, 1), n
 
 
-def transient_of(along: SectionMap, sample: Sample, seen: float, beyond: float, effort: Effort) -> Lifetimes | str:
+def transient_of(
+    along: SectionMap,
+    sample: Sample,
+    seen: float,
+    beyond: float,
+    effort: Effort,
+    settings: LifetimeSettings = LifetimeSettings(),
+) -> Lifetimes | str:
     """Measure the lifetimes of a set that is lost between two values; return why there is no law, if there is none.
 
     Returns
@@ -154,30 +165,30 @@ def transient_of(along: SectionMap, sample: Sample, seen: float, beyond: float, 
     Lifetimes
         Its `value` and `free_exponent` are fitted together; `exponent` is the one at this value.
     """
-    place = Place(along, sample.starts[:LANES], sample.points, sample.size(along.geometry), 4 * effort.length)
+    place = Place(along, sample.starts[: settings.lanes], sample.points, sample.size(along.geometry), effort)
     paths, until = place.stays(beyond)
-    if (until <= paths.shape[1] // 2).mean() < ALL:
+    if (until <= paths.shape[1] // 2).mean() < settings.stay_away:
         return "beyond, its trajectories stay near it or come back"
     low, high = seen, beyond
-    for _ in range(HALVINGS):
+    for _ in range(settings.halvings):
         middle = 0.5 * (low + high)
         lives = place.lifetime(middle)[0] > place.length
         low, high = (middle, high) if lives else (low, middle)
     values: list[float] = []
     means: list[float] = []
     counts: list[int] = []
-    for k in range(HALVINGS):
+    for k in range(settings.halvings):
         value = low + (beyond - low) * 0.5**k
         mean, n = place.lifetime(value)
-        if mean >= SETTLE and n >= FEWEST_ESCAPES:
+        if mean >= SETTLE and n >= settings.fewest_escapes:
             values, means, counts = [*values, value], [*means, mean], [*counts, n]
-    if len(values) < FEWEST_LIFETIMES:
+    if len(values) < settings.fewest:
         return "beyond, too few of its trajectories leave at times that can be measured"
-    values, means, counts = values[-MOST_LIFETIMES:], means[-MOST_LIFETIMES:], counts[-MOST_LIFETIMES:]
-    found = fit_lifetimes(values, means, counts, low)
-    found = fit_lifetimes(values, means, counts, found.value)
+    values, means, counts = values[-settings.most :], means[-settings.most :], counts[-settings.most :]
+    found = fit_lifetimes(values, means, counts, low, settings)
+    found = fit_lifetimes(values, means, counts, found.value, settings)
     exponent, error = found.free_exponent
-    if not (error <= LARGEST_ERROR * exponent and found.value_error <= 0.25 * abs(values[0] - found.value)):
+    if not (error <= settings.largest_error * exponent and found.value_error <= 0.25 * abs(values[0] - found.value)):
         return (
             f"beyond, its trajectories leave at mean times, {means[0]:.3g} to {means[-1]:.3g}, that show no power law"
         )

@@ -11,7 +11,15 @@ import magpend
 from magpend_core.crossing import Crossing
 from pipeline.analysis.branches.starting_orbits import family_of
 from pipeline.analysis.events import connections
-from pipeline.analysis.events.connections import Leaving, Rest, _sides, connection_of, rest_at, rests_in
+from pipeline.analysis.events.connections import (
+    ConnectionSettings,
+    Leaving,
+    Rest,
+    _sides,
+    connection_of,
+    rest_at,
+    rests_in,
+)
 from pipeline.analysis.events.contact import Effort, SectionMap, sample_of
 from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.events.test_events import lorenz_connection
@@ -60,18 +68,18 @@ def test_sides__of_a_linear_saddle():
 
 
 @pytest.mark.slow
-def test_rests_in__only_a_set_that_contains_one(monkeypatch):
+def test_rests_in__only_a_set_that_contains_one():
     along = lorenz_map()
     own = sample_of(along, 28.0, np.array([6.0, 5.0, 23.0]), EFFORT)
     (rest,) = rests_in(along, 28.0, own)
     assert rest.state == pytest.approx(np.zeros(3), abs=1e-9)
     # one trajectory, for one return, passes the origin on one side at most
-    monkeypatch.setattr(connections, "RETURNS", 1)
-    states, _ = connections.motion_of(along, 28.0, replace(own, starts=own.points[:1024]))
+    once = ConnectionSettings(returns=1)
+    states, _ = connections.motion_of(along, 28.0, replace(own, starts=own.points[:1024]), once)
     nearest = np.abs(states).max(axis=2).min(axis=1).argsort()[:8]
-    assert not any(rests_in(along, 28.0, replace(own, starts=own.points[k : k + 1])) for k in nearest.tolist())
+    assert not any(rests_in(along, 28.0, replace(own, starts=own.points[k : k + 1]), once) for k in nearest.tolist())
     # and one that ends passes nothing
-    assert rests_in(along, 5.0, own) == []
+    assert rests_in(along, 5.0, own, once) == []
 
 
 @pytest.mark.slow
@@ -88,6 +96,6 @@ def test_connection_of__on_another_section(monkeypatch):
     # the set lives on
     assert "meet no unstable orbit" in connection_of(along, own, (26.0, 25.0, 16.0), EFFORT)
     # lifetimes that are too long show no loss
-    ((_, _, edge, contact, far, _),) = judged
+    ((_, _, edge, contact, far, _, settings),) = judged
     assert far == 16.0
-    assert "do not show" in lost(along, own, edge, contact, 23.9, EFFORT)
+    assert "do not show" in lost(along, own, edge, contact, 23.9, EFFORT, settings)
