@@ -48,20 +48,17 @@ class CutSettings:
     separated: float = 1e-8  # part of one subspace in the next at which the multipliers of both are told apart
 
 
-CUTS = CutSettings()
-
-
-def is_steep(point: Point, family: Family) -> bool:
+def is_steep(point: Point, family: Family, cuts: CutSettings = CutSettings()) -> bool:
     """Return whether a limit cycle of a flow is too steep for shooting over its whole period."""
     if not family.period or crossed_state(family.system) is None:
         return False
-    return bool(np.linalg.norm(family.scaled(point.value.monodromy), 2) > CUTS.steep)
+    return bool(np.linalg.norm(family.scaled(point.value.monodromy), 2) > cuts.steep)
 
 
-def is_steeper(point: Point) -> bool:
+def is_steeper(point: Point, cuts: CutSettings = CutSettings()) -> bool:
     """Return whether a cut orbit needs more cuts."""
     assert isinstance(point.value, CutValue)
-    return bool(point.value.steepest.max() > CUTS.most_growth)
+    return bool(point.value.steepest.max() > cuts.most_growth)
 
 
 def flown(family: Family, rows: Rows, seconds: np.ndarray, atol: float) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +108,7 @@ class CutValue(Value):
         return graded_multipliers(self.tangents, self.speeds)
 
 
-def graded_multipliers(tangents: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+def graded_multipliers(tangents: np.ndarray, speeds: np.ndarray, cuts: CutSettings = CutSettings()) -> np.ndarray:
     """Return the multipliers of a closed orbit of a flow from the derivatives of its segments.
 
     Sweeps of QR decompositions along the orbit turn an orthonormal basis, in the states modulo the flow's direction,
@@ -124,6 +121,8 @@ def graded_multipliers(tangents: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         Derivatives of the segments in their order, shape (segment, state, state).
     speeds
         Rates at their starts, shape (segment, state).
+    cuts
+        Numbers to choose.
 
     Returns
     -------
@@ -134,16 +133,16 @@ def graded_multipliers(tangents: np.ndarray, speeds: np.ndarray) -> np.ndarray:
     across = np.array([np.linalg.qr(np.column_stack([speed, np.eye(n)]))[0][:, 1:] for speed in speeds])
     factors = np.roll(across, -1, axis=0).transpose(0, 2, 1) @ tangents @ across
     basis = np.eye(n - 1)
-    for _ in range(CUTS.sweeps):
+    for _ in range(cuts.sweeps):
         turned, product = basis, np.eye(n - 1)
         for factor in factors:
             turned, triangle = np.linalg.qr(factor @ turned)
             product = triangle @ product
         back = basis.T @ turned
         basis = turned
-        if not (np.abs(np.tril(back, -1)) >= CUTS.separated).any():
+        if not (np.abs(np.tril(back, -1)) >= cuts.separated).any():
             break
-    ends = [i for i in range(1, n - 1) if np.abs(back[i:, :i]).max() < CUTS.separated]
+    ends = [i for i in range(1, n - 1) if np.abs(back[i:, :i]).max() < cuts.separated]
     blocks = [slice(i, j) for i, j in zip([0, *ends], [*ends, n - 1], strict=True)]
     # what is left below the blocks is rounding, which the large factors would raise
     each = [np.linalg.eigvals(back[block, block] @ product[block, block]) for block in blocks]
@@ -309,15 +308,15 @@ def whole_orbit(family: Family, point: Point) -> tuple[CutProblem, np.ndarray]:
 
 
 def cut_where_steep(
-    problem: CutProblem, u: np.ndarray, along: np.ndarray, settings: Settings
+    problem: CutProblem, u: np.ndarray, along: np.ndarray, settings: Settings, cuts: CutSettings = CutSettings()
 ) -> Steps[tuple[CutProblem, Point] | None]:
     """Halve the segments of an orbit on which tangents grow too much, and refine the orbit.
 
     `along` is the direction of the branch, in the unknowns of `OrbitProblem`. Returns None on failure.
     """
     value = yield Query(problem, u)
-    while value.is_finite and isinstance(value, CutValue) and len(problem.shares) < CUTS.most_segments:
-        chosen = (value.steepest > CUTS.growth) | (len(problem.shares) < CUTS.least_segments)
+    while value.is_finite and isinstance(value, CutValue) and len(problem.shares) < cuts.most_segments:
+        chosen = (value.steepest > cuts.growth) | (len(problem.shares) < cuts.least_segments)
         if not chosen.any():
             break
         problem, u = problem.halved(u, chosen)

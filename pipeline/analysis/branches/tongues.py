@@ -12,7 +12,6 @@ import numpy as np
 import xarray as xr
 
 from magpend_core import run_branches
-from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
 from magpend_core.precision import limits_at, tolerances_at
 from magpend_core.rotation import CLOSED_TURNS, TurningState, rotation_numbers
@@ -79,11 +78,6 @@ class Search:
     n_periods: int
     settings: TongueSettings = TongueSettings()
 
-    @property
-    def system(self) -> System:
-        """System that is integrated."""
-        return self.family.system
-
     def rotation(self, values: np.ndarray, states: np.ndarray, closed: np.ndarray | None = None) -> np.ndarray:
         """Compute the rotation numbers of trajectories that start at given states and values of the free parameter."""
         rows = self.family.rows(self._unknowns(values, states))
@@ -91,7 +85,7 @@ class Search:
             rows.parameters,
             rows.frequency_hz,
             rows.states,
-            system=self.system,
+            system=self.family.system,
             turning=self.turning,
             n_periods=self.n_periods,
             orbit_period=closed,
@@ -109,7 +103,7 @@ class Search:
             n_transient=n_transient,
             n_keep=n_keep,
             **limits_at(self.settings.tolerance),
-            system=self.system,
+            system=self.family.system,
         )
         return np.asarray(found.section[:, 0])
 
