@@ -17,7 +17,7 @@ from typing import Any
 import pandas as pd
 
 import magpend
-from pipeline.analysis.branches.figure import NAMES
+from pipeline.analysis.branches.kinds import NAMES
 from pipeline.layout.vocabulary import letter
 from pipeline.results.tabular import plain
 

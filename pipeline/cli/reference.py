@@ -338,6 +338,14 @@ def results() -> str:
     return "\n\n".join(parts)
 
 
+def event_kinds() -> str:
+    """Return the Markdown table of the kinds of events."""
+    from pipeline.analysis.events.kinds import EVENTS
+
+    rows = ((f"`{kind.name}`", f"`{kind.label}`" if kind.label else "", kind.text) for kind in EVENTS.values())
+    return table(("name", "label", "event"), rows)
+
+
 def conventions() -> str:
     """Return the Markdown table of the attributes that describe the variables of an opened cube or result."""
     from pipeline.layout.conventions import ADDED
@@ -382,6 +390,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "measures": measures,
     "variables": variables,
     "results": results,
+    "events": event_kinds,
     "conventions": conventions,
     "statuses": statuses,
     "models": models,

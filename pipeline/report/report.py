@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.analysis.events.names import RANGE_END
+from pipeline.analysis.events.kinds import RANGE_END
 from pipeline.analysis.spectrum.declaration import SpectrumOptions
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.own_words import dims_in_own_words, in_own_words

@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.basins.declaration import RegimeOptions
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.branches.declaration import CurveFigureOptions, CurveOptions
-from pipeline.analysis.branches.figure import DASHES, NAMES, draw_over, line_note, mark_points
-from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS
+from pipeline.analysis.branches.figure import DASHES, draw_over, line_note, mark_points
+from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, NAMES
 from pipeline.analysis.branches.levels import refuse_at
 from pipeline.layout.conventions import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, letter, parameter_name

@@ -15,7 +15,17 @@ from matplotlib.patches import Circle
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of, limits_of
 from pipeline.analysis.branches.completeness import cut_words
 from pipeline.analysis.branches.declaration import BranchFigureOptions, MultiplierOptions
-from pipeline.analysis.branches.kinds import BRANCH_POINTS, CURVE_KINDS, HOMOCLINIC, HOPF, KINDS, LABELS, LIMITS
+from pipeline.analysis.branches.kinds import (
+    BRANCH_POINTS,
+    CURVE_KINDS,
+    HOMOCLINIC,
+    HOPF,
+    KINDS,
+    LABELS,
+    LIMITS,
+    MARKERS,
+    NAMES,
+)
 from pipeline.analysis.branches.levels import at_levels, refuse_at
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
@@ -26,18 +36,6 @@ from pipeline.plots.measured import columns_of, draw_sections, points_of, with_p
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import words_of
 
-MARKERS = dict(zip((*KINDS, *LIMITS), "^soDpvX*P", strict=True))
-NAMES = {
-    "fold": "fold",
-    "period_doubling": "period doubling",
-    "neimark_sacker": "Neimark-Sacker",
-    "branch_point": "branch point",
-    "hopf": "Hopf",
-    "pitchfork": "pitchfork",
-    "transcritical": "transcritical",
-    "homoclinic": "homoclinic",
-    "snic": "saddle node on a circle",
-}
 STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
 UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
 _NAME_PT = 7.0

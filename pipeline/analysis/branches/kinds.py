@@ -39,6 +39,16 @@ AUTO writes HB for H and TR (torus) for NS; MatCont writes LPC for the fold of a
 transcritical point is a branch point to both.
 """
 
+MARKERS = dict(zip(CURVE_KINDS, "^soDpvX*P", strict=True))
+"""Markers of bifurcations in figures."""
+
+NAMES = {
+    **{FOLD: "fold", DOUBLING: "period doubling", TORUS: "Neimark-Sacker", BRANCHING: "branch point", HOPF: "Hopf"},
+    **{PITCHFORK: "pitchfork", TRANSCRITICAL: "transcritical"},
+    **{HOMOCLINIC: "homoclinic", SNIC: "saddle node on a circle"},
+}
+"""Names of bifurcations in texts."""
+
 CURVE_WHY = {
     "closed": "closed",
     "resonance": "the multipliers become real",

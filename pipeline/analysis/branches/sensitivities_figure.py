@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from pipeline.analysis.branches.declaration import SensitivityFigureOptions, SensitivityOptions
-from pipeline.analysis.branches.figure import NAMES
-from pipeline.analysis.branches.kinds import LABELS
+from pipeline.analysis.branches.kinds import LABELS, NAMES
 from pipeline.analysis.branches.levels import bifurcations_at, levels_of_bifurcations
 from pipeline.layout.vocabulary import parameter_name
 from pipeline.plots import labels, style

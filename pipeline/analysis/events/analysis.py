@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pkgutil import resolve_name
 
 import numpy as np
 import xarray as xr
@@ -12,12 +13,10 @@ import xarray as xr
 from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.intervals import interval_along, settle_along, swept_axis
 from pipeline.analysis.branches.kinds import FOLD, KINDS, SNIC
-from pipeline.analysis.events.breakups import Breakups
-from pipeline.analysis.events.cascades import Born, cascade_of, torus_of
 from pipeline.analysis.events.crises import Crises
 from pipeline.analysis.events.dataset import dataset_of
 from pipeline.analysis.events.declaration import EventOptions
-from pipeline.analysis.events.grazing import grazing_of
+from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, RANGE_END, UNDECIDED, detectors_of
 from pipeline.analysis.events.lines import (
     AT_BRANCH_POINT,
     CROSSING,
@@ -33,16 +32,17 @@ from pipeline.analysis.events.lines import (
     lines_of,
     places_of,
 )
-from pipeline.analysis.events.names import BREAKUP, CRISES, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.analysis.events.one_event import are_mirrored, is_at_one_value, on_circle, with_images
-from pipeline.analysis.events.passages import may_pass, passage_of
 from pipeline.analysis.events.refinement import refined
-from pipeline.analysis.events.scene import Event, Scene, Stretch
+from pipeline.analysis.events.scene import Event, Scene, Stretch, orbit_beyond
 from pipeline.layout.vocabulary import (
+    APERIODIC,
     ATTRACTS,
+    CHAOTIC_SET,
     EQUILIBRIUM,
     FREQUENCY_DIM,
     PERIODIC_ORBIT,
+    TORUS,
     axis_name,
     frequency_of,
     letter,
@@ -99,18 +99,17 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     order = np.argsort(part[axis].values, kind="stable")
     scene = Scene(part, located, axis, base, order, lines_of(located, others, geometry))
     stretches, ids = _continued(scene, [_undoubled(scene, one) for one in _stretches(scene)])
-    crises = Crises(replace(scene, names=ids))
-    stretches = stretches if options.orbits else crises.split(stretches)
+    if not options.orbits:
+        stretches = Crises(replace(scene, names=ids)).split(stretches)
     run.echo(f"events: {len(stretches)} stretches of attractors, {len(scene.lines)} branches")
     stretches, fates, names = _joined(*_cut(scene, stretches))
     stretches.sort(key=lambda one: (one.attractor, one.places))
     names = {(place, i): names.get((place, name), name) for (place, i), name in ids.items()}
-    scene = crises.scene = replace(scene, names=names)
+    scene = replace(scene, names=names)
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
     named = [_on_circle(scene, one, named) for one in named]
     if not options.orbits:
-        breakups = Breakups(scene)
-        named = [_aperiodic(scene, crises, breakups, one, named) for one in named]
+        named = [_aperiodic(scene, one, named) for one in named]
     return dataset_of(scene, stretches, _merged(with_images(scene, named)))
 
 
@@ -341,7 +340,7 @@ def _named(scene: Scene, event: Event) -> Event:
     if fate.limit:
         return replace(event, what=fate.limit, error=max(fate.error, LOCATED * scene.scale))
     if fate.bifurcation < 0:
-        return _touching(scene, event)
+        return event if event.stretch.kind in APERIODIC else _detected(scene, event, ())
     ds, k = scene.located, fate.bifurcation
     sides = ds["n_unstable_before"].values[k], ds["n_unstable_after"].values[k]
     if int(ds["of_branch"].values[k]) == fate.branch and (min(sides) != 0 or max(sides) == 0):
@@ -352,19 +351,12 @@ def _named(scene: Scene, event: Event) -> Event:
     return replace(event, what=what, error=error_at(ds, k, scene.scale))
 
 
-def _touching(scene: Scene, event: Event) -> Event:
-    """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
-    fate = event.fate
-    line = next((line for line in scene.lines if line.branch == fate.branch), None)
-    if line is None or fate.node not in (0, len(line.value) - 1):
-        return event
-    family = scene.family(event.stretch.places[event.rises], line.period)
-    found = grazing_of(line, fate.node, family)
-    if found is None:
-        return event
-    what, value, error, why = found
-    fate = replace(fate, value=value, why=f"{fate.why}; {why}")
-    return replace(event, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
+def _detected(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Let the detectors of the kinds of events name an end, until one does."""
+    for place in detectors_of(SETS[one.stretch.kind]):
+        if one.what == UNDECIDED:
+            one = resolve_name(place)(scene, one, named)
+    return one
 
 
 def _on_circle(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
@@ -390,62 +382,20 @@ def _cells(scene: Scene, attractor: int, rises: bool, place: int, beyond: int) -
     return dict(counts.most_common()), int(here.sum())
 
 
-def _aperiodic(scene: Scene, crises: Crises, breakups: Breakups, one: Event, named: Sequence[Event]) -> Event:
-    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by a crisis, if
-    there is proof.
+def _aperiodic(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set or a torus by the end of the orbit that its cells go on to, or by what happens
+    between the two values, if there is proof.
     """
-    if one.what != UNDECIDED or one.stretch.period or SETS[one.stretch.kind] not in ("chaotic_set", "torus"):
+    if one.what != UNDECIDED or one.stretch.kind not in (TORUS, CHAOTIC_SET):
         return one
-    is_chaotic = SETS[one.stretch.kind] == "chaotic_set"
-    place, way = one.stretch.places[one.rises], 1 if one.rises else -1
+    if orbit_beyond(one, named) is None:
+        one = replace(one, fate=replace(one.fate, why=_why_open(one, named)))
+    return _detected(scene, one, named)
+
+
+def _why_open(one: Event, named: Sequence[Event]) -> str:
+    """Say why no orbit tells the end of a chaotic set or a torus."""
     heir = next(iter(one.to), -1)
-    opposite = [
-        other
-        for other in named
-        if other.rises != one.rises
-        and other.stretch.attractor == heir
-        and other.stretch.places[other.rises] == place + way
-        and next(iter(other.to), -1) == one.stretch.attractor
-    ]
-    facing = [other for other in opposite if other.fate.bifurcation >= 0]
-    if not facing or len(one.to) > 1:
-        why = _why_open(one, heir, named)
-        alone = [other for other in opposite if len(one.to) == len(other.to) == 1]
-        if alone and {SETS[x.stretch.kind] for x in (one, alone[0])} == {"torus", "chaotic_set"}:
-            broken = breakups.name(one, alone[0].stretch)
-            if broken.what != UNDECIDED:
-                return broken
-            why = broken.fate.why
-        return crises.name(one, why) if is_chaotic else replace(one, fate=replace(one.fate, why=why))
-    born = _born(scene, one.stretch, place, way, facing[0].fate)
-    fate = replace(facing[0].fate, value=born.value, why=born.why)
-    if not born.what:
-        open_end = replace(one, fate=replace(fate, bifurcation=-1))
-        return crises.name(open_end, born.why) if is_chaotic else open_end
-    error = max(born.error, LOCATED * scene.scale)
-    return replace(one, fate=fate, what=born.what, error=error, born=born)
-
-
-def _born(scene: Scene, stretch: Stretch, place: int, way: int, fate: Fate) -> Born:
-    """Judge the end of a chaotic set or a torus, given the fate of the orbit beyond."""
-    along, geometry, all_points = scene.along, geometry_of(scene.attractors), points_of_rows(scene.attractors)
-    points = all_points[stretch.rows[way > 0]]
-    bracket, is_torus = (float(along[place + way]), float(along[place])), SETS[stretch.kind] == "torus"
-    if may_pass(scene.located, fate.bifurcation, is_torus):
-        family = scene.family(place, 1)
-        return passage_of(scene.located, fate.bifurcation, family, bracket, points, geometry, is_torus)
-    if not is_torus:
-        return cascade_of(scene.located, fate, bracket, points, geometry)
-    if stretch.places[0] == stretch.places[1]:
-        return Born("", "one value of the run shows the torus; two are needed to see it shrink")
-    rows = rows_at(scene.attractors)[(int(scene.order[place - way]),)]
-    inner = next(row for row in rows if scene.attractors["attractor"].values[row] == stretch.attractor)
-    values = float(along[place + way]), float(along[place]), float(along[place - way])
-    return torus_of(scene.located, fate, values, (points, all_points[inner]), geometry)
-
-
-def _why_open(one: Event, heir: int, named: Sequence[Event]) -> str:
-    """Say why the end of a chaotic set or a torus is not decided."""
     beyond = [other.stretch for other in named if other.stretch.attractor == heir]
     if any(other.kind == one.stretch.kind for other in beyond):
         return f"{letter(heir)} is a {plain(SETS[one.stretch.kind])} too and may be the same: such ids rest on distance"
@@ -467,7 +417,7 @@ def _merged(named: Sequence[Event]) -> list[Event]:
             and last.stretch.attractor == one.stretch.attractor
             and (
                 last.fate.bifurcation == one.fate.bifurcation >= 0
-                or (last.what in (*CRISES, BREAKUP) and last.what == one.what and is_at_one_value(last, one))
+                or (EVENTS[one.what].two_sided and last.what == one.what and is_at_one_value(last, one))
             )
         ):
             merged[-1] = replace(last, after=one.stretch)

@@ -10,7 +10,7 @@ than the distance of these values are not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -18,11 +18,10 @@ import xarray as xr
 from magpend_core.engine.placeholders import no_forcing
 from magpend_core.orbits import crossed_state, section_map
 from pipeline.analysis.attractors.extension.growth import growth_of, kind_of
-from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.contact import SectionMap, map_along
+from pipeline.analysis.events.kinds import BREAKUP, UNDECIDED
 from pipeline.analysis.events.lines import at
-from pipeline.analysis.events.names import BREAKUP, UNDECIDED
-from pipeline.analysis.events.scene import Event, Scene, Stretch
+from pipeline.analysis.events.scene import Born, Event, Scene, Stretch, opposite_ends
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
 from pipeline.results.ragged import points_of_rows
 
@@ -56,32 +55,27 @@ class _Found:
     rate: float
 
 
-@dataclass(eq=False)
-class Breakups:
-    """Intervals of a scene with a torus on one side and a chaotic set on the other; each is looked at once."""
+def name_breakup(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a torus or of a chaotic set whose cells go on to the other kind of set, or say what was met
+    between the two.
+    """
+    others = [other.stretch for other in opposite_ends(one, named) if len(one.to) == len(other.to) == 1]
+    if not others or {one.stretch.kind, others[0].kind} != {TORUS, CHAOTIC_SET}:
+        return one
+    torus, chaos = sorted((one.stretch, others[0]), key=lambda stretch: stretch.kind != TORUS)
+    if (torus, chaos) not in scene.verdicts:
+        scene.verdicts[torus, chaos] = _between(scene, torus, chaos, rises=one.rises == (torus is one.stretch))
+    found = scene.verdicts[torus, chaos]
+    fate = replace(one.fate, value=found.value, bifurcation=-1, why=found.why)
+    return replace(one, fate=fate, what=found.what or UNDECIDED, error=found.error, born=found)
 
-    scene: Scene
-    known: dict[tuple[Stretch, Stretch], Born] = field(default_factory=dict)
 
-    def name(self, one: Event, other: Stretch) -> Event:
-        """Name the end of a torus or of a chaotic set whose cells go on to the other kind of set, or say what was met
-        between the two.
-        """
-        pair = (one.stretch, other) if one.stretch.kind == TORUS else (other, one.stretch)
-        if pair not in self.known:
-            self.known[pair] = self._between(*pair, rises=one.rises == (pair[0] is one.stretch))
-        found = self.known[pair]
-        fate = replace(one.fate, value=found.value, bifurcation=-1, why=found.why)
-        return replace(one, fate=fate, what=found.what or UNDECIDED, error=found.error, born=found)
-
-    def _between(self, torus: Stretch, chaos: Stretch, rises: bool) -> Born:
-        """Judge the interval between a torus and a chaotic set; `rises` if the parameter rises from the torus on."""
-        scene, all_points = self.scene, points_of_rows(self.scene.attractors)
-        ends = (torus, rises), (chaos, not rises)
-        values = tuple(float(scene.along[one.places[end]]) for one, end in ends)
-        sets = tuple(all_points[one.rows[end]] for one, end in ends)
-        along = map_along(scene, torus.places[rises])
-        return breakup_of(scene.located, along, values, sets)
+def _between(scene: Scene, torus: Stretch, chaos: Stretch, rises: bool) -> Born:
+    """Judge the interval between a torus and a chaotic set; `rises` if the parameter rises from the torus on."""
+    ends, points = ((torus, rises), (chaos, not rises)), points_of_rows(scene.attractors)
+    values = tuple(float(scene.along[one.places[end]]) for one, end in ends)
+    sets = tuple(points[one.rows[end]] for one, end in ends)
+    return breakup_of(scene.located, map_along(scene, torus.places[rises]), values, sets)
 
 
 def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets: Sequence[np.ndarray]) -> Born:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.kinds import DOUBLING, KINDS, TORUS
+from pipeline.analysis.events.kinds import CASCADE
 from pipeline.analysis.events.lines import Fate, at
-from pipeline.analysis.events.names import CASCADE
+from pipeline.analysis.events.passages import may_pass
+from pipeline.analysis.events.scene import Born, Event, Scene, judged, orbit_beyond
+from pipeline.results.ragged import points_of_rows, rows_at
 from pipeline.results.sets import Geometry, mean_distance
 from pipeline.results.tabular import words_of
 
@@ -36,19 +39,14 @@ SQUARE_ROOT = 0.25
 """Largest deviation from 1 of the ratio of a torus's squared sizes to that of its distances from the point."""
 
 
-@dataclass(frozen=True)
-class Born:
-    """Verdict on the end of a chaotic set or a torus; `what` is empty if it is not decided."""
-
-    what: str
-    why: str
-    value: float = np.nan
-    error: float = np.nan
-    doublings: tuple[float, ...] = ()
-    ratio: float = np.nan
-    exponent: float = np.nan  # minus the power of the distance with which laminar phases grow
-    exponent_error: float = np.nan
-    rotation: str = ""  # p/q of the orbit to which a torus locks
+def name_cascade(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set by the cascade of doublings of the orbit to which its cells go on."""
+    fate = orbit_beyond(one, named)
+    if fate is None or may_pass(scene.located, fate.bifurcation, is_torus=False):
+        return one
+    points = points_of_rows(scene.attractors)[one.row]
+    found = cascade_of(scene.located, fate, scene.values_at(one), points, geometry_of(scene.attractors))
+    return judged(scene, one, fate, found)
 
 
 def cascade_of(
@@ -123,6 +121,22 @@ def _chain(ds: xr.Dataset, k: int) -> list[int]:
             break
         chain.append(int(nearest))
     return chain
+
+
+def name_torus(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a torus by the Neimark-Sacker point of the orbit to which its cells go on."""
+    fate, stretch = orbit_beyond(one, named), one.stretch
+    if fate is None or may_pass(scene.located, fate.bifurcation, is_torus=True):
+        return one
+    if stretch.places[0] == stretch.places[1]:
+        why = "one value of the run shows the torus; two are needed to see it shrink"
+        return judged(scene, one, fate, Born("", why))
+    place, points = one.place - one.way, points_of_rows(scene.attractors)
+    rows = rows_at(scene.attractors)[(int(scene.order[place]),)]
+    inner = next(row for row in rows if scene.attractors["attractor"].values[row] == stretch.attractor)
+    values = *scene.values_at(one), float(scene.along[place])
+    found = torus_of(scene.located, fate, values, (points[one.row], points[inner]), geometry_of(scene.attractors))
+    return judged(scene, one, fate, found)
 
 
 def torus_of(

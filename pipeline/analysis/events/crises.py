@@ -11,13 +11,12 @@ its bands.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.deflation import DeflationSettings, search_orbits, starts_around
-from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.connections import connection_of
 from pipeline.analysis.events.contact import (
     SETTLE,
@@ -32,9 +31,9 @@ from pipeline.analysis.events.contact import (
     map_along,
     sample_of,
 )
+from pipeline.analysis.events.kinds import BANDS, BOUNDARY, INTERIOR, TRANSIENT, TWINS
 from pipeline.analysis.events.lines import at
-from pipeline.analysis.events.names import BANDS, BOUNDARY, INTERIOR, TRANSIENT, TWINS
-from pipeline.analysis.events.scene import Event, Scene, Stretch
+from pipeline.analysis.events.scene import Born, Event, Scene, Stretch
 from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transient_of
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter, parameter_name
@@ -75,18 +74,22 @@ class Crisis(Born):
     lives_beyond: bool = False  # whether the set that meets the orbit is the one on the other side
 
 
+def name_crisis(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set by the crisis of this set, or of a set that its cells go on to, as seen from the
+    other side, else by lifetimes beyond; add what was tried if it stays open.
+    """
+    return Crises(scene).name(one)
+
+
 @dataclass(eq=False)
 class Crises:
     """The crises of the chaotic sets of a scene; each end of a set is looked at once."""
 
     scene: Scene
-    known: dict[tuple[int, int, int], Crisis] = field(default_factory=dict)
 
-    def name(self, one: Event, why: str) -> Event:
-        """Name the end of a chaotic set by the crisis of this set, or of a set that its cells go on to, as seen from
-        the other side, else by lifetimes beyond; add `why` if it stays open.
-        """
-        place, way = one.stretch.places[one.rises], 1 if one.rises else -1
+    def name(self, one: Event) -> Event:
+        """Name the end of a chaotic set as in `name_crisis`."""
+        place, way = one.place, one.way
         tries = [self.at(one.stretch.attractor, place, way)]
         if not tries[0].what:
             heirs = [i for i in one.to if self._row(i, place + way) is not None][:2]
@@ -95,7 +98,7 @@ class Crises:
         found = next((crisis for crisis in tries if crisis.what), None)
         if found is None:
             found = self._transient(one.stretch.attractor, place, way)
-            tried = "; ".join(filter(None, dict.fromkeys([why, *(x.why for x in tries), found.why])))
+            tried = "; ".join(filter(None, dict.fromkeys([one.fate.why, *(x.why for x in tries), found.why])))
             if not found.what:
                 return replace(one, fate=replace(one.fate, why=tried))
             found = replace(found, why=tried)
@@ -104,10 +107,11 @@ class Crises:
 
     def at(self, attractor: int, place: int, way: int) -> Crisis:
         """Return the crisis in which a chaotic set at a place ends as the parameter goes on to the next place."""
-        key = attractor, place, way
-        if key not in self.known:
-            self.known[key] = self._crisis(*key)
-        return self.known[key]
+        key, known = (attractor, place, way), self.scene.verdicts
+        if key not in known:
+            known[key] = self._crisis(*key)
+        found: Crisis = known[key]
+        return found
 
     def _joined(self, attractor: int, place: int, way: int) -> Crisis:
         """Return the crisis in which another set at a place merges with this one as the parameter goes on."""

@@ -9,13 +9,12 @@ import xarray as xr
 
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import BRANCHING
-from pipeline.analysis.events.cascades import Born
 from pipeline.analysis.events.crises import Crisis
 from pipeline.analysis.events.graph import at_ends
+from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, UNDECIDED
 from pipeline.analysis.events.lines import Fate
-from pipeline.analysis.events.names import LIVES_ON, NAMES, UNDECIDED
 from pipeline.analysis.events.one_event import is_own, same_as
-from pipeline.analysis.events.scene import Event, Scene, Stretch
+from pipeline.analysis.events.scene import Born, Event, Scene, Stretch
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.results.outcomes import DIVERGED
@@ -23,12 +22,10 @@ from pipeline.results.outcomes import DIVERGED
 Columns = dict[str, Sequence[object]]
 """Values of the columns of events, by name."""
 
-_CODES = {"set": SETS, "what": NAMES, "criticality": ["unknown", *CRITICALITIES[1:]]}
-"""Labels of the columns that hold codes."""
-
 
 def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event]) -> xr.Dataset:
     """Return the events and stretches of a scene as the Dataset of the analysis."""
+    codes = {"set": SETS, "what": list(EVENTS), "criticality": ["unknown", *CRITICALITIES[1:]]}
     named = sorted(named, key=lambda one: (one.stretch.attractor, one.stretch.places[one.rises]))
     located, along, n = scene.located, scene.along, len(scene.along)
     beyond = [one.beyond for one in named]
@@ -46,7 +43,7 @@ def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event
         "period": [one.stretch.period for one in named],
         "period_after": [one.after.period if one.after else -1 for one in named],
         "rises": [int(one.rises) for one in named],
-        "what": [NAMES.index(one.what) for one in named],
+        "what": [codes["what"].index(one.what) for one in named],
         "criticality": degrees,
         "value": [_value(one) for one in named],
         "value_error": [one.error for one in named],
@@ -61,7 +58,7 @@ def dataset_of(scene: Scene, stretches: Sequence[Stretch], named: Sequence[Event
         "evidence": [one.fate.why for one in named],
     }
     variables: dict[str, object] = {
-        name: ("event", np.array(values), code_flags(_CODES[name]) if name in _CODES else {})
+        name: ("event", np.array(values), code_flags(codes[name]) if name in codes else {})
         for name, values in (columns | _columns_of_sets(named)).items()
     }
     to = [list(one.to) for one in named], [list(one.to.values()) for one in named]

@@ -93,7 +93,7 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
-    version=15,
+    version=16,
 )
 
 

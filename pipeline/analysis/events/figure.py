@@ -10,26 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from pipeline.analysis.branches.figure import MARKERS
-from pipeline.analysis.branches.figure import NAMES as IN_WORDS
-from pipeline.analysis.branches.kinds import KINDS, LABELS, LIMITS
 from pipeline.analysis.events.declaration import EventOptions, GenealogyOptions
-from pipeline.analysis.events.names import (
-    BANDS,
-    BOUNDARY,
-    BREAKUP,
-    CASCADE,
-    GRAZING,
-    INTERIOR,
-    INTERMITTENCY,
-    LOCKING,
-    NAMES,
-    RANGE_END,
-    SLIDING,
-    TRANSIENT,
-    TWINS,
-    UNDECIDED,
-)
+from pipeline.analysis.events.kinds import EVENTS, RANGE_END, UNDECIDED
 from pipeline.layout.vocabulary import letter
 from pipeline.plots import labels, style
 from pipeline.plots.figure import frame_of
@@ -48,21 +30,6 @@ _HALO = [withStroke(linewidth=1.8, foreground="white")]
 _OPEN: dict[str, Any] = {"color": "0.45", "linewidth": 1.2, "linestyle": (0, (1, 1.2))}
 _JOIN: dict[str, Any] = {"arrowstyle": "->", "linewidth": 0.6, "color": "0.35", "shrinkA": 5.0, "shrinkB": 4.0}
 _MARK: dict[str, Any] = {"markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": "black", "zorder": 8.0}
-
-_OTHERS = {
-    CASCADE: ("*", "", "end of a cascade"),
-    BOUNDARY: ("X", "", "boundary crisis"),
-    INTERIOR: ("P", "", "interior crisis"),
-    BANDS: ("d", "", "merging of bands"),
-    TWINS: ("H", "", "merging of attractors"),
-    TRANSIENT: ("x", "", "lost into a transient"),
-    **{name: ("h", kind.upper(), f"intermittency {kind.upper()}") for kind, name in INTERMITTENCY.items()},
-    LOCKING: (">", "", "locking"),
-    GRAZING: ("<", "", "grazing"),
-    SLIDING: ("<", "S", "grazing-sliding"),
-    BREAKUP: ("8", "", "break-up of a torus"),
-}
-"""Marker, label and name of the events that are no bifurcations of a branch."""
 
 
 @style.drawn
@@ -148,17 +115,19 @@ def _draw_bars(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> set[int]:
 
 
 def _draw_events(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
+    kinds = words_of(ds["what"])
     taken: dict[int, list[float]] = {row: [] for row in rows.values()}
     width = np.ptp([x for k in ("low", "high") for x in ds[f"stretch_{k}"].values])
     for k in range(ds.sizes["event"]):
-        what, row = NAMES[int(ds["what"][k])], rows[int(ds["attractor"][k])]
+        what, row = kinds[int(ds["what"][k])], rows[int(ds["attractor"][k])]
         seen, beyond, x = (float(ds[name][k]) for name in ("seen", "beyond", "value"))
         if what == UNDECIDED:
             ax.plot([seen, beyond], [row, row], zorder=2.0, **_OPEN)
         if not np.isfinite(x) or what == RANGE_END:
             continue
-        marker, label = _OTHERS[what][:2] if what in _OTHERS else (MARKERS[what], LABELS[what])
-        ax.plot(x, row, linestyle="none", marker=marker, **_MARK)
+        kind = EVENTS[what]
+        label = kind.mark or kind.label
+        ax.plot(x, row, linestyle="none", marker=kind.marker, **_MARK)
         if all(abs(x - other) > 3.0 * _LETTER * width for other in taken[row]):
             taken[row].append(x)
         else:
@@ -173,16 +142,12 @@ def _draw_events(ax: Axes, ds: xr.Dataset, rows: dict[int, int]) -> None:
 
 
 def _handles(ds: xr.Dataset) -> list[Any]:
-    present = {NAMES[int(code)] for code in ds["what"].values}
+    kinds = words_of(ds["what"])
+    present = {kinds[code] for code in ds["what"].values.tolist()}
     handles = [
-        Line2D([], [], linestyle="none", marker=MARKERS[kind], label=f"{LABELS[kind]} {IN_WORDS[kind]}", **_MARK)
-        for kind in (*KINDS, *LIMITS)
-        if kind in present
-    ]
-    handles += [
-        Line2D([], [], linestyle="none", marker=marker, label=name, **_MARK)
-        for what, (marker, _, name) in _OTHERS.items()
-        if what in present
+        Line2D([], [], linestyle="none", marker=kind.marker, label=f"{kind.label} {kind.text}".lstrip(), **_MARK)
+        for kind in EVENTS.values()
+        if kind.name in present and kind.marker
     ]
     if UNDECIDED in present:
         handles.append(Line2D([], [], label="not decided", **_OPEN))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.events.names import RANGE_END
+from pipeline.analysis.events.kinds import RANGE_END
 from pipeline.layout.own_words import RATE
 from pipeline.layout.vocabulary import letter, parameter_name
 from pipeline.results.intervals import binomial_interval

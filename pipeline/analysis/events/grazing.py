@@ -13,6 +13,7 @@ smooth function of the length of the stay.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,8 +25,9 @@ from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.known import at_value
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.events.lines import Line
-from pipeline.analysis.events.names import GRAZING, SLIDING
+from pipeline.analysis.events.kinds import GRAZING, SLIDING
+from pipeline.analysis.events.lines import LOCATED, Line
+from pipeline.analysis.events.scene import Event, Scene
 from pipeline.results.tolerances import BRANCH_RTOL
 
 SAMPLES = 4000
@@ -54,6 +56,20 @@ NEAR = 0.02
 
 REACH = 1e-4
 """Largest distance of the touch from the last orbit, and largest error, in units of the interval of the parameter."""
+
+
+def name_touch(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of an orbit that begins to touch a surface of impacts or switches, at the end of its branch."""
+    fate = one.fate
+    line = next((line for line in scene.lines if line.branch == fate.branch), None)
+    if line is None or fate.node not in (0, len(line.value) - 1):
+        return one
+    found = grazing_of(line, fate.node, scene.family(one.place, line.period))
+    if found is None:
+        return one
+    what, value, error, why = found
+    fate = replace(fate, value=value, why=f"{fate.why}; {why}")
+    return replace(one, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
 
 
 def grazing_of(line: Line, node: int, family: Family) -> tuple[str, float, float, str] | None:

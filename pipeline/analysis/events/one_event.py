@@ -12,8 +12,8 @@ from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.bifurcations import SAME_PLACE
 from pipeline.analysis.branches.kinds import SNIC
 from pipeline.analysis.events.crises import Crisis
+from pipeline.analysis.events.kinds import EVENTS, RANGE_END, UNDECIDED
 from pipeline.analysis.events.lines import Fate
-from pipeline.analysis.events.names import BREAKUP, CRISES, RANGE_END, UNDECIDED
 from pipeline.analysis.events.scene import Event, Scene
 from pipeline.layout.vocabulary import EQUILIBRIUM
 from pipeline.results.tolerances import SAME_ON_BRANCH
@@ -93,7 +93,7 @@ def _is_same(scene: Scene, a: Event, b: Event) -> bool:
     if a.what == SNIC and (on_circle(scene, a, b) or on_circle(scene, b, a)):
         return True
     ds, (j, k) = scene.located, (a.fate.bifurcation, b.fate.bifurcation)
-    if a.what in (*CRISES, BREAKUP) and (
+    if EVENTS[a.what].two_sided and (
         a.fate.value == b.fate.value or b.stretch.attractor == getattr(a.born, "twin", -1)
     ):
         return True  # one crisis told from both sides, or by both sets that merge

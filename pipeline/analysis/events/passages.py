@@ -14,7 +14,7 @@ orbit are spread evenly near it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import gcd
 from typing import NamedTuple
@@ -25,12 +25,15 @@ from scipy.optimize import least_squares
 
 from magpend_core.extension import more_sections
 from magpend_core.precision import limits_at
+from pipeline.analysis.attractors.matching import geometry_of
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.events.cascades import Born
+from pipeline.analysis.events.kinds import INTERMITTENCY, LOCKING
 from pipeline.analysis.events.lines import at
-from pipeline.analysis.events.names import INTERMITTENCY, LOCKING
+from pipeline.analysis.events.scene import Born, Event, Scene, judged, orbit_beyond
+from pipeline.layout.vocabulary import TORUS as TORUS_SET
+from pipeline.results.ragged import points_of_rows
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import plain
 
@@ -106,6 +109,17 @@ def may_pass(ds: xr.Dataset, k: int, is_torus: bool) -> bool:
     """Return whether a set can end at a bifurcation of an orbit, by slow passages near it."""
     kind, degree = KINDS[int(ds["kind"].values[k])], CRITICALITIES[int(ds["criticality"].values[k])]
     return kind == FOLD or (not is_torus and kind in EXPONENTS and degree == "subcritical")
+
+
+def name_passage(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
+    """Name the end of a chaotic set or a torus by the slow passages near the orbit to which its cells go on."""
+    fate, is_torus = orbit_beyond(one, named), one.stretch.kind == TORUS_SET
+    if fate is None or not may_pass(scene.located, fate.bifurcation, is_torus):
+        return one
+    points, family = points_of_rows(scene.attractors)[one.row], scene.family(one.place, 1)
+    about = geometry_of(scene.attractors), is_torus
+    found = passage_of(scene.located, fate.bifurcation, family, scene.values_at(one), points, *about)
+    return judged(scene, one, fate, found)
 
 
 def passage_of(

@@ -8,10 +8,10 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.events.declaration import EventOptions
-from pipeline.analysis.events.names import LIVES_ON, NAMES, RANGE_END, UNDECIDED
+from pipeline.analysis.events.kinds import LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
 from pipeline.results.run import OpenRun
-from pipeline.results.tabular import counted
+from pipeline.results.tabular import counted, words_of
 from pipeline.specification.tables import RATES
 
 PARTS = 4
@@ -66,7 +66,7 @@ def further_values(ds: xr.Dataset, width: float, word: str = "") -> list[float]:
     word
         Word for the drive's rate in which the width is given, if the parameter is the frequency.
     """
-    what = np.array(NAMES)[ds["what"].values]
+    what = np.array(words_of(ds["what"]))[ds["what"].values]
     seen, beyond = ds["seen"].values, ds["beyond"].values
     ends = np.sort(np.stack([seen, beyond]), axis=0)
     shown = RATES[word].given(ends) if word else ends

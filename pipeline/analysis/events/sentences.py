@@ -7,24 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, LABELS, PITCHFORK, SNIC, TORUS, TRANSCRITICAL
 from pipeline.analysis.events.graph import graph_of
-from pipeline.analysis.events.names import (
-    BANDS,
-    BOUNDARY,
-    BREAKUP,
-    CASCADE,
-    CRISES,
-    GRAZING,
-    INTERMITTENCY,
-    LIVES_ON,
-    LOCKING,
-    RANGE_END,
-    SLIDING,
-    TRANSIENT,
-    TWINS,
-    UNDECIDED,
-)
+from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.layout.vocabulary import letter, parameter_name
 from pipeline.products.product import Table
 from pipeline.results.outcomes import DIVERGED
@@ -45,8 +29,6 @@ _NAMES = (
     *("beyond", "bifurcation", "branch", "other_branch", "is_own", "n_cells", "ratio", "met_period", "exponent"),
     *("exponent_error", "rotation", "twin", "lives_beyond", "evidence"),
 )
-
-_LIMITS = {"homoclinic": "homoclinic end (HOM) at a saddle", "snic": "saddle node on a circle (SNIC)"}
 
 
 def events_table(ds: xr.Dataset) -> Table:
@@ -108,7 +90,7 @@ def _row(ds: xr.Dataset, k: int) -> Row:
     row = {"event": int(one["same_as"]), **values(one, *_NAMES)}
     to, cells = one["to_attractor"].values.tolist(), one["to_cells"].values.tolist()
     row |= {"to_attractor": to[0], "to_cells": cells[0]}
-    return {"label": LABELS.get(row["what"], ""), **row}
+    return {"label": EVENTS[row["what"]].label, **row}
 
 
 def _with_others(ds: xr.Dataset, row: Row, ends: Sequence[Row]) -> Row:
@@ -118,7 +100,7 @@ def _with_others(ds: xr.Dataset, row: Row, ends: Sequence[Row]) -> Row:
     going = {i: n for i, n in zip(to, cells, strict=True) if n}
     doublings = [x for x in one["doublings"].values.tolist() if np.isfinite(x)]
     others = [end for k, end in enumerate(ends) if end["event"] == row["event"] != k]
-    return {**row, "sentence": _sentence(ds, row, going, doublings, _where(row, others))}
+    return {**row, "sentence": _sentence(ds, {**row, "doublings": doublings}, going, _where(row, others))}
 
 
 def _where(row: Row, others: Sequence[Row]) -> str:
@@ -131,7 +113,7 @@ def _where(row: Row, others: Sequence[Row]) -> str:
     return f", where {' and '.join(told)}" if told else ""
 
 
-def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[float], where: str) -> str:
+def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], where: str) -> str:
     name, unit = parameter_name(str(ds.attrs["parameter"])), str(ds.attrs["parameter_units"])
     unit = "" if unit == "1" else f" {unit}"
     own, way = _own(row), "rises" if row["rises"] else "falls"
@@ -144,94 +126,15 @@ def _sentence(ds: xr.Dataset, row: Row, to: dict[int, int], doublings: list[floa
     if row["what"] == UNDECIDED:
         where = " and ".join(f"{x:.10g}" for x in sorted((seen, beyond)))
         return f"{who} ends between {name} = {where}{unit} as it {way}: not decided ({row['evidence']}){cells}"
-    at = f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
-    if row["period_after"] == row["period"] or (row["period_after"] >= 0 and row["what"] in (*CRISES, BREAKUP)):
-        return f"{who} changes at {at} as it {way}: {_reason(row, doublings)}{where}"
+    kind, at = EVENTS[row["what"]], f"{name} = {value_with_error(row['value'], row['value_error'])}{unit}"
+    if row["period_after"] == row["period"] or (row["period_after"] >= 0 and kind.two_sided):
+        return f"{who} changes at {at} as it {way}: {kind.told(row)}{where}"
     if row["period_after"] >= 0:
         changes = f"{letter(row['attractor'])} changes from {own} to period {row['period_after']}"
-        return f"{changes} at {at} as it {way}: {_reason(row, doublings)}{where}"
+        return f"{changes} at {at} as it {way}: {kind.told(row)}{where}"
     late = (row["value"] - beyond) * (1 if row["rises"] else -1) > row["value_error"]
     unseen = f" (no cell finds it beyond {seen:.10g})" if late else ""
-    return f"{who} ends at {at} as it {way}{unseen}: {_reason(row, doublings)}{where}{cells}"
-
-
-def _reason(row: Row, doublings: list[float]) -> str:
-    """Name the event and say what the attractor meets, in words."""
-    what, own, other = row["what"], bool(row["is_own"]), row["other_branch"]
-    if what in (CASCADE, LOCKING, *INTERMITTENCY.values()):
-        return _end_of_set(row, doublings)
-    if what in CRISES:
-        return _crisis(row)
-    if what == TRANSIENT:
-        return f"lost into a transient, {_power(row, 'lifetimes beyond')}; no orbit that it meets is proved"
-    if what == BREAKUP:
-        return "break-up of the torus into a chaotic set"
-    if what == GRAZING:
-        return "grazing, a peak of it begins to touch a surface of impacts or switches"
-    if what == SLIDING:
-        return "grazing-sliding, its stay on the surface of a switch shrinks to a touch"
-    if what == SNIC and row["set"] == "equilibrium":
-        return f"{_LIMITS[what]}; it meets the unstable equilibrium of branch {row['branch']} on a cycle"
-    if what in _LIMITS:
-        return f"{_LIMITS[what]}; its period grows without bound"
-    degree = "" if row["criticality"] == "unknown" else f"{row['criticality']} "
-    spelt = {TORUS: "Neimark-Sacker", HOPF: "Hopf"}.get(what, plain(what))
-    head = f"{degree}{spelt} ({LABELS[what]})"
-    sure = row["criticality"] in ("supercritical", "subcritical")
-    off, of = row["criticality"] == "subcritical", "" if other < 0 else f" (branch {other})"
-    kind = "equilibrium" if row["set"] == "equilibrium" else "orbit"
-    if what == FOLD:
-        return f"{head}, it meets the unstable {kind} of branch {row['branch']}"
-    if what in (DOUBLING, HOPF, TORUS, PITCHFORK) and own and not sure:
-        return head
-    if row["set"] == "torus":
-        return f"{head}, the torus shrinks onto the orbit of branch {row['branch']}"
-    told = {
-        (DOUBLING, True): f"{'it meets the unstable' if off else 'onto the'} orbit of period {2 * row['period']}{of}",
-        (DOUBLING, False): f"it shrinks onto the orbit of period {row['period'] // 2}{of}",
-        (HOPF, True): f"it {'meets an unstable' if off else 'sheds a stable'} limit cycle{of}",
-        (HOPF, False): f"it shrinks onto the equilibrium{of}",
-        (TORUS, True): "it meets an unstable torus" if off else "onto a torus",
-        (PITCHFORK, True): f"it {'meets two unstable arms' if off else 'passes its stability to two arms'}{of}",
-        (PITCHFORK, False): f"it meets the other arm on the {kind} between them{of}",
-    }
-    verb = "exchanges stability with" if what == TRANSCRITICAL else "meets"
-    return f"{head}, {told.get((what, own), f'it {verb} the {kind}{of}')}"
-
-
-def _crisis(row: Row) -> str:
-    """Name a crisis, the orbit that is met, and how lifetimes grow, or what meets it if they tell no power."""
-    name = {BANDS: "merging of bands", TWINS: "merging of attractors"}.get(row["what"], plain(row["what"]))
-    who = "the set beyond" if row["lives_beyond"] else "it"
-    twin = f" together with {letter(row['twin'])}" if row["twin"] >= 0 else ""
-    orbit = f"the unstable orbit of period {row['met_period']}"
-    if np.isnan(row["exponent"]):
-        return f"{name}, {who} meets {orbit} along the unstable manifold of an equilibrium"
-    times = _power(row, "lifetimes" if row["what"] == BOUNDARY else "lifetimes of its parts")
-    return f"{name}, {who} meets {orbit}{twin}; {times}"
-
-
-def _power(row: Row, times: str) -> str:
-    return f"{times} grow with the power -{row['exponent']:.2f} ± {row['exponent_error']:.2f} of the distance"
-
-
-def _end_of_set(row: Row, doublings: list[float]) -> str:
-    """Name the end of a chaotic set or of a torus, in words."""
-    what = str(row["what"])
-    if what == CASCADE:
-        listed = ", ".join(f"{x:.7g}" for x in doublings)
-        return f"end of a cascade of doublings (PD at {listed}; ratio {row['ratio']:.3f})"
-    kinds = {
-        INTERMITTENCY["ii"]: "subcritical Neimark-Sacker point (NS)",
-        INTERMITTENCY["iii"]: "subcritical doubling (PD)",
-    }
-    ghost = f"the {kinds.get(what, 'fold (LP)')} of the orbit of branch {row['branch']}"
-    if what == LOCKING:
-        of = f" as {row['rotation']}" if row["rotation"] else ""
-        return f"it locks{of} at {ghost}"
-    power = f"-{row['exponent']:.2f} ± {row['exponent_error']:.1g} of the distance"
-    name = plain(what).rpartition(" ")[2].upper()
-    return f"intermittency of type {name} at {ghost}, laminar phases grow with the power {power}"
+    return f"{who} ends at {at} as it {way}{unseen}: {kind.told(row)}{where}{cells}"
 
 
 def _going_on(attractor: int, to: dict[int, int]) -> str:

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.branches.analysis import fixed_of, isolas_of
 from pipeline.analysis.branches.completeness import cut_words
-from pipeline.analysis.branches.figure import MARKERS, NAMES, STABLE, UNSTABLE, stretches, with_located
-from pipeline.analysis.branches.kinds import KINDS, LABELS
+from pipeline.analysis.branches.figure import STABLE, UNSTABLE, stretches, with_located
+from pipeline.analysis.branches.kinds import KINDS, LABELS, MARKERS, NAMES
 from pipeline.analysis.branches.levels import at_levels
 from pipeline.analysis.response.declaration import ResponseFigureOptions, ResponseOptions
 from pipeline.layout.vocabulary import axis_name, model_of

@@ -11,9 +11,8 @@ import xarray as xr
 
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.analysis import fixed_of
-from pipeline.analysis.branches.figure import NAMES
-from pipeline.analysis.branches.kinds import KINDS
-from pipeline.analysis.events.names import RANGE_END, UNDECIDED
+from pipeline.analysis.branches.kinds import KINDS, NAMES
+from pipeline.analysis.events.kinds import EVENTS, RANGE_END, UNDECIDED
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.orbits import finite
@@ -22,7 +21,6 @@ from pipeline.explorer.data.parameter_plane import packed_orbit
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, frequency_of, parameter_name
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import isel
-from pipeline.results.tabular import plain
 from pipeline.runs.derive import AnalysedRun, options_of, shown_table
 from pipeline.store.run import RunDirectory
 
@@ -66,7 +64,7 @@ def _event(
     low, high = sorted((seen, beyond)) if math.isfinite(beyond) else (seen, seen)
     return {
         "event": row["event"],
-        "label": row["label"] or plain(row["what"]),
+        "label": row["label"] or EVENTS[row["what"]].text,
         "sentence": row["sentence"],
         "x": finite(one["value"]),
         "low": low,

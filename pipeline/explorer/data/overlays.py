@@ -13,9 +13,9 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.branches.dataset import CRITICALITIES
-from pipeline.analysis.branches.figure import NAMES, pieces
+from pipeline.analysis.branches.figure import pieces
 from pipeline.analysis.branches.kinds import KINDS as BIFURCATIONS
-from pipeline.analysis.branches.kinds import LABELS
+from pipeline.analysis.branches.kinds import LABELS, NAMES
 from pipeline.analysis.chaos.lyapunov_figure import EXPONENT_COLOURS
 from pipeline.analysis.resilience.analysis import end_of
 from pipeline.explorer.data.colours import rgb

@@ -11,8 +11,7 @@ from matplotlib.colors import to_hex
 
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
-from pipeline.analysis.branches.figure import NAMES
-from pipeline.analysis.branches.kinds import CURVE_KINDS, HOMOCLINIC, LABELS
+from pipeline.analysis.branches.kinds import CURVE_KINDS, HOMOCLINIC, LABELS, NAMES
 from pipeline.explorer import RequestError
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.explored import ExploredRun

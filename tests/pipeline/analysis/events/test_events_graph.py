@@ -115,7 +115,7 @@ WIDTH = 0.004
 def undecided():
     """Leave the ends of chaotic sets open, so that their intervals alone tell where they are."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analysis, "_aperiodic", lambda scene, crises, breakups, one, named: one)
+        patch.setattr(analysis, "_aperiodic", lambda scene, one, named: one)
         yield
 
 

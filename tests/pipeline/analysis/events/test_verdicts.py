@@ -10,8 +10,8 @@ from pipeline.analysis.branches.kinds import DOUBLING, KINDS, TORUS
 from pipeline.analysis.events import breakups
 from pipeline.analysis.events.breakups import LOCKED, ROUNDS, VALUES, _Found, breakup_of
 from pipeline.analysis.events.cascades import DELTA, _chain, cascade_of, torus_of
+from pipeline.analysis.events.kinds import BREAKUP, CASCADE
 from pipeline.analysis.events.lines import Fate
-from pipeline.analysis.events.names import BREAKUP, CASCADE
 from pipeline.layout.conventions import code_flags
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET
 from pipeline.layout.vocabulary import TORUS as TORUS_SET
