@@ -7,7 +7,6 @@ swept parameter. Results have own names, such as ``F``, when they are stored and
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model
-from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name
 from pipeline.specification.tables import FREQUENCY, RATES, Rate, word_named
 
 if TYPE_CHECKING:
@@ -39,10 +38,6 @@ _ERRORS = {
     "special_second_error": "special_second",
 }
 """Variables with the width of an interval of frequencies, and those with the frequency."""
-
-
-_TOLD = re.compile(rf"\b{FREQUENCY} = ([-+.,e\d ]*\d)(?: to ([-+.e\d]*\d))?(?: ± ([-+.e\d]*\d))?")
-"""Values of the frequency in a text, or a range of them, with an error."""
 
 
 def rate_attribute(word: str) -> dict[str, str]:
@@ -75,6 +70,24 @@ def axis_in_own_words(name: str, word: str) -> tuple[str, Callable[[Any], Any]]:
     return (FREQUENCY, np.asarray) if word == FREQUENCY else (word, lambda hertz: _rounded(RATES[word].given(hertz)))
 
 
+def width_in_own_words(name: str, word: str, value: float, width: float) -> float:
+    """Return the width of a small interval around a value of an axis or parameter, in the unit of a specification with
+    a word for the rate.
+    """
+    return float(width * RATES[word].slope(value)) if axis_name(name) == FREQUENCY_DIM else width
+
+
+def place_in_words(name: str, word: str, *values: float, digits: int = 7, between: str = ", ") -> str:
+    """Return ``NAME = VALUE`` of an axis or parameter, as in the tables of a specification with a word for the rate.
+
+    Two values with ``between=" to "`` are a range, from the lower to the higher one.
+    """
+    own = parameter_name(dims_in_own_words([axis_name(name)], word)[0])
+    found = axis_in_own_words(name, word)[1](np.array(values)).tolist()
+    found = sorted(found) if between == " to " else found
+    return f"{own} = {between.join(f'{x:.{digits}g}' for x in found)}"
+
+
 def rate_of(ds: xr.Dataset) -> str:
     """Return the word for the drive's rate in the specification of a dataset's run."""
     return str(ds.attrs.get(RATE, FREQUENCY))
@@ -88,9 +101,9 @@ def dims_in_own_words(dims: Iterable[str], word: str) -> tuple[str, ...]:
 def in_own_words(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset with the drive's rate in the word of its specification, for tables and figures.
 
-    All variables in Hz are converted and rounded to 15 digits, unless their names end in ``_hz``, and so are values of
-    the frequency in the texts of ``evidence`` and ``left_out``. The dim and the coordinate ``frequency`` are named like
-    the word, and so are attributes whose value is this name. Others are returned unchanged.
+    All variables in Hz are converted and rounded to 15 digits, unless their names end in ``_hz``. The dim and the
+    coordinate ``frequency`` are named like the word, and so are attributes whose value is this name. Others are
+    returned unchanged; analyses write texts in the word (`place_in_words`).
     """
     ds = with_plain_names(ds)
     word = str(ds.attrs.get(RATE, FREQUENCY))
@@ -108,38 +121,16 @@ def in_own_words(ds: xr.Dataset) -> xr.Dataset:
             found[name] = (variable.dims, _rounded(values), about)
         elif rate.inverse and name in _FLIPPED:
             found[name] = (variable.dims, 1 - variable.values, variable.attrs)
-        elif name == "evidence" and variable.dtype.kind in "OU":
-            texts = np.array([_told(text, rate) for text in variable.values.tolist()])
-            found[name] = (variable.dims, texts, variable.attrs)
     if "elasticity" in ds:
         found |= _sensitivities(ds, rate)
     coordinates = {name: value for name, value in found.items() if name in ds.coords}
     shown = ds.assign_coords(coordinates).assign({n: v for n, v in found.items() if n not in ds.coords})
     named = {FREQUENCY: rate.column, FREQUENCY_DIM: rate.column, "Hz": unit}
     shown.attrs = {k: named.get(v, v) if isinstance(v, str) else v for k, v in ds.attrs.items()}
-    if "left_out" in shown.attrs:
-        shown.attrs["left_out"] = _told(shown.attrs["left_out"], rate)
     if FREQUENCY_DIM not in ds.variables:
         return shown
     shown = shown.rename({FREQUENCY_DIM: rate.column})
     return shown.sortby(rate.column) if rate.inverse and rate.column in shown.dims else shown
-
-
-def _told(text: str, rate: Rate) -> str:
-    """Return a text with the values of the frequency in it as those of its rate."""
-    rounded = 7  # number of digits of a value in a text that may be rounded
-
-    def converted(found: re.Match[str]) -> str:
-        texts = [*found[1].split(", "), *([found[2]] if found[2] else [])]
-        values = np.array([float(x) for x in texts])
-        # a rounded value loses its last digit, so that what was round in the word is round again
-        digits = [len(re.sub(r"e.*|\D", "", x).lstrip("0")) for x in texts]
-        told = [f"{x:.{n - 1 if rounded <= n < 10 else 10}g}" for x, n in zip(rate.given(values), digits, strict=True)]
-        error = f" ± {float(found[3]) * rate.slope(values[-1]):.0e}" if found[3] else ""
-        between = " to " if found[2] else ", "
-        return f"{rate.column} = {between.join(told[::-1] if found[2] and rate.inverse else told)}{error}"
-
-    return _TOLD.sub(converted, text)
 
 
 def _sensitivities(ds: xr.Dataset, rate: Rate) -> dict[Any, Any]:

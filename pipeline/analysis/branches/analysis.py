@@ -31,7 +31,7 @@ from pipeline.analysis.branches.kinds import (
     LIMITS,
     PITCHFORK,
 )
-from pipeline.layout.own_words import RATE, dims_in_own_words
+from pipeline.layout.own_words import RATE, dims_in_own_words, place_in_words, rate_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.product import Table
 from pipeline.results.run import OpenRun
@@ -86,7 +86,7 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     followed = explore(starts, scope)
     if starts and not followed:
         left_out = [*left_out, f"{len(starts)} starting orbits: could not be followed"]
-    return dataset_of(followed, parameter, base, [*missed, *left_out]).assign(
+    return dataset_of(followed, parameter, base, [*missed, *left_out], run.spec.rate).assign(
         searched_variables(searched, followed, periods, base.model) | counted_variables(counted, base.model)
     )
 
@@ -117,14 +117,14 @@ def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     found = curves_from(located, base, second, bounds, options.curve_period, left_out=left_out)
     lines = [f"{_place_of(located, k)}: {why}" for k, why in sorted(left_out.items()) if k >= 0]
     ds = curves_dataset(found, axis_name(options.parameter), second, base.model)
-    return ds.assign_attrs(left_out="\n".join([*lines, *not_followed(ds)]))
+    return ds.assign_attrs(left_out="\n".join([*lines, *not_followed(ds, run.spec.rate)]))
 
 
 def _place_of(ds: xr.Dataset, k: int) -> str:
     """Name a located bifurcation with its place."""
     kind, period = KINDS[int(ds["kind"][k])], int(ds["orbit_period"][int(ds["of_branch"][k])])
-    name = parameter_name(str(ds.attrs["parameter"]))
-    return f"{kind}, {period_words(period)}, at {name} = {float(ds['value'][k]):.7g}"
+    place = place_in_words(str(ds.attrs["parameter"]), rate_of(ds), float(ds["value"][k]))
+    return f"{kind}, {period_words(period)}, at {place}"
 
 
 def branches_table(ds: xr.Dataset) -> Table:

@@ -22,7 +22,7 @@ from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.searching import family_at, rows_of, where_variables
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.own_words import axis_in_own_words
+from pipeline.layout.own_words import axis_in_own_words, place_in_words
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of
 from pipeline.results.run import OpenRun
 from pipeline.specification.problems import SpecError, unknown_name
@@ -103,7 +103,7 @@ def given_starts(run: OpenRun, options: BranchOptions, interval: tuple[float, fl
         near, own_period = _closed_near(there, state, period)
         if near is None:
             what = f"no orbit of period {period}" if period else "no equilibrium"
-            at = ", ".join(f"{parameter_name(n)} = {v:.7g}" for n, v in {name: value, **where}.items())
+            at = ", ".join(place_in_words(n, run.spec.rate, v) for n, v in {name: value, **where}.items())
             lines.append(f"start at {at}: Newton's method found {what} from there")
         else:
             starts.append(Start(replace(there, period=own_period), near, value))

@@ -59,6 +59,7 @@ from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
 from pipeline.layout.conventions import code_flags
+from pipeline.layout.own_words import place_in_words
 from pipeline.layout.vocabulary import frequency_of, model_attribute, parameter_name, section_attributes
 from pipeline.results.tabular import plain
 
@@ -494,10 +495,11 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     )
 
 
-def not_followed(ds: xr.Dataset) -> list[str]:
+def not_followed(ds: xr.Dataset, word: str = parameter_name(FREQUENCY)) -> list[str]:
     """Return a text line for each point of codimension two from which curves spring that were not followed.
 
-    A curve counts as followed if one of its kind and period comes near the point.
+    A curve counts as followed if one of its kind and period comes near the point. The rate has the specification's
+    `word`.
     """
     largest = 0.05  # distance of a curve from a point of codimension two from which it springs, in units of the ranges
     roles, lines = ("first", "second"), list[str]()
@@ -523,7 +525,7 @@ def not_followed(ds: xr.Dataset) -> list[str]:
         missing += OTHERS.get(kind, [])
         if missing:
             place = ", ".join(
-                f"{parameter_name(ds.attrs[f'{role}_parameter'])} = {x:.7g}" for role, x in zip(roles, at, strict=True)
+                place_in_words(ds.attrs[f"{role}_parameter"], word, x) for role, x in zip(roles, at, strict=True)
             )
             lines.append(f"{plain(kind)} at {place}: not followed from there: {', '.join(missing)}")
     return lines

@@ -28,7 +28,7 @@ from pipeline.analysis.branches.kinds import HOPF, KINDS
 from pipeline.analysis.branches.limits import cut_ends
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.layout.conventions import code_flags
-from pipeline.layout.vocabulary import model_attribute, parameter_units, section_attributes
+from pipeline.layout.vocabulary import model_attribute, parameter_name, parameter_units, section_attributes
 from pipeline.products.reporting import track
 from pipeline.results.tolerances import BRANCH_RTOL
 
@@ -36,7 +36,11 @@ CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
 
 
 def dataset_of(
-    branches: Sequence[Branch], parameter: str, parameters: Parameters | None = None, left_out: Sequence[str] = ()
+    branches: Sequence[Branch],
+    parameter: str,
+    parameters: Parameters | None = None,
+    left_out: Sequence[str] = (),
+    word: str = parameter_name(FREQUENCY),
 ) -> xr.Dataset:
     """Return branches as a labelled dataset; `pipeline.analysis.branches` lists its variables.
 
@@ -50,6 +54,8 @@ def dataset_of(
         Parameters of the run; their model gives names, units, and the class of each orbit's motion.
     left_out
         Lines on attractors that were not followed, with reasons; those on the ends of branches are added.
+    word
+        Word for the drive's rate in the added lines.
     """
     model = None if parameters is None else parameters.model
     system = branches[0].family.system if branches else (None if model is None else model.system)
@@ -86,7 +92,7 @@ def dataset_of(
     return result.assign_attrs(
         parameter=parameter,
         parameter_units=parameter_units(parameter, model),
-        left_out="\n".join([*left_out, *cut_ends(branches)]),
+        left_out="\n".join([*left_out, *cut_ends(branches, word)]),
     )
 
 

@@ -209,7 +209,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=11,
+    version=12,
 )
 
 COEFFICIENTS = {

@@ -33,8 +33,9 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.following import Branch, Limit, grows_without_bound, leading_of, opposite, problem_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
-from pipeline.layout.vocabulary import parameter_name
+from pipeline.layout.own_words import place_in_words
 from pipeline.results.tolerances import BRANCH_RTOL
+from pipeline.specification.tables import FREQUENCY
 
 
 @dataclass(frozen=True)
@@ -367,15 +368,15 @@ def _fold(family: Family, value: float, state: np.ndarray) -> Fold | None:
 # ---- ends within the interval ------------------------------------------------------------------
 
 
-def cut_ends(branches: Sequence[Branch], settings: LimitSettings = LimitSettings()) -> list[str]:
+def cut_ends(branches: Sequence[Branch], word: str = FREQUENCY, settings: LimitSettings = LimitSettings()) -> list[str]:
     """Return text lines on the ends at which a branch was cut off: one that is stuck, with what was met there, one with
-    too many points, and those at the bounds of the parameter, together.
+    too many points, and those at the bounds of the parameter, together. The rate has the specification's `word`.
     """
     lines, beyond = [], dict[str, list[int]]()
     for i, branch in enumerate(branches):
         for which in (0, 1):
             points, why = towards(branch, which), branch.ends[which]
-            at = f"{parameter_name(branch.family.free[0])} = {branch.family.values(points[-1].u)[0]:.7g}"
+            at = place_in_words(branch.family.free[0], word, branch.family.values(points[-1].u)[0])
             if why == "stuck":
                 lines.append(f"branch {i} at {at}: {'; '.join(_met(branch, points, settings))}")
             elif why == "max_points":

@@ -15,7 +15,8 @@ from magpend_core.orbits import scaled_distance
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameter_name, split_dims
+from pipeline.layout.own_words import place_in_words, rate_of
+from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, split_dims
 from pipeline.results.ragged import points_of_rows
 from pipeline.results.tabular import sets_of
 from pipeline.results.tolerances import RECURRENCE
@@ -86,20 +87,20 @@ def attracting(
     left_out : list of str
         A line for each attractor, and each reason, with the points where it is and how to get it.
     """
-    low, high = interval
+    (low, high), word = interval, rate_of(attractors)
     starts: list[Start] = []
     reasons: dict[tuple[int, str], list[Mapping[str, float]]] = {}
     for one in listed(attractors, parameters, parameter, high - low):
-        why = _why_not(one, interval, max_period)
+        why = _why_not(one, interval, max_period, word)
         if why:
             reasons.setdefault((one.identity, why), []).append(one.where)
         elif one.start is not None:
             starts.append(one.start)
-    lines = [f"attractor {i}{_places(where)}: {why}" for (i, why), where in reasons.items()]
+    lines = [f"attractor {i}{_places(where, word)}: {why}" for (i, why), where in reasons.items()]
     return starts, lines
 
 
-def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
+def _why_not(one: Listed, interval: tuple[float, float], max_period: int, word: str) -> str:
     """Return the reason why no branch can start from an attractor; an empty text if one can."""
     if one.is_cycle:
         return "a limit cycle seen at even times; see it at crossings: [section] of a new run"
@@ -110,20 +111,18 @@ def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str
     if max_period and one.period > max_period:
         return f"its period is {one.period}; take it with --period {one.period}"
     if not interval[0] <= one.start.value <= interval[1]:
-        low, high = interval
-        name = parameter_name(one.start.family.free[0])
-        return f"outside of {name} = {low:.7g} to {high:.7g}; widen it with --from and --to"
+        bounds = place_in_words(one.start.family.free[0], word, *interval, between=" to ")
+        return f"outside of {bounds}; widen it with --from and --to"
     return ""
 
 
-def _places(where: Sequence[Mapping[str, float]]) -> str:
+def _places(where: Sequence[Mapping[str, float]], word: str) -> str:
     if not where[0]:
         return ""
     ranges = []
     for name in where[0]:
-        values = sorted({at[name] for at in where})
-        last = f" to {values[-1]:.7g}" if len(values) > 1 else ""
-        ranges.append(f"{parameter_name(name)} = {values[0]:.7g}{last}")
+        values = {at[name] for at in where}
+        ranges.append(place_in_words(name, word, *{min(values), max(values)}, between=" to "))
     points = f" ({len(where)} points)" if len(where) > 1 else ""
     return f" at {', '.join(ranges)}{points}"
 

@@ -32,7 +32,7 @@ from pipeline.analysis.events.contact import (
     sample_of,
 )
 from pipeline.analysis.events.kinds import BANDS, BOUNDARY, INTERIOR, TRANSIENT, TWINS
-from pipeline.analysis.events.lines import at
+from pipeline.analysis.events.lines import at, own_width
 from pipeline.analysis.events.scene import Born, Event, Scene, Stretch
 from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transient_of
 from pipeline.layout.vocabulary import KINDS as SETS
@@ -331,7 +331,7 @@ def _judged(
 def _law(ds: xr.Dataset, times: Lifetimes, exponent: float, error: float) -> str:
     return (
         f"{_lifetimes(ds, times.values, times.means)} grow with the power -{exponent:.3f} ± {error:.3f} of the "
-        f"distance from {at(ds, times.value)} ± {times.value_error:.0e}"
+        f"distance from {at(ds, times.value)} ± {own_width(ds, times.value, times.value_error):.0e}"
     )
 
 

@@ -16,7 +16,7 @@ from pipeline.analysis.branches.kinds import BRANCHING, FOLD, KINDS, LIMITS, PIT
 from pipeline.analysis.branches.known import GUESS, NEAR_FOLD, SAME_VALUE, at_value, error_of
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
-from pipeline.layout.vocabulary import parameter_name
+from pipeline.layout.own_words import place_in_words, rate_of, width_in_own_words
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import words_of
 from pipeline.results.tolerances import SAME_ON_BRANCH
@@ -227,8 +227,13 @@ def follow(ds: xr.Dataset, place: Place, way: int) -> Fate:
 
 
 def at(ds: xr.Dataset, *numbers: float) -> str:
-    """Write values of the parameter with its name."""
-    return f"{parameter_name(str(ds.attrs['parameter']))} = {', '.join(f'{x:.10g}' for x in numbers)}"
+    """Write values of the parameter with its name, in the words of the specification."""
+    return place_in_words(str(ds.attrs["parameter"]), rate_of(ds), *numbers, digits=10)
+
+
+def own_width(ds: xr.Dataset, value: float, width: float) -> float:
+    """Return the width of an interval around a value of the parameter, in the unit of the specification."""
+    return width_in_own_words(str(ds.attrs["parameter"]), rate_of(ds), value, width)
 
 
 def _at_end(ds: xr.Dataset, line: Line, node: int, seen: str) -> Fate:

@@ -30,7 +30,7 @@ from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, KINDS, TORUS
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.events.kinds import INTERMITTENCY, LOCKING
-from pipeline.analysis.events.lines import at
+from pipeline.analysis.events.lines import at, own_width
 from pipeline.analysis.events.scene import Born, Event, Scene, judged, orbit_beyond
 from pipeline.layout.vocabulary import TORUS as TORUS_SET
 from pipeline.results.ragged import points_of_rows
@@ -166,20 +166,26 @@ def passage_of(
     sections = _sections(family, values, points, effort.many, effort.n_sections)
     found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
     fitted = scaling(found, kind, len(ghost), effort)
-    born = replace(_judged(found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
+    born = replace(_judged(ds, found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
     if born.what != LOCKING or fitted is None:
         return born
     return replace(born, rotation=rotation_of(sections[fitted[2][-1]], len(ghost), geometry))
 
 
 def _judged(
-    found: Phases, fitted: tuple[float, float, np.ndarray] | None, kind: str, told: str, value: float, is_torus: bool
+    ds: xr.Dataset,
+    found: Phases,
+    fitted: tuple[float, float, np.ndarray] | None,
+    kind: str,
+    told: str,
+    value: float,
+    is_torus: bool,
 ) -> Born:
     """Name the end if the lengths grow towards the bifurcation with its exponent."""
     if fitted is None:
         return Born("", f"{told}; its trajectories show too few laminar phases near this orbit to scale their lengths")
     exponent, error, chosen = fitted
-    lengths, away = found.length[chosen], found.distance[chosen]
+    lengths, away = found.length[chosen], [own_width(ds, value, x) for x in found.distance[chosen]]
     told += f"; lengths of laminar phases near it from {lengths[0]:.3g} to {lengths[-1]:.3g} sections at distances from"
     told += f" {away[0]:.2g} to {away[-1]:.2g}: exponent {exponent:.3f} ± {error:.1g}"
     if (found.spread[chosen].max() <= REGULAR) != is_torus:

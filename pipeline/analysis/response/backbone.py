@@ -33,6 +33,7 @@ from pipeline.analysis.response.resonance import (
     phase_resonance,
 )
 from pipeline.layout.conventions import code_flags
+from pipeline.layout.own_words import place_in_words
 from pipeline.layout.vocabulary import model_attribute, parameter_name, parameters_of, section_attributes
 from pipeline.products.product import Table
 from pipeline.results.run import OpenRun
@@ -176,7 +177,7 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
         found = run_alone(phase_resonance(problem, guess))
         if found is None:
             frequency, force = problem.family.values(guess)
-            where = f"{NAME} = {frequency:.7g}, {options.drive} = {force:g}"
+            where = f"{place_in_words(NAME, run.spec.rate, frequency)}, {options.drive} = {force:g}"
             left_out.append(f"phase resonance at {where}: Newton's method found no orbit within the bounds")
             continue
         nearest = min(found.points, key=lambda p: float(np.linalg.norm(p.u - guess)))
@@ -215,7 +216,7 @@ def _follow_modes(run: OpenRun, options: BackboneOptions, curves: list[Curve], l
     imaginary = 1e-7
     wide = 10.0  # factor from the frequencies of the linear modes of a flow to the default bounds
     base = _undamped(run, options)
-    model, starts = base.model, []
+    model, starts, word = base.model, [], run.spec.rate
     channel = _channels(model).index(options.channel)
     for state, values, vectors in _equilibria(run, base):
         where = ", ".join(f"{name} {x:.4g}" for name, x in zip(model.state_names, state, strict=True))
@@ -226,11 +227,12 @@ def _follow_modes(run: OpenRun, options: BackboneOptions, curves: list[Curve], l
             low, high = options.low or lines.min() / wide, options.high or lines.max() * wide
         for k in np.flatnonzero(values.imag > 0.0)[np.argsort(values.imag[values.imag > 0.0])]:
             hertz = float(values[k].imag / (2.0 * np.pi))
-            line = f"normal mode of {NAME} = {hertz:.7g} at {where}"
+            line = f"normal mode of {place_in_words(NAME, word, hertz)} at {where}"
             if not undamped[k]:
                 left_out.append(f"{line}: grows or decays at the rate {values[k].real:.3g} 1/s; see --undamped")
             elif not low <= hertz <= high:
-                left_out.append(f"{line}: outside of {NAME} = {low:.7g} to {high:.7g}; widen it with --from and --to")
+                interval = place_in_words(NAME, word, low, high, between=" to ")
+                left_out.append(f"{line}: outside of {interval}; widen it with --from and --to")
             else:
                 scaled = state / np.asarray(model.system.scales)
                 bounds = ((low, high), (0.0, options.reach))
@@ -299,17 +301,17 @@ def _dataset(run: OpenRun, options: BackboneOptions, curves: list[Curve], left_o
         "last_end": ("curve", np.array(last, np.int8), code_flags(ENDS)),
         "linear_frequency": ("curve", np.array(linear, float)),
     }
-    left_out = [*left_out, *(f"curve {i}: {why}" for i, curve in enumerate(curves) for why in _cut_off(curve))]
+    cut = (f"curve {i}: {why}" for i, curve in enumerate(curves) for why in _cut_off(curve, run.spec.rate))
     coords = {**channel_coordinates(model, n_harmonics), "state": list(model.state_names)}
     attrs = {"model": model_attribute(run.model), **section_attributes(run.model.crossing), "parameter": FREQUENCY}
     attrs |= {"parameter_units": "Hz", "of_channel": options.channel, "force": options.drive}
-    return xr.Dataset(variables, coords, {**attrs, "left_out": "\n".join(left_out)})
+    return xr.Dataset(variables, coords, {**attrs, "left_out": "\n".join([*left_out, *cut])})
 
 
-def _cut_off(curve: Curve) -> Iterator[str]:
+def _cut_off(curve: Curve, word: str) -> Iterator[str]:
     """Yield a text for each end at which a curve was cut off within its bounds."""
     for why, end in zip(curve.ends, (curve.points[0], curve.points[-1]), strict=True):
-        at = f"at {NAME} = {float(curve.problem.family.values(end.u)[0]):.7g}"
+        at = f"at {place_in_words(NAME, word, curve.problem.family.values(end.u)[0])}"
         if why == "stuck":
             yield f"stuck {at}: Newton's method found no next orbit for the shortest step"
         elif why == "max_points":

@@ -13,10 +13,16 @@ from scipy.integrate import solve_ivp
 
 import magpend
 from pipeline.analysis.branches.declaration import BranchOptions, CurveOptions
+from pipeline.analysis.branches.kinds import KINDS as BIFURCATIONS
+from pipeline.analysis.events.cascades import cascade_of
+from pipeline.analysis.events.crises import _law
+from pipeline.analysis.events.lines import Fate
+from pipeline.analysis.events.transients import Lifetimes
 from pipeline.compute.simulate import simulate
 from pipeline.layout.cells import parameter_axes
-from pipeline.layout.own_words import in_own_words
+from pipeline.layout.own_words import in_own_words, place_in_words, rate_attribute, width_in_own_words
 from pipeline.products.product import StateOptions
+from pipeline.results.sets import Geometry
 from pipeline.runs.naming import named
 from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import RATES
@@ -70,30 +76,46 @@ def test_widths__are_scaled_by_the_derivative(word):
     assert rate.slope(0.2) * width == pytest.approx(abs(rate.given(0.2 + width) - rate.given(0.2)), rel=1e-5)
 
 
-def test_evidence__has_the_word_of_the_specification(runs):
-    """All numbers of the frequency in a text, with an error, and no others."""
-    ds = xr.Dataset(
-        {"evidence": ("event", ["2 of 3 at frequency_hz = 0.25, -5e-1; 3 turn", "from frequency_hz = 0.2 ± 1e-03."])}
-    )
-    model = runs["omega"].cube().attrs["model"]
-    omega, period = (
-        in_own_words(ds.assign_attrs(drive_rate=word, model=model))["evidence"].values.tolist()
-        for word in ("omega", "period")
-    )
-    assert omega == ["2 of 3 at omega = 1.570796327, -3.141592654; 3 turn", "from omega = 1.256637061 ± 6e-03."]
-    assert period[1] == "from drive_period = 5 ± 2e-02."
-    cut = ds.assign_attrs(
-        drive_rate="omega", model=model, left_out="branch 0 beyond frequency_hz = 0.07957747, a bound"
-    )
-    assert in_own_words(cut).attrs["left_out"] == "branch 0 beyond omega = 0.5, a bound"
-    told = "A at frequency_hz = 0.25 to 0.5 (3 points): outside of frequency_hz = 0.1432394 to 0.2, F = 3"
-    omega, period = (
-        in_own_words(ds.assign_attrs(drive_rate=word, model=model, left_out=told)).attrs["left_out"]
-        for word in ("omega", "period")
-    )
-    # 0.9/(2 pi), rounded, is 0.9 again
-    assert omega == "A at omega = 1.570796327 to 3.141592654 (3 points): outside of omega = 0.9 to 1.256637061, F = 3"
-    assert period.startswith("A at drive_period = 2 to 4 (3 points): outside of drive_period = 5 to 6.98132")
+def test_place_in_words__has_the_word_of_the_specification():
+    """Values of the frequency alone, in the order given, or as a range from the lower to the higher one."""
+    assert place_in_words("frequency", "omega", 0.25, 0.5, digits=10) == "omega = 1.570796327, 3.141592654"
+    assert place_in_words("frequency_hz", "period", 0.2, 0.25, between=" to ") == "drive_period = 4 to 5"
+    assert place_in_words("frequency", "frequency_hz", 0.2, 0.25) == "frequency_hz = 0.2, 0.25"
+    assert place_in_words("frequency", "omega", 0.9 / (2 * pi)) == "omega = 0.9"
+    assert place_in_words("F", "omega", 3.0) == "F = 3"
+    assert width_in_own_words("frequency", "omega", 0.2, 1e-3) == pytest.approx(2 * pi * 1e-3)
+    assert width_in_own_words("frequency", "period", 0.2, 1e-3) == pytest.approx(25e-3)
+    assert width_in_own_words("F", "period", 0.2, 1e-3) == 1e-3
+
+
+def located(word):
+    """Doublings along the drive's frequency, in the words of a specification."""
+    values = np.array([0.2, 0.25, 0.2618])
+    doublings = np.full(3, BIFURCATIONS.index("period_doubling"))
+    names = {"value": values, "kind": doublings, "of_branch": [0, 1, 2], "to_branch": [1, 2, 3]}
+    names |= {"n_unstable_before": [0, 0, 0], "n_unstable_after": [1, 1, 1]}
+    attrs = {"parameter": "frequency", **rate_attribute(word)}
+    return xr.Dataset({name: ("bifurcation", value) for name, value in names.items()}, attrs=attrs)
+
+
+@pytest.mark.parametrize(
+    ("word", "values", "limit"),
+    [
+        ("frequency_hz", "frequency_hz = 0.2, 0.25, 0.2618", "frequency_hz = 0.265"),
+        ("omega", "omega = 1.256637061, 1.570796327, 1.644937913", "omega = 1.665"),
+        ("period", "drive_period = 5, 4, 3.819709702", "drive_period = 3.773"),
+    ],
+)
+def test_evidence__has_the_word_of_the_specification(word, values, limit):
+    geometry = Geometry((False,), (1.0,))
+    found = cascade_of(located(word), Fate(0.2, bifurcation=0), (0.2, 0.21), np.zeros((3, 1)), geometry)
+    assert found.why.startswith(f"doublings at {values}, last ratio 4.2373, limit at {limit}")
+    times = Lifetimes((0.3,), (12.0,), 0.5, 0.01, 0.25, 1e-3, (0.5, 0.01))
+    law = _law(located(word), times, 0.5, 0.01)
+    width = {"frequency_hz": "1e-03", "omega": "6e-03", "period": "2e-02"}[word]
+    own = RATES[word].column
+    assert law.startswith(f"mean lifetimes 12 at {own} = ")
+    assert law.endswith(f" of the distance from {own} = {RATES[word].given(0.25):.10g} ± {width}")
 
 
 def test_start__has_the_rate_in_any_of_its_words(runs):
@@ -121,7 +143,7 @@ def test_start__has_the_rate_in_any_of_its_words(runs):
 @pytest.mark.slow
 def test_left_out__has_the_word_of_the_specification(runs):
     found = runs["omega"].branches(parameter="omega", low=1.25, high=1.35, start={"x": 1e9, "x_dot": 0.0, "omega": 1.3})
-    lines = in_own_words(found).attrs["left_out"].splitlines()
+    lines = found.attrs["left_out"].splitlines()
     assert lines[0] == "start at omega = 1.3: Newton's method found no orbit of period 1 from there"
     outside = [line for line in lines if line.startswith("attractor")]
     assert outside

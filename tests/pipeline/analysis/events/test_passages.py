@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
@@ -31,6 +32,7 @@ RING = magpend.model(
     name="ring", kind="map", O=1.0, K=0.6,
 )  # fmt: skip
 
+ALONG_R = xr.Dataset(attrs={"parameter": "r"})
 LONG = {"n_transient": 2000, "n_keep": 200}
 
 
@@ -224,9 +226,9 @@ def test_scaling__refuses_the_other_law(kind, exponent):
         slope, error, chosen = scaling(found, kind, 1, passages.MEASURED[kind])
         assert slope == pytest.approx(other, abs=2e-3)
         assert len(chosen) >= passages.LEAST_VALUES
-        told = passages._judged(found, (slope, error, chosen), kind, "", 0.0, False)
+        told = passages._judged(ALONG_R, found, (slope, error, chosen), kind, "", 0.0, False)
         assert bool(told.what) == (other == exponent)
-        assert not passages._judged(found, (slope, error, chosen), kind, "", 0.0, True).what
+        assert not passages._judged(ALONG_R, found, (slope, error, chosen), kind, "", 0.0, True).what
 
 
 def test_rotation_of__turns_of_the_section():

@@ -276,7 +276,9 @@ def test_backbone_table__rows_of_points_and_lines_of_curves() -> None:
 def test_cut_off__ends_that_are_no_ends_of_the_curve() -> None:
     problem = ModeProblem(mode_family(DUFFING, 0.2), DUFFING, np.zeros(2), ((0.1, 0.3), (0.0, 1.0)))
     points = [SimpleNamespace(u=np.array([0.0, 0.0, ratio])) for ratio in (1.0, 1.25)]
-    told = [list(_cut_off(Curve(problem, points, ("linear_mode", end)))) for end in ("bound", "stuck", "max_points")]
+    curves = [Curve(problem, points, ("linear_mode", end)) for end in ("bound", "stuck", "max_points")]
+    told = [list(_cut_off(curve, "frequency_hz")) for curve in curves]
     assert told[0] == []
     assert told[1][0].startswith("stuck at frequency_hz = 0.25:")
+    assert next(_cut_off(curves[1], "period")).startswith("stuck at drive_period = 4:")
     assert told[2][0].startswith("2 points at frequency_hz = 0.25")
