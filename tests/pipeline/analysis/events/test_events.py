@@ -208,8 +208,8 @@ def test_events__closed_forms(name, tmp_path):
     assert (errors < (4e-7 if name in ("cubic", "exchange", "growth") else 2e-8)).all()
     assert not (table["what"] == "not_decided").any(), table["evidence"].tolist()
     # unstable parts of branches tell nothing that these events need
-    brief, full = run.branches(stable=True), run.branches()
-    stable = run.table("events", stable=True, orbits=name == "lorenz")  # whose crisis rests on no branch
+    full, brief = run.branches(), run.branches(stable=True)
+    stable = run.table("events", orbits=name == "lorenz")  # whose crisis rests on no branch
     assert told(stable)[0] == [one for one in events if name != "lorenz" or one[3] != "boundary_crisis"]
     assert int(brief["n_points"].sum()) < int(full["n_points"].sum()) + (name in ("delayed", "soft", "lorenz"))
 

@@ -128,7 +128,8 @@ def test_events__tongues_of_van_der_pol(tongue, tmp_path):
     (mu, force, period), values, folds = TONGUES[tongue]
     axes = {"mu": [mu], "A": [force], "omega": values}
     run = sweep(FORCED, tmp_path, {"x": (-2, 2), "x_dot": (-2, 2)}, {"n_transient": 300, "n_keep": 200}, n=2, **axes)
-    table = run.table("events", parameter="omega", stable=True)
+    run.branches(parameter="omega", stable=True)
+    table = run.table("events", parameter="omega")
     known = [fold_of_forced(mu, force, period, *one) for one in folds]
     edges, ends = of(table, "locking"), of(table, "fold")
     assert [x[4] for x in edges] == [tongue] * 2
