@@ -31,6 +31,9 @@ LEAST_PERIODS = 8
 WRITTEN, WRITING_S = 20, 0.5
 """Number of tasks that are written to time the writing, and the most time for it [s]."""
 
+FILE_S = 0.004
+"""Time to write a file, by the rule [s]."""
+
 MOST_WRITTEN_BYTES, MOST_WRITTEN_CELLS = 20_000_000, 1_000_000
 """Size of a task [bytes] and of a run [cells] above which a rule gives the time of writing."""
 
@@ -77,7 +80,6 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
     float
         Time of a task's files and its commit record [s].
     """
-    file_s = 0.004  # time to write a file, by the rule [s]
     from pipeline.runs.run import identity_here
     from pipeline.store.commits import write_task
     from pipeline.store.keys import keys_of
@@ -85,7 +87,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
 
     n_files = len(keys_of(plan, 0)) + 1
     if plan.n_cells > MOST_WRITTEN_CELLS or plan.n_bytes / plan.n_tasks > MOST_WRITTEN_BYTES:
-        return n_files * file_s
+        return n_files * FILE_S
     rng, taken = np.random.default_rng(0), []
     with tempfile.TemporaryDirectory(prefix="magpend-estimate-") as folder:
         info = create(Path(folder) / "run", spec, plan, identity_here(spec, plan), "")

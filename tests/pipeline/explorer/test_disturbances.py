@@ -177,8 +177,8 @@ def test_noisy_start__takes_shorter_steps_where_it_must(watcher, monkeypatch):
     plain = noisy(watcher, noise=0.05, periods=1)[0]
     monkeypatch.setattr(starting, "LARGEST_CHANGE", plain["step_error"] / 1.5)
     finer = noisy(watcher, noise=0.05, periods=1)[0]
-    assert plain["steps_per_period"] == starting.STEPS
-    assert finer["steps_per_period"] > starting.STEPS
+    assert plain["steps_per_period"] == starting.STEPS_PER_PERIOD
+    assert finer["steps_per_period"] > starting.STEPS_PER_PERIOD
     assert finer["step_error"] <= starting.LARGEST_CHANGE
     # also later on the way
     monkeypatch.setattr(starting, "LARGEST_CHANGE", plain["step_error"] / 100.0)
