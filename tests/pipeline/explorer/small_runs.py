@@ -40,7 +40,7 @@ integration = { rtol = 1e-8, atol = 1e-8, n_transient = 150, n_keep = 12 }
 """
 """The same over a plane."""
 
-CURVES: dict[str, Any] = {"max_period": 1, "second": "amplitude", "second_low": 0.25, "second_high": 0.35}
+CURVES: dict[str, Any] = {"second": "amplitude", "second_low": 0.25, "second_high": 0.35}
 
 HZ = 0.15915494309189535
 
@@ -85,6 +85,7 @@ integration = { rtol = 1e-9, atol = 1e-9, n_transient = 100, n_keep = 12 }
 def bent_resonance(folder: Path) -> tuple[Path, Path]:
     """Compute the run along the frequency with its curves, and the one over the plane with its attractors."""
     line, plane = finished(folder / "line", LINE), finished(folder / "plane", PLANE)
+    derive(line, "branches", {"max_period": 1})
     derive(line, "curves", CURVES)
     derive(plane, "attractors", {})
     return line, plane
