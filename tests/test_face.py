@@ -56,12 +56,11 @@ def _close_figures():
 # ---- signatures ---------------------------------------------------------------------------------
 
 
-def declared(model: type[Options], left_out: tuple[str, ...] = ()) -> dict[str, object]:
+def declared(model: type[Options]) -> dict[str, object]:
     """Defaults of an options model; the mark of a required parameter where there is none."""
     return {
         name: inspect.Parameter.empty if info.is_required() else info.get_default(call_default_factory=True)
         for name, info in model.model_fields.items()
-        if name not in left_out
     }
 
 
@@ -87,7 +86,7 @@ def test_run__has_each_analysis_with_the_defaults_of_its_options(name):
 def test_plots__have_each_figure_with_the_defaults_of_its_options(name):
     options = FIGURES[name].options
     assert vars(Figures)[name].options is options
-    assert defaults_of(getattr(Plots, name), {"ax", "figure", "echo"}) == declared(options, ("out", "format"))
+    assert defaults_of(getattr(Plots, name), {"ax", "figure", "echo"}) == declared(options)
 
 
 def test_methods__complete_and_refuse_as_written_ones_do(run):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
 
 from pipeline.cli import console
 from pipeline.cli.common import Directory
@@ -18,6 +20,14 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".pdf", ".svg")
 
+Out = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Figure file; by default in DIR/figures, named by its options.")
+]
+Format = Annotated[
+    Literal["png", "pdf", "svg"] | None,
+    typer.Option(metavar="png|pdf|svg", help="File format; by default png, or that of --out."),
+]
+
 
 def _groups() -> Groups:
     from pipeline.products.registry import FIGURES
@@ -28,8 +38,8 @@ def _groups() -> Groups:
 def _make(name: str) -> Any:
     from pipeline.products.registry import FIGURES
 
-    def command(directory: Directory, options: Any) -> None:
-        draw(directory, name, options)
+    def command(directory: Directory, options: Any, out: Out = None, format: Format = None) -> None:
+        draw(directory, name, options, out, format)
 
     figure = FIGURES[name]
     command.__name__ = f"figure {name}"
@@ -41,7 +51,7 @@ plot_app = command_group(
 )
 
 
-def draw(directory: str, name: str, options: FigureOptions) -> None:
+def draw(directory: str, name: str, options: FigureOptions, out: Path | None = None, suffix: str | None = None) -> None:
     """Draw a figure of a run, write it with its data, and print where they are."""
     from pipeline.runs.drawing import drawn, ready
     from pipeline.runs.naming import options_in_own_words
@@ -50,39 +60,32 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     from pipeline.store.local import make_folder, refuse_links, unwritable
     from pipeline.store.runfile import read_run
 
-    if options.out:
-        check_figure_path(_target_of(options), FIGURES, [read_run(directory).digest])
+    if out is not None:
+        if suffix and out.suffix.lower() != f".{suffix}":
+            out = out.with_name(f"{out.name}.{suffix}")
+        check_figure_path(out, FIGURES, [read_run(directory).digest])
     run, wanted = ready(directory, name, options, console.note)
-    target = (
-        _target_of(wanted) if wanted.out else _in_run(run.info.files, name, options_in_own_words(wanted, run.spec.rate))
-    )
-    if not wanted.out and run.info.files.local is None:  # runs of other buckets may have the same name
+    label = options_in_own_words(wanted, run.spec.rate).label()
+    target = out or _folder_of(run.info.files) / f"{name}{label}.{suffix or 'png'}"
+    if out is None and run.info.files.local is None:  # runs of other buckets may have the same name
         for file in (target, target.with_suffix(".nc")):
             check_file(file, digests=[run.info.digest])
-    if not wanted.out:
+    if out is None:
         refuse_links(target.parent, target, target.with_suffix(".nc"))
     if problem := unwritable(target.parent):
         raise RefusedError(f"{problem}; give another place for the figure: --out FILE.")
     figure = drawn(run, name, wanted)
     from pipeline.plots import save_data, save_figure
 
-    if not wanted.out:
+    if out is None:
         make_folder(target.parent)
     console.result(f"figure: {save_figure(figure, target)}")
     console.result(f"data: {save_data(figure, target)}")
 
 
-def _target_of(options: FigureOptions) -> Path:
-    out, suffix = Path(options.out), f".{options.format}"
-    return out.with_name(out.name + suffix) if options.format and out.suffix.lower() != suffix else out
-
-
-def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
-    """Return the default file of a figure: in the run directory or, for a run in an object store, in
-    ``figures/NAME``.
-    """
-    folder = files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]
-    return folder / f"{name}{options.label()}.{options.format or 'png'}"
+def _folder_of(files: Files) -> Path:
+    """Return the folder of figures: in the run directory or, for a run in an object store, ``figures/NAME``."""
+    return files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]
 
 
 def check_figure_path(path: Path, within: str = "", digests: Collection[str] = ()) -> None:

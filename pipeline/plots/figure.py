@@ -163,8 +163,7 @@ def draw_figure(run: OpenRun, name: str, options: FigureOptions) -> DataFigure:
 
 def request(name: str, options: Options) -> dict[str, Any]:
     """Return what identifies a figure: its name, and the options that differ from their defaults."""
-    wanted = {key: value for key, value in options.changed().items() if key not in ("out", "format")}
-    return {"figure": name, "options": wanted}
+    return {"figure": name, "options": options.changed()}
 
 
 def run_provenance(run: OpenRun) -> dict[str, Any]:

@@ -353,8 +353,6 @@ class FigureOptions(Options):
     dpi: float | None = option(
         None, "Resolution; by default 200, or that of the style", unit="1/in", ge=20.0, le=2400.0
     )
-    out: str = option("", "Figure file; by default in DIR/figures, named by its options.")
-    format: Literal["", "png", "pdf", "svg"] = option("", "File format; by default png, or that of --out.")
 
     @field_serializer("style", when_used="json")
     def _plain_style(self, style: Any) -> Any:
@@ -365,7 +363,7 @@ class FigureOptions(Options):
 
         The drive frequency as the continuation parameter is left out.
         """
-        given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
+        given = self.changed()
         if given.get("parameter") == "frequency_hz":
             del given["parameter"]
         if self.style:

@@ -43,7 +43,7 @@ def figure(
     name
         One of `pipeline.products.registry.FIGURES`.
     options, more
-        Options that differ from the defaults; ``out`` and ``format`` are for the command line.
+        Options that differ from the defaults.
     echo
         Function that prints a line.
 

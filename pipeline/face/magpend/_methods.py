@@ -191,7 +191,7 @@ def _function(
     """Return a function of a source and of keywords, with the signature and the docstring that the options give."""
     from pipeline.runs.arguments import options_in_errors
 
-    fields = {name: info for name, info in product.options.model_fields.items() if name not in ("out", "format")}
+    fields = product.options.model_fields
     required = {name: info for name, info in fields.items() if info.is_required()}
     fields = {**required, **fields}
     Parameter = inspect.Parameter

@@ -121,8 +121,6 @@ def test_label__every_option_that_changes_the_picture_changes_the_name(name):
     base = model.model_construct(**required)
     seen = {base.label(): "nothing"}
     for key in model.model_fields:
-        if key in ("out", "format"):
-            continue
         label = model.model_construct(**{**required, key: other_value(model, key)}).label()
         assert label not in seen, f"{key} and {seen.get(label)} give the same file name {label!r}"
         seen[label] = key
@@ -132,9 +130,8 @@ def test_label__tells_close_values_apart_and_has_what_was_given():
     labels = {options_of("gallery", at={"frequency": f}).label() for f in (2.2, 2.2000001, 2.2000002)}
     assert len(labels) == 3
     assert "_frequency_2.2" in labels
-    # a quantity replaces the state; where and how it is written is no part of the name
+    # a quantity replaces the state
     assert options_of("bifurcation", state="psi1", quantity="energy.max").label() == "_energy.max"
-    assert options_of("regimes", out="a.png", format="pdf").label() == ""
     assert options_of("branches", over=r"C:\runs\line").label() == "_over_C--runs-line"  # a name on Windows, too
 
 
