@@ -52,7 +52,7 @@ def prune(
     directory: Directory,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the results; remove nothing.")] = False,
 ) -> None:
-    """Remove results that belong to an earlier state of the cube or an earlier version of magpend."""
+    """Remove results that belong to earlier cells, attractors or branches of the run, or to an earlier magpend."""
     from pipeline.runs import derive
 
     found = (derive.stale if dry_run else derive.prune)(directory)
