@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 
 from magpend_core import Sections, Status
 from pipeline.compute.integrate import WALKED, Integrate, Job, going_on, integrate, watched_quantities
-from pipeline.layout.cells import CellMap
 from pipeline.layout.identity import numbered
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
+from pipeline.layout.plan import Plan
 from pipeline.layout.schema import base_variables
 from pipeline.motion.steady import Inputs
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.models import KEPT
 from pipeline.specification.spec import Spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.reading import read_block
@@ -62,7 +60,7 @@ class Source:
         self.names = [variable.name for variable in own]
         self._is_committed = np.zeros(self.run.plan.n_tasks + 1, bool)
         self._is_committed[list(self.run.commits)] = True
-        self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
+        self._read = lru_cache(maxsize=2)(lambda task: read_block(self.run.info, self.run.commits[task], self.names))
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
         """Return for each wanted cell the flat index of the cell with the same inputs in this run; -1 if it has none.
@@ -116,9 +114,9 @@ def same_products(run: RunDirectory, wanted: Spec) -> list[str]:
     ]
 
 
-def obstacles(run: RunDirectory, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
-    """Return the reasons why a new run, with its specification and identity, cannot copy the cells of another one."""
-    lines = unlike(run.info.identity, identity)
+def obstacles(run: RunDirectory, plan: Plan) -> list[str]:
+    """Return the reasons why a new run, with its plan, cannot copy the cells of another one."""
+    wanted, lines = plan.spec, unlike(run.info.identity, plan.identity)
     if line := _no_extension(run.spec, wanted):
         lines.append(line)
     same = same_products(run, wanted)
@@ -148,12 +146,13 @@ def _no_extension(old: Spec, new: Spec) -> str:
 class Pool:
     """Earlier runs from which a new run copies cells; the first one that has a cell provides it."""
 
-    def __init__(self, spec: Spec, runs: Sequence[RunDirectory]) -> None:
-        self.spec = spec
-        self.sources = [Source(run, spec) for run in runs]
+    def __init__(self, plan: Plan, runs: Sequence[RunDirectory]) -> None:
+        self.plan = plan
+        self.sources = [Source(run, plan.spec) for run in runs]
 
-    def count(self, inputs: Inputs, way: Way | None) -> list[int]:
-        """Count the cells that can be copied from each earlier run."""
+    def count(self, block: tuple[slice, ...]) -> list[int]:
+        """Count the cells of a block that can be copied from each earlier run."""
+        inputs, way = self.plan.cells.inputs(block), way_of(self.plan.spec, block)
         counts, rest = [], np.arange(len(inputs.initial_states))
         for source in self.sources:
             place = source.find(inputs.take(rest), way)
@@ -165,16 +164,16 @@ class Pool:
             rest = rest[n_taken == 0]
         return counts
 
-    def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
+    def integrator(self, block: tuple[slice, ...], tally: list[int]) -> Integrate:
         """Return a function that computes the cells of a block, and copies those that earlier runs have, with the same
         bits.
 
         The numbers of cells that were taken are appended to `tally`.
         """
-        way = way_of(self.spec, block)
+        way = way_of(self.plan.spec, block)
         if way is None:
             return lambda spec, inputs: self._give(spec, inputs, inputs, None, tally)
-        return lambda spec, inputs: self._give(spec, inputs, cells.inputs(block), way, tally)
+        return lambda spec, inputs: self._give(spec, inputs, self.plan.cells.inputs(block), way, tally)
 
     def _give(self, spec: Spec, inputs: Inputs, begin: Inputs, way: Way | None, tally: list[int]) -> Values:
         """Return the variables of branches. The first points of each branch are copied, and the rest is integrated."""
@@ -269,4 +268,4 @@ def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
         if run.info.digest != expected:
             raise RefusedError(f"{place}: another run stands there than when its cells were looked up.")
         runs.append(run)
-    return Pool(Spec.parse(read_run(directory).spec, KEPT), runs)
+    return Pool(read_run(directory).plan, runs)

@@ -20,13 +20,10 @@ from magpend_core.models import import_model
 from pipeline.compute.integrate import WALKED, Integrate, going_on, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
-from pipeline.layout.cells import CellMap
-from pipeline.layout.identity import differences, identity_of, numbered
-from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.identity import differences, numbered
+from pipeline.layout.plan import Plan
 from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.models import KEPT
-from pipeline.specification.spec import Spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.reading import read_cells
@@ -37,26 +34,23 @@ _PREPARING = threading.Lock()
 
 
 @lru_cache(maxsize=4)
-def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
+def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> RunInfo:
     """Read the run of a task, once per process; raise `RefusedError` if this worker would compute other results."""
     if origin is not None:
         import_model(*origin)
     info = read_run(directory)
-    spec = Spec.parse(info.spec, KEPT)
-    plan = make_plan(spec)
-    different = differences(numbered(info.identity), identity_of(spec, plan))
+    different = differences(numbered(info.identity), info.plan.identity)
     if digest != info.digest or different:
         why = "; ".join(different) or "another run was begun in the directory"
         raise RefusedError(
             f"{directory}: this worker's magpend would not compute the same run ({why}); "
             "install the same version everywhere."
         )
-    return info, spec, plan, CellMap(spec)
+    return info
 
 
 def compute(
-    spec: Spec,
-    cells: CellMap,
+    plan: Plan,
     block: tuple[slice, ...],
     before: Mapping[str, np.ndarray] | None = None,
     integrate: Integrate = integrate,
@@ -65,6 +59,7 @@ def compute(
 
     `before` has variables of the last computed cells of branches that began in an earlier block.
     """
+    spec, cells = plan.spec, plan.cells
     inputs = cells.inputs(block)
     if before is not None:
         inputs = going_on(inputs, before)
@@ -98,17 +93,17 @@ def run_task(
     cells by status, and the seconds taken by the kernel and by writing; with `sources` how many cells were taken.
     """
     with _PREPARING:
-        info, spec, plan, cells = _prepare(directory, digest, origin)
-    started = time.perf_counter()
+        info = _prepare(directory, digest, origin)
+    plan, started = info.plan, time.perf_counter()
     taken: list[int] = []
-    how = _taking(directory, digest, sources, cells, plan.task(index), taken)
+    how = _taking(info, sources, plan.task(index), taken)
     with using_threads(1):  # the tasks keep the cores busy
-        values = compute(spec, cells, plan.task(index), **_left(info, plan, cells, index), **how)
+        values = compute(plan, plan.task(index), **_left(info, index), **how)
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
     with writing_results():
-        write_task(info, plan, index, values, counts)
+        write_task(info, index, values, counts)
     return {
         "task": index,
         "cells": plan.cells_in(index),
@@ -119,23 +114,19 @@ def run_task(
     }
 
 
-def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
+def _left(info: RunInfo, index: int) -> dict[str, Any]:
     """Read the states in which the preceding task, if there is one, left the branches of this task."""
+    plan = info.plan
     predecessor = plan.predecessor(index)
     if predecessor is None:
         return {}
     names = [v.name for v in plan.variables if v.name in WALKED]
-    region = cells.last_cells(plan.task(predecessor))
-    return {"before": read_cells(info, plan, predecessor, region, names)}
+    region = plan.cells.last_cells(plan.task(predecessor))
+    return {"before": read_cells(info, predecessor, region, names)}
 
 
 def _taking(
-    directory: str,
-    digest: str,
-    sources: tuple[tuple[str, str], ...],
-    cells: CellMap,
-    block: tuple[slice, ...],
-    taken: list[int],
+    info: RunInfo, sources: tuple[tuple[str, str], ...], block: tuple[slice, ...], taken: list[int]
 ) -> dict[str, Any]:
     """Return, if there are `sources`, a function ``integrate`` for `compute` that copies cells from them."""
     if not sources:
@@ -143,20 +134,19 @@ def _taking(
     from pipeline.compute.reuse import pool_of
 
     with _PREPARING:
-        pool = pool_of(directory, digest, sources)
-    return {"integrate": pool.integrator(cells, block, taken)}
+        pool = pool_of(info.files.place, info.digest, sources)
+    return {"integrate": pool.integrator(block, taken)}
 
 
-def warm_up(spec: Spec) -> float:
+def warm_up(plan: Plan) -> float:
     """Compile the functions that a run needs into the compile cache; return the time that this took [s].
 
     It is compiled once, before threads or workers need it: what they will do is done here for a single cell over no
     more than a few periods.
     """
-    started = time.perf_counter()
+    started, spec, cells = time.perf_counter(), plan.spec, plan.cells
     short = Inputs(spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states))))
     if spec.section is not None:  # products go on from cells that return, so from one that may
-        cells = CellMap(spec)
         short = cells.inputs(tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape)))
         short = Inputs(short.parameters[:1, :1], short.frequency_hz[:1, :1], short.initial_states[:1])
     integration = spec.integration.model_copy(update={"n_transient": 0, "n_keep": 1})

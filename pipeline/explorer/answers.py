@@ -173,7 +173,7 @@ class Answering:
     """A run that answers requests for data in a few threads; what waits is bounded."""
 
     def __init__(self, run: RunDirectory) -> None:
-        self.run = ExploredRun.of(run)
+        self.run = ExploredRun.open(run)
         self.live_problem = live_problem(self.run)
         self.live = None if self.live_problem else LiveRun(self.run)
         self.pool = ThreadPoolExecutor(THREADS, "explorer")

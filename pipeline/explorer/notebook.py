@@ -48,5 +48,5 @@ def explorer(
     import_extra("anywidget", "notebook", "explorer")
     from pipeline.explorer.widget import Explorer
 
-    found = ExploredRun.of(run)
+    found = ExploredRun.open(run)
     return Explorer(found if curves is None else replace(found, curves=RunDirectory.open(curves)), height=height)

@@ -432,7 +432,7 @@ def serve(
 
     run: RunDirectory = RunDirectory.open(source)
     if curves is not None:
-        run = replace(ExploredRun.of(run), curves=RunDirectory.open(curves))
+        run = replace(ExploredRun.open(run), curves=RunDirectory.open(curves))
     taken = listening(port)
     guard = Guard(new_token(), taken.getsockname()[1])
     address = f"http://{HOST}:{guard.port}/?token={guard.token}"

@@ -14,7 +14,6 @@ import numpy as np
 
 from magpend_core.versions import ENGINE
 from pipeline.layout.cells import coordinates
-from pipeline.layout.plan import Plan
 from pipeline.layout.schema import FORMAT, REFINEMENT
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.spec import Spec
@@ -23,7 +22,7 @@ CELLS = 1
 """Number of what turns a specification into cells: inputs, motions, refined grids. See `magpend_core.versions`."""
 
 
-def identity_of(spec: Spec, plan: Plan) -> dict[str, Any]:
+def identity_of(spec: Spec, chunks: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
     """Return all data that determine the bytes of a run's store: specification, parameters, layout, versions.
 
     The title, the source of a function and ``[execution]`` are left out; the chunks that follow from ``[execution]``
@@ -37,7 +36,7 @@ def identity_of(spec: Spec, plan: Plan) -> dict[str, Any]:
         "model_digest": spec.model.digest,
         "parameter_values": spec.values.as_dict(),
         "coordinates": _coordinates_digest(spec),
-        "chunks": {v.name: list(plan.chunks(v)) for v in plan.variables},
+        "chunks": {name: list(chunk) for name, chunk in chunks.items()},
     }
 
 

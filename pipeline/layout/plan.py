@@ -14,12 +14,15 @@ import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline.layout.cells import CellMap
+from pipeline.layout.identity import identity_of
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.product import Variable
@@ -48,21 +51,60 @@ TASK_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class Plan:
-    """The plan of a run: cells, tasks and chunks, with estimates of size and time."""
+    """The plan of a run: its specification, cells, tasks and chunks, with estimates of size and time."""
 
-    kind: str  # ``"sweep"`` or ``"continuation"``
-    # cell dims of the cube, and their sizes
-    dims: tuple[str, ...]
-    shape: tuple[int, ...]
-    path: int | None  # index of the dim that branches walk; None in a sweep
+    spec: Spec
+    cells: CellMap = field(compare=False, repr=False)
     block: tuple[int, ...]  # cells of a task, per dim
-    variables: tuple[Variable, ...]  # variables of the cube
-    sizes: Mapping[str, int]  # sizes of the dims that are not cell dims
-    seconds_per_cell: float  # estimated time on one core [s]
-    # directions in which branches walk, each for an equal part of the branches; empty in a sweep
-    directions: tuple[str, ...] = ()
-    # estimated time of a cell on one core at each swept frequency [s]; None if it is not swept
-    seconds_at: np.ndarray | None = field(default=None, compare=False, repr=False)
+    text: str = field(default="", compare=False, repr=False)  # TOML text of the specification
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Cell dims of the result cube."""
+        return self.cells.dims
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the cell dims."""
+        return self.cells.shape
+
+    @property
+    def path(self) -> int | None:
+        """Index of the dim along which branches are continued. It is None in a sweep."""
+        return self.cells.path
+
+    @property
+    def directions(self) -> tuple[str, ...]:
+        """Directions in which branches are continued, each for an equal part of the branches; empty in a sweep."""
+        return self.spec.continuation.directions if self.spec.continuation else ()
+
+    @cached_property
+    def variables(self) -> tuple[Variable, ...]:
+        """Variables of the result cube."""
+        return variables_of(self.spec.model, self.spec.products)
+
+    @cached_property
+    def sizes(self) -> Mapping[str, int]:
+        """Sizes of the dims that are not cell dims."""
+        return sizes_of(self.spec.model, self.spec.products, self.spec.integration.n_keep)
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """All data that determine the numbers and the layout of the run."""
+        return identity_of(self.spec, {v.name: self.chunks(v) for v in self.variables})
+
+    @cached_property
+    def seconds_per_cell(self) -> float:
+        """Estimated time of a cell on one core [s]."""
+        return sum(periods_per_cell(self.spec)) * mean_seconds_per_period(self.spec)
+
+    @cached_property
+    def seconds_at(self) -> np.ndarray | None:
+        """Estimated time of a cell on one core at each swept frequency [s]; None if it is not swept."""
+        if FREQUENCY not in self.spec.axes:
+            return None
+        frequency = self.spec.axes[FREQUENCY].array()
+        return sum(periods_per_cell(self.spec)) * self.spec.motion.seconds_per_period(frequency)
 
     @property
     def n_cells(self) -> int:
@@ -87,7 +129,12 @@ class Plan:
     @property
     def n_bytes(self) -> int:
         """Size of the result cube before compression [bytes]."""
-        return self.n_cells * sum(v.itemsize(self.sizes) for v in self.variables)
+        return self.n_cells * self.bytes_per_cell
+
+    @property
+    def bytes_per_cell(self) -> int:
+        """Size of all variables of a cell [bytes]."""
+        return sum(v.itemsize(self.sizes) for v in self.variables)
 
     @property
     def core_seconds(self) -> float:
@@ -163,7 +210,7 @@ class Plan:
         return (*chunk, *(sizes[d] for d in variable.own_dims))
 
 
-def make_plan(spec: Spec) -> Plan:
+def make_plan(spec: Spec, text: str = "") -> Plan:
     """Plan a run: choose the block of cells per task, and estimate size and time.
 
     A task takes a thirty-second part of the run, but between 2 and 20 s of one core by the rule of thumb, and
@@ -171,35 +218,34 @@ def make_plan(spec: Spec) -> Plan:
     is given. In a refined grid a task is a tile: one parameter point, and about equally many cells along each
     grid dim, in multiples of the stride. In a continuation it is about 16 branches of one direction, over as
     many points as that time allows, at most 20 s.
+
+    Parameters
+    ----------
+    spec
+        Specification of the run.
+    text
+        TOML text of the specification, which the run keeps.
+
+    Raises
+    ------
+    SpecError
+        If there are too many tasks or branches, or chunks that cannot be written; the message lists all problems.
     """
-    cells = CellMap(spec)
-    seconds = sum(periods_per_cell(spec)) * mean_seconds_per_period(spec)
-    n_points = 1 if cells.path is None else cells.shape[cells.path]
-    wanted = spec.execution.trajectories_per_task or _trajectories(spec, math.prod(cells.shape), n_points, seconds)
-    directions: tuple[str, ...] = ()
+    draft = Plan(spec, CellMap(spec), (), text)
+    wanted = spec.execution.trajectories_per_task or _trajectories(draft)
     if spec.continuation is not None:
-        directions = spec.continuation.directions
-        block = _walk_block(spec, cells, wanted, seconds)
+        block = _walk_block(draft, wanted)
     elif spec.refine is None:
-        block = _block(cells.shape, None, wanted)
+        block = _block(draft.shape, None, wanted)
     else:
-        grid = cells.shape[len(spec.axes) :]
+        grid = draft.shape[len(spec.axes) :]
         if spec.execution.trajectories_per_task is None:
-            most = TASK_BYTES // _bytes_per_cell(spec)
+            most = TASK_BYTES // draft.bytes_per_cell
             wanted = max(wanted, min(LEAST_LATTICE * spec.refine ** len(grid), most))
         block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
-    return Plan(
-        spec.kind,
-        cells.dims,
-        cells.shape,
-        cells.path,
-        block,
-        variables_of(spec.model, spec.products),
-        sizes_of(spec.model, spec.products, spec.integration.n_keep),
-        seconds,
-        directions,
-        _seconds_at(spec),
-    )
+    plan = replace(draft, block=block)
+    _refuse_large(plan)
+    return plan
 
 
 def mean_seconds_per_period(spec: Spec) -> float:
@@ -216,20 +262,12 @@ def periods_per_cell(spec: Spec) -> tuple[float, float]:
     return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
 
 
-def _seconds_at(spec: Spec) -> np.ndarray | None:
-    """Return the estimated computing time of a cell at each swept frequency [s]; None if frequency is not swept."""
-    if FREQUENCY not in spec.axes:
-        return None
-    return sum(periods_per_cell(spec)) * spec.motion.seconds_per_period(spec.axes[FREQUENCY].array())
-
-
-def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
-    wanted_seconds = _wanted_seconds(n_cells * seconds_per_cell)
-    per_cell = _bytes_per_cell(spec)
-    limit = PLAN_CHUNK_BYTES if n_points == 1 else TASK_BYTES
-    n = min(wanted_seconds / (seconds_per_cell * n_points), limit / (per_cell * n_points))
+def _trajectories(plan: Plan) -> int:
+    per_branch = plan.bytes_per_cell * plan.n_points
+    limit = PLAN_CHUNK_BYTES if plan.n_points == 1 else TASK_BYTES
+    n = min(_wanted_seconds(plan.core_seconds) / (plan.seconds_per_cell * plan.n_points), limit / per_branch)
     # blocks are filled dim by dim, which can double the number of tasks
-    n = max(n, 2 * n_cells / n_points / MOST_TASKS)
+    n = max(n, 2 * plan.n_cells / plan.n_points / MOST_TASKS)
     return max(1, round(n / LANES_OF_TASK)) * LANES_OF_TASK
 
 
@@ -237,30 +275,27 @@ def _wanted_seconds(core_seconds: float) -> float:
     return min(max(core_seconds / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
 
 
-def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float) -> tuple[int, ...]:
+def _walk_block(plan: Plan, wanted: int) -> tuple[int, ...]:
     """Return the block shape of a continuation's task. A task takes branches of one direction over a stretch of the
     parameter axis.
     """
-    assert spec.continuation is not None
-    assert cells.path is not None
-    n_points, directions = cells.shape[cells.path], spec.continuation.directions
-    sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
-    largest = max(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
-    n_seeds = cells.shape[-1] // len(directions)
-    if len(directions) > 1:
+    assert plan.path is not None
+    n_points, seconds = plan.n_points, plan.seconds_per_cell
+    largest = max(v.itemsize(plan.sizes) for v in plan.variables)
+    n_seeds = plan.shape[-1] // len(plan.directions)
+    if len(plan.directions) > 1:
         # any other number would put branches of both directions into one task
-        n_seeds = _group(n_seeds, wanted, TASK_BYTES // _bytes_per_cell(spec))
+        n_seeds = _group(n_seeds, wanted, TASK_BYTES // plan.bytes_per_cell)
         wanted = max(wanted, n_seeds)
-    block = list(_block((*cells.shape[:-1], n_seeds), cells.path, wanted))
+    block = list(_block((*plan.shape[:-1], n_seeds), plan.path, wanted))
     n_branches = math.prod(block) // n_points
-    points = spec.execution.points_per_task
+    points = plan.spec.execution.points_per_task
     if points is None:
-        by_time = _wanted_seconds(math.prod(cells.shape) * seconds_per_cell) / (n_branches * seconds_per_cell)
-        at = _seconds_at(spec)
-        at_most = MOST_SECONDS / (n_branches * (seconds_per_cell if at is None else float(at.max())))
+        by_time = _wanted_seconds(plan.core_seconds) / (n_branches * seconds)
+        at_most = MOST_SECONDS / (n_branches * (seconds if plan.seconds_at is None else float(plan.seconds_at.max())))
         by_size = PLAN_CHUNK_BYTES / (n_branches * largest)
         points = _share(n_points, max(1, int(min(by_time, at_most, by_size))))
-    block[cells.path] = min(points, n_points)
+    block[plan.path] = min(points, n_points)
     return tuple(block)
 
 
@@ -280,11 +315,6 @@ def _share(n: int, most: int) -> int:
 def _part(n: int, most: int) -> int:
     """Return the largest divisor of `n` that is at most `most`."""
     return n // next(k for k in range(-(-n // most), n + 1) if n % k == 0)
-
-
-def _bytes_per_cell(spec: Spec) -> int:
-    sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
-    return sum(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
 
 
 def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:
@@ -332,14 +362,7 @@ GO_ON = "MAGPEND_SPACE"
 """Environment variable; ``0`` lets a run begin although the disk may be too small for it."""
 
 
-def check_plan(plan: Plan) -> None:
-    """Refuse a plan with too many tasks or branches, or with chunks that cannot be written.
-
-    Raises
-    ------
-    SpecError
-        If there is a problem; the message lists all of them.
-    """
+def _refuse_large(plan: Plan) -> None:
     problems = _task_problems(plan) + _chunk_problems(plan)
     if plan.path is not None and plan.shape[-1] > MOST_BRANCHES:
         problems.append(

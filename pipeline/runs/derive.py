@@ -23,7 +23,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +85,7 @@ class AnalysedRun(RunDirectory):
         run = RunDirectory.open(source)
         if isinstance(run, AnalysedRun) and echo is None and not places:
             return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)}, echo=echo or silent, **places)
+        return cls(run.info, run.commits, run.known, echo or silent, **places)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of an analysis of this run with plain names, computed now or read if it is stored.

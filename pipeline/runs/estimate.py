@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell
 from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
@@ -47,7 +46,7 @@ class Estimate:
     compiled_s: float  # time spent on compiling [s]
 
 
-def estimate(spec: Spec, plan: Plan) -> Estimate:
+def estimate(plan: Plan) -> Estimate:
     """Estimate the computing time of a run on one core of this machine, from a sample of its cells.
 
     This takes a second or two, after compiling. The time of products (exponents) is their number of periods
@@ -55,24 +54,25 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
     """
     from pipeline.compute.task import warm_up
 
-    compiled_s = warm_up(spec)
+    spec, compiled_s = plan.spec, warm_up(plan)
     most, products = periods_per_cell(spec)
     # products that the engine computes while integrating are measured with it
     watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].watches(o)}
     spec = spec.replace(products=watched)
+    plan = replace(plan, spec=spec)
     products -= periods_per_cell(spec)[1]
-    inputs = _sample(spec, plan, np.random.default_rng(0), BRANCHES, pairs=False)
+    inputs = _sample(plan, np.random.default_rng(0), BRANCHES, pairs=False)
     ratio, measured, seconds = _speed(spec, inputs, most)
     how = f"measured: {inputs.frequency_hz.size} of its cells over {measured} periods, {seconds:.1f} s"
     periods = most
     if spec.integration.stop_when_closed:
-        periods = _periods_until_closed(spec, plan, most, ratio)
+        periods = _periods_until_closed(plan, most, ratio)
         how += f"; a cell takes {periods:.0f} of at most {most:.0f} periods until it has closed"
     per_cell = ratio * mean_seconds_per_period(spec) * (periods + products)
     return Estimate(per_cell * plan.n_cells, how, compiled_s)
 
 
-def writing_seconds(spec: Spec, plan: Plan) -> float:
+def writing_seconds(plan: Plan) -> float:
     """Measure how long it takes to write the files of one task to a temporary folder [s].
 
     Returns
@@ -80,7 +80,6 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
     float
         Time of a task's files and its commit record [s].
     """
-    from pipeline.runs.run import identity_here
     from pipeline.store.commits import write_task
     from pipeline.store.keys import keys_of
     from pipeline.store.setup import create
@@ -90,7 +89,8 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
         return n_files * FILE_S
     rng, taken = np.random.default_rng(0), []
     with tempfile.TemporaryDirectory(prefix="magpend-estimate-") as folder:
-        info = create(Path(folder) / "run", spec, plan, identity_here(spec, plan), "")
+        info = create(Path(folder) / "run", plan)
+        plan = info.plan
         for index in range(min(WRITTEN, plan.n_tasks)):
             shape = tuple(s.stop - s.start for s in plan.task(index))
             values = {
@@ -98,7 +98,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
                 for v in plan.variables
             }
             started = time.perf_counter()
-            write_task(info, plan, index, values, {"bounded": plan.cells_in(index)})
+            write_task(info, index, values, {"bounded": plan.cells_in(index)})
             taken.append(time.perf_counter() - started)
             if sum(taken) > WRITING_S:
                 break
@@ -120,14 +120,13 @@ def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
     return core_seconds / max(1, min(workers, n_tasks))
 
 
-def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
+def _sample(plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
     """Draw cells at random from the whole run; return their parameters, frequencies and initial states.
 
     With `pairs`, the points of a continuation's branch come in neighbouring pairs, so that the second point
     of a pair starts where it would start in the run.
     """
-    cells = CellMap(spec)
-    n_points = 1 if plan.path is None else plan.shape[plan.path]
+    n_points = plan.n_points
     in_task = math.prod(n for i, n in enumerate(plan.block) if i != plan.path)
     branches = [n for i, n in enumerate(plan.shape) if i != plan.path]
     chosen = rng.choice(math.prod(branches), min(n_branches, in_task, math.prod(branches)), replace=False)
@@ -137,7 +136,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
         block = [slice(int(i), int(i) + 1) for i in place]
         if plan.path is not None:
             block.insert(plan.path, slice(0, n_points))
-        parts.append(cells.inputs(tuple(block)))
+        parts.append(plan.cells.inputs(tuple(block)))
     points = _points(n_points, rng, pairs=pairs)
     return Inputs(
         np.concatenate([p.parameters[:, points] for p in parts]),
@@ -196,7 +195,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
     return np.where(np.isfinite(ends), ends, inputs.initial_states), seconds / by_rule, seconds
 
 
-def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
+def _periods_until_closed(plan: Plan, most: float, ratio: float) -> float:
     """Estimate from a sample how many periods a cell takes on average, if its integration stops once its orbit has
     closed.
 
@@ -205,10 +204,10 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
     closing_s = 0.8  # most time for measuring when cells close, by the rule of thumb [s]
     from pipeline.compute.integrate import integrate
 
-    rng, n_keep = np.random.default_rng(1), spec.integration.n_keep
+    spec, rng, n_keep = plan.spec, np.random.default_rng(1), plan.spec.integration.n_keep
     found, n_branches, left = np.empty(0), BRANCHES, closing_s
     while left > 0:
-        inputs = _sample(spec, plan, rng, n_branches, pairs=True)
+        inputs = _sample(plan, rng, n_branches, pairs=True)
         a_period = ratio * float(spec.motion.seconds_per_period(inputs.frequency_hz).mean())
         if not len(found):
             cap = int(min(most, max(closing_s / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))

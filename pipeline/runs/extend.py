@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.layout.cells import CellMap
 from pipeline.layout.evaluation import check_starts
 from pipeline.layout.extents import with_sizes
 from pipeline.layout.identity import canonical, digest_of
@@ -27,7 +26,7 @@ from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.writing import sync_folder
 from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size
-from pipeline.runs.run import Echo, carry_out, identity_here
+from pipeline.runs.run import Echo, carry_out
 from pipeline.runs.status import State, state
 from pipeline.runs.zoom import Widening, derived_toml, widened
 from pipeline.specification.files import find_spec
@@ -48,11 +47,7 @@ if TYPE_CHECKING:
 class Extension:
     """Plan of a wider run, with the earlier runs from which it copies cells."""
 
-    # the wider run
-    spec: Spec
-    text: str
-    plan: Plan
-    identity: Mapping[str, Any]
+    plan: Plan  # plan of the wider run
     runs: tuple[RunDirectory, ...]  # runs whose cells are reused
     counts: tuple[int, ...]  # number of reused cells of each
     notes: tuple[str, ...]  # remarks on runs that are incomplete or have no suitable cells
@@ -65,7 +60,7 @@ class Extension:
     @property
     def digest(self) -> str:
         """Digest of everything that decides the numbers and the layout of the wider run."""
-        return digest_of(self.identity)
+        return digest_of(self.plan.identity)
 
     @property
     def share(self) -> float:
@@ -76,7 +71,7 @@ class Extension:
 
     def _more(self, run: RunDirectory) -> float:
         """Return the fraction of a cell's periods that must still be integrated after it is copied."""
-        integration = self.spec.integration
+        integration = self.plan.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)
 
@@ -87,7 +82,7 @@ class Extension:
         for run, count in zip(self.runs, self.counts, strict=True):
             how = "continue from their last section in" if self._more(run) else "are reused from"
             yield f"{count} of {n} cells {how} {run.name}"
-        bound = "at most " if self.spec.refine is not None else ""
+        bound = "at most " if self.plan.spec.refine is not None else ""
         yield f"{bound}{n - self.reused} cells are left to integrate"
 
 
@@ -115,17 +110,16 @@ def plan_extension(
     runs = [RunDirectory.open(source) for source in sources]
     wide, text = _wide(runs[0], spec, widening or Widening())
     check_starts(wide)
-    plan = make_plan(wide)
-    identity = identity_here(wide, plan)
-    fitting, notes = _fitting(runs, wide, identity)
-    counts = _census(wide, plan, fitting)
+    plan = make_plan(wide, text)
+    fitting, notes = _fitting(runs, plan)
+    counts = _census(plan, fitting)
     if not sum(counts):
         reasons = notes + [line for run in fitting for line in _strangers(run, wide)]
         raise RefusedError(
             "no cell can be reused, so a new run is as quick (magpend run SPEC --out NEW). "
             "Differences:\n  " + "\n  ".join(reasons)
         )
-    return Extension(wide, text, plan, identity, tuple(fitting), tuple(counts), tuple(notes))
+    return Extension(plan, tuple(fitting), tuple(counts), tuple(notes))
 
 
 def _wide(run: RunDirectory, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
@@ -144,15 +138,13 @@ def _wide(run: RunDirectory, spec: str | Path | None, widening: Widening) -> tup
     return wide, derived_toml("Extended", origin, wide)
 
 
-def _fitting(
-    runs: Sequence[RunDirectory], wide: Spec, identity: Mapping[str, Any]
-) -> tuple[list[RunDirectory], list[str]]:
+def _fitting(runs: Sequence[RunDirectory], plan: Plan) -> tuple[list[RunDirectory], list[str]]:
     """Select the earlier runs whose cells can be copied, with notes on the others."""
     from pipeline.compute.reuse import obstacles
 
     fitting, notes = [], []
     for run in runs:
-        lines = obstacles(run, wide, identity)
+        lines = obstacles(run, plan)
         if lines:
             notes.append(f"{run.name}: none of its cells can be reused ({'; '.join(lines)})")
             continue
@@ -165,13 +157,12 @@ def _fitting(
     return fitting, notes
 
 
-def _census(wide: Spec, plan: Plan, runs: Sequence[RunDirectory]) -> list[int]:
+def _census(plan: Plan, runs: Sequence[RunDirectory]) -> list[int]:
     from pipeline.compute.reuse import Pool
 
-    pool, cells = Pool(wide, runs), CellMap(wide)
-    counts = [0] * len(runs)
+    pool, counts = Pool(plan, runs), [0] * len(runs)
     for block in plan.tasks() if runs else ():
-        for i, n in enumerate(pool.count(cells.inputs(block), way_of(wide, block))):
+        for i, n in enumerate(pool.count(block)):
             counts[i] += n
     return counts
 
@@ -185,14 +176,14 @@ def _strangers(run: RunDirectory, wide: Spec) -> list[str]:
 
 def describe_extension(extension: Extension, *, workers: int | None = None) -> Iterator[str]:
     """Yield the text lines of a dry run: size, copied and remaining cells, and the estimated time."""
-    spec, plan = extension.spec, extension.plan
+    plan, spec = extension.plan, extension.plan.spec
     if spec.title:
         yield spec.title
     dims = ", ".join(f"{d} {n}" for d, n in zip(dims_in_own_words(plan.dims, spec.rate), plan.shape, strict=True))
     yield f"{spec.kind}: {plan.n_cells} cells ({dims or 'one cell'}) in {plan.n_tasks} tasks"
     yield from extension.lines()
     yield f"cube: {size(plan.n_bytes)} before compression"
-    yield time_line(spec, plan, extension.share, plan.n_tasks, workers)
+    yield time_line(plan, extension.share, plan.n_tasks, workers)
 
 
 def extend(
@@ -270,7 +261,7 @@ def extend(
     old = RunDirectory.open(first)
     if extension.digest == old.info.digest:
         return _as_it_is(old, echo)
-    _refuse_loss(old, extension.spec)
+    _refuse_loss(old, extension.plan.spec)
     with first.lock():
         _build(extension, built, **how)
         _exchange(_folder(first), _folder(built), echo)
@@ -281,7 +272,7 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
     for line in extension.lines():
         echo(line)
     sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
-    carry_out(extension.spec, extension.text, files, echo=echo, sources=sources, **how)
+    carry_out(extension.plan, files, echo=echo, sources=sources, **how)
     echo(f"{_record(extension, files)} of {extension.plan.n_cells} cells were reused")
     return state(files)
 
@@ -401,14 +392,14 @@ def _refined(
     word = run.spec.rate if key == FREQUENCY else key
     spec = widened(run.spec, Widening({word: {"values": values.tolist()}}))
     text = derived_toml("Refined", f"run {run.info.name}, digest {run.info.digest}", spec)
-    identity = identity_here(spec, make_plan(spec))
+    plan = make_plan(spec, text)
     files = open_files(place)
-    if is_run(files) and RunDirectory.open(files).info.digest != digest_of(identity):
+    if is_run(files) and RunDirectory.open(files).info.digest != digest_of(plan.identity):
         shutil.rmtree(place)  # left by a refinement that was killed
-    fitting, _ = _fitting([*others, run], spec, identity)
+    fitting, _ = _fitting([*others, run], plan)
     sources = [(one.info.files.place, one.info.digest) for one in fitting]
     there = replace(where or Where(), place=files.place)
-    carry_out(spec, text, files, workers=workers, where=there, echo=echo, sources=sources)
+    carry_out(plan, files, workers=workers, where=there, echo=echo, sources=sources)
     return RunDirectory.open(place)
 
 
@@ -446,7 +437,7 @@ def _as_it_is(run: RunDirectory, echo: Echo) -> State:
 
 def _refuse_loss(run: RunDirectory, wide: Spec) -> None:
     """Raise RefusedError if the wider run lacks cells or products of the run that it would replace."""
-    cells, finder, lost = CellMap(run.spec), Finder(wide), 0
+    cells, finder, lost = run.plan.cells, Finder(wide), 0
     for index in run.commits:
         block = run.plan.task(index)
         lost += int((finder.find(cells.inputs(block), way_of(run.spec, block)) == NOWHERE).sum())

@@ -20,7 +20,6 @@ from pipeline.specification.clusters import (
     refuse_breaks,
     seconds_of,
 )
-from pipeline.specification.spec import Spec
 
 AIM_S = 1800.0
 """Time that a job is given enough cores for [s]: short enough to start soon, long enough to be worth a job."""
@@ -70,14 +69,14 @@ class Work:
         ]
 
 
-def measure(spec: Spec, plan: Plan, done: Container[int]) -> Work:
+def measure(plan: Plan, done: Container[int]) -> Work:
     """Measure the work that a run still has to do, as ``magpend run --dry-run`` does."""
     left = [index for index in range(plan.n_tasks) if index not in done]
     n_left = sum(plan.cells_in(index) for index in left)
     seconds, how = 0.0, "nothing is left to compute"
     if left:
-        found = estimate(spec, plan)
-        seconds = found.core_seconds * n_left / plan.n_cells + len(left) * writing_seconds(spec, plan)
+        found = estimate(plan)
+        seconds = found.core_seconds * n_left / plan.n_cells + len(left) * writing_seconds(plan)
         how = found.how
     in_turn = 1 if plan.path is None else plan.task_grid[plan.path]
     return Work(
@@ -86,7 +85,7 @@ def measure(spec: Spec, plan: Plan, done: Container[int]) -> Work:
         n_tasks=plan.n_tasks,
         n_tasks_left=len(left),
         n_parallel=max(1, min(len(left), plan.n_tasks // in_turn)),
-        periods=n_left * sum(periods_per_cell(spec)),
+        periods=n_left * sum(periods_per_cell(plan.spec)),
         seconds=seconds,
         how=how,
         n_bytes=plan.n_bytes,

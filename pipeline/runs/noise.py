@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.layout.cells import CellMap
+from pipeline.layout.plan import Plan
 from pipeline.motion.noisy import Noisy
 from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import STEPS_PER_PERIOD, NoiseTable
 from pipeline.specification.problems import SpecError
-from pipeline.specification.spec import Spec
 from pipeline.store.run import RunDirectory
 
 SAMPLE, PERIODS = 32, 4
@@ -25,7 +25,7 @@ ORDER, ORDER_OF_OWN = 1.5, 1.0
 """Strong order of the method, and where a strength depends on its own state: for the step that a message proposes."""
 
 
-def check_steps(spec: Spec) -> None:
+def check_steps(plan: Plan) -> None:
     """Refuse a run with noise whose steps are too long for a layer of its equations or for its tolerance.
 
     `SAMPLE` cells, evenly spread over the run, are integrated for some periods. The run is refused if the largest
@@ -37,10 +37,10 @@ def check_steps(spec: Spec) -> None:
     SpecError
         With the step's length, the bound and the number of steps that fits.
     """
-    motion = spec.motion
+    spec, motion = plan.spec, plan.spec.motion
     if not isinstance(motion, Noisy):
         return
-    inputs = _sample(spec)
+    inputs = _sample(plan.cells)
     if problem := _stiff_problem(motion, inputs):
         raise SpecError([problem])
     few = min(PERIODS, spec.integration.n_transient + spec.integration.n_keep)
@@ -59,9 +59,9 @@ def check_steps(spec: Spec) -> None:
         )
 
 
-def warn_of_steps(spec: Spec, run: RunDirectory, echo: Callable[[str], None]) -> None:
+def warn_of_steps(run: RunDirectory, echo: Callable[[str], None]) -> None:
     """Print a warning if cells of a finished run have a strong error above ``noise.tolerance``."""
-    motion = spec.motion
+    motion = run.spec.motion
     if not isinstance(motion, Noisy):
         return
     error, tolerance = run.cube()["strong_error"].values, motion.table.tolerance
@@ -73,9 +73,8 @@ def warn_of_steps(spec: Spec, run: RunDirectory, echo: Callable[[str], None]) ->
         )
 
 
-def _sample(spec: Spec) -> Inputs:
+def _sample(cells: CellMap) -> Inputs:
     """Return the inputs of cells evenly spread over a run."""
-    cells = CellMap(spec)
     n_cells = int(np.prod(cells.shape))
     rows = np.unique(np.linspace(0, n_cells - 1, min(SAMPLE, n_cells)).astype(np.int64))
     found = []

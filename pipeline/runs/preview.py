@@ -11,12 +11,12 @@ from typing import Any
 from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.extents import size_remarks
 from pipeline.layout.own_words import dims_in_own_words
-from pipeline.layout.plan import Plan, check_space, make_plan
+from pipeline.layout.plan import Plan, check_space
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.products.registry import FIGURES
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.progress import duration, size
-from pipeline.runs.run import identity_here, ready
+from pipeline.runs.run import prepare
 from pipeline.runs.suitability import overview, unsuited
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
@@ -133,10 +133,8 @@ class Preview:
 
     Attributes
     ----------
-    spec : Spec
-        The specification, checked.
     plan : Plan
-        Tasks and arrays that follow from it.
+        The specification, with the tasks and arrays that follow from it.
     directory : str
         Place of the run.
     exists : bool
@@ -147,12 +145,16 @@ class Preview:
         Number of workers that the time is for; None for the cores of this machine.
     """
 
-    spec: Spec
     plan: Plan
     directory: str
     exists: bool
     done: frozenset[int]
     workers: int | None = None
+
+    @property
+    def spec(self) -> Spec:
+        """The specification, checked."""
+        return self.plan.spec
 
     @property
     def dims(self) -> dict[str, int]:
@@ -179,7 +181,7 @@ class Preview:
         """Time of the missing cells, measured on some of them at the first use."""
         missing = set(range(self.n_tasks)) - self.done
         share = sum(self.plan.cells_in(i) for i in missing) / self.n_cells
-        return times(self.spec, self.plan, share, len(missing), self.workers)
+        return times(self.plan, share, len(missing), self.workers)
 
     @property
     def lines(self) -> Iterator[str]:
@@ -223,12 +225,11 @@ def preview(
     """
     parsed = Spec.read(spec, smoke=smoke)
     files = open_files(out if out is not None else parsed.directory)
-    parsed = ready(parsed, files)
-    plan = make_plan(parsed)
-    info = check(files, identity_here(parsed, plan))
-    done = whole_records(info, plan) if info else set()
+    plan = prepare(parsed, files)
+    info = check(files, plan.identity)
+    done = whole_records(info) if info else set()
     check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
-    return Preview(parsed, plan, files.name, info is not None, frozenset(done), workers)
+    return Preview(plan, files.name, info is not None, frozenset(done), workers)
 
 
 def describe_plan(
@@ -242,28 +243,29 @@ def describe_plan(
     yield from preview(spec, out, workers=workers, smoke=smoke).lines
 
 
-def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
+def time_line(plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
     """Return a text line with the estimated time for a fraction `share` of a run's cells."""
-    return times(spec, plan, share, n_tasks, workers).line
+    return times(plan, share, n_tasks, workers).line
 
 
-def times(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> Times:
+def times(plan: Plan, share: float, n_tasks: int, workers: int | None) -> Times:
     """Estimate the time for a fraction `share` of a run's cells, in `n_tasks` tasks."""
     from pipeline.compute.execute import default_workers
 
     if not share:
         return Times(0.0, 0.0, "time: nothing is left to compute")
-    found = estimate(spec, plan)
-    writing_s = writing_seconds(spec, plan)
+    found, writing_s = estimate(plan), writing_seconds(plan)
     seconds = share * found.core_seconds + n_tasks * writing_s
     used = default_workers() if workers is None else workers
     cores, by_clock = max(1, min(used, n_tasks)), wall_seconds(seconds, n_tasks, used)
-    bound = "about" if spec.refine is None else "at most"
+    bound = "about" if plan.spec.refine is None else "at most"
     compiled = f"; compiling its kernel took {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     whole = duration(found.core_seconds)
     rests = f"{found.how}; writing a task takes {1000 * writing_s:.0f} ms{compiled}"
     more = (
-        "" if spec.motion.obstacle else f"; after it, analyse attractors may extend cells for up to {whole} of one core"
+        ""
+        if plan.spec.motion.obstacle
+        else f"; after it, analyse attractors may extend cells for up to {whole} of one core"
     )
     line = f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}){more}"
     return Times(seconds, by_clock, line)

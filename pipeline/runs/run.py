@@ -14,8 +14,7 @@ from magpend_core.models.imported import origin
 from pipeline.layout.conventions import unit_remarks
 from pipeline.layout.evaluation import check_starts
 from pipeline.layout.extents import size_remarks, with_sizes
-from pipeline.layout.identity import identity_of
-from pipeline.layout.plan import Plan, check_plan, check_space, make_plan
+from pipeline.layout.plan import Plan, check_space, make_plan
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.stopping import InterruptedRunError, stoppable
@@ -36,7 +35,7 @@ from pipeline.store.view import VERIFY, checks_chunks
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
 
-__all__ = ["InterruptedRunError", "carry_out", "identity_here", "run"]
+__all__ = ["InterruptedRunError", "carry_out", "run"]
 
 Echo = Callable[[str], None]
 Sources = Sequence[tuple[str, str]]
@@ -99,50 +98,49 @@ def run(
     from pipeline.compute.clients import Where
 
     parsed = Spec.read(spec, smoke=smoke)
-    text = parsed.text
     files = open_files(out if out is not None else parsed.directory)
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
-    parsed = ready(parsed, files)
-    for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
+    plan = prepare(parsed, files)
+    for remark in (*plan.spec.model.flow.remarks, *unit_remarks(plan.spec.model)):
         echo(f"warning: {remark}")
-    for line in size_remarks(parsed):
+    for line in size_remarks(plan.spec):
         echo(line)
-    carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
+    carry_out(plan, files, workers=workers, where=where, echo=echo)
     finished = RunDirectory.open(files)
-    warn_of_steps(parsed, finished, echo)
+    warn_of_steps(finished, echo)
     return finished
 
 
-def ready(spec: Spec, files: Files) -> Spec:
-    """Check what a specification computes, and return it with the sizes of its states.
+def prepare(spec: Spec, files: Files) -> Plan:
+    """Check what a specification computes, and plan it with the sizes of its states.
 
     The sizes are those that the run in the directory keeps, if there is one.
 
     Raises
     ------
     SpecError
-        If the equations have no value at the starts, or if steps of noise are too long.
+        If the equations have no value at the starts, if steps of noise are too long, or if the run is too large.
     """
     check_starts(spec)
     try:
         kept = read_run(files).parsed_spec() if is_run(files) else None
     except (DamagedError, RefusedError, OSError):
         kept = None
-    spec = with_sizes(spec, kept)
-    check_steps(spec)
-    return spec
+    plan = make_plan(with_sizes(spec, kept), spec.text)
+    check_steps(plan)
+    return plan
 
 
 def carry_out(
-    spec: Spec, text: str, files: Files, *, workers: int | None, where: Where, echo: Echo, sources: Sources = ()
+    plan: Plan, files: Files, *, workers: int | None, where: Where, echo: Echo, sources: Sources = ()
 ) -> None:
-    """Compute the missing tasks of a specification in a run directory, which is created if it does not exist.
+    """Compute the missing tasks of a plan in a run directory, which is created if it does not exist.
 
     Parameters
     ----------
-    spec, text
-        The specification, and the TOML text that it was read from.
+    plan
+        Plan of the run.
     files
         Files of the run directory.
     workers, echo
@@ -159,59 +157,36 @@ def carry_out(
     """
     from pipeline.compute import clients
 
-    plan = make_plan(spec)
-    identity = identity_here(spec, plan)
-    if check(files, identity) is None:
+    if check(files, plan.identity) is None:
         check_space(plan, files.local)
         clients.reach(where)  # before anything is created
-        _compile(spec, echo)
+        _compile(plan, echo)
     with stoppable(files.name), files.lock() as alone:
         is_alone = alone is not False
-        info = establish(files, spec, plan, identity, text, echo, alone=is_alone)
-        commits = sound_commits(info, plan, echo, alone=is_alone)
-        _complete(info, spec, plan, commits, workers, where, echo, sources)
+        info = establish(files, plan, echo, alone=is_alone)
+        commits = sound_commits(info, echo, alone=is_alone)
+        _complete(info, commits, workers, where, echo, sources)
 
 
-def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """Return everything that decides the numbers and the layout of a run.
-
-    Raises
-    ------
-    SpecError
-        If the run is too large, see `check_plan`.
-    """
-    check_plan(plan)
-    return identity_of(spec, plan)
-
-
-def _complete(
-    info: RunInfo,
-    spec: Spec,
-    plan: Plan,
-    commits: Records,
-    workers: int | None,
-    where: Where,
-    echo: Echo,
-    sources: Sources = (),
-) -> None:
+def _complete(info: RunInfo, commits: Records, workers: int | None, where: Where, echo: Echo, sources: Sources) -> None:
     """Compute all tasks of a run that are not committed."""
     from pipeline.compute import clients, execute, task
 
-    packer = Packer(info, plan, commits)
+    plan, packer = info.plan, Packer(info, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
-        write_copy(info, plan, commits)
+        write_copy(info, commits)
         echo(f"{info.name} is complete; nothing to do.")
         return
     remove_copy(info)
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     check_space(plan, info.files.local, plan.n_cells - before)
     echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
-    for line in start_remarks(spec.initial_conditions):
+    for line in start_remarks(plan.spec.initial_conditions):
         echo(line)
     clients.reach(where)
-    _compile(spec, echo)
-    job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
+    _compile(plan, echo)
+    job = partial(task.run_task, info.files.place, info.digest, origin=origin(plan.spec.model))
     if sources:
         job = partial(job, sources=tuple(sources))
     started = time.perf_counter()
@@ -234,38 +209,39 @@ def _complete(
                 log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
                 packer.add(result["task"])
                 progress.add(result["cells"])
-    _require_all(info, plan, echo)
+    _require_all(info, echo)
 
 
-def _compile(spec: Spec, echo: Echo) -> None:
+def _compile(plan: Plan, echo: Echo) -> None:
     """Compile what a run needs, which also checks its model; do nothing for what is compiled already."""
     from pipeline.compute import task
 
-    seconds = task.warm_up(spec)
+    seconds = task.warm_up(plan)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
 
 
-def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
+def _require_all(info: RunInfo, echo: Echo) -> None:
     """Raise IncompleteError unless every task is committed; remove the files that stopped tasks left."""
-    commits, problems = damaged_records(info, plan, contents=False)
-    absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
+    commits, problems = damaged_records(info, contents=False)
+    n_tasks = info.plan.n_tasks
+    absent = [i for i in range(n_tasks) if i not in commits or name_of(i) in problems]
     if absent:
         why = f" {next(iter(problems.values()))}." if problems else ""
         raise IncompleteError(
-            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed but are not committed "
+            f"{info.name}: {len(absent)} of {n_tasks} tasks were computed but are not committed "
             f"here (the first is {absent[0]}).{why} Every worker must see this folder under this path, "
             "and have space to write. Then give the same command again; it computes only these tasks."
         )
-    sweep(info, plan, commits, echo)
-    write_copy(info, plan, commits)
+    sweep(info, commits, echo)
+    write_copy(info, commits)
 
 
 _LONG_SECONDS = 5.0
 _NAMED = 10
 
 
-def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
+def sound_commits(info: RunInfo, echo: Echo, *, alone: bool = True) -> Records:
     """Return the commit records of all undamaged tasks; damaged tasks are discarded, to be computed again.
 
     Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
@@ -274,8 +250,8 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) 
 
     Parameters
     ----------
-    info, plan
-        The run and its plan.
+    info
+        The run.
     echo
         Function that prints a line about each task that is computed again, with the reason.
     alone
@@ -284,7 +260,7 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) 
     """
     started = time.perf_counter()
     contents = checks_chunks()
-    records, damaged = damaged_records(info, plan, contents=contents)
+    records, damaged = damaged_records(info, contents=contents)
     seconds = time.perf_counter() - started
     if contents and seconds > _LONG_SECONDS:
         echo(
@@ -296,7 +272,7 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) 
         echo(f"and {len(damaged) - _NAMED} more")
     if damaged:
         withdraw(info, damaged)
-        records, _ = scan(info, plan)
+        records, _ = scan(info)
     if alone:
-        sweep(info, plan, records, echo)
+        sweep(info, records, echo)
     return records

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.layout.plan import make_plan
 from pipeline.store.checking import ODD, Verification, verify
 from pipeline.store.commits import withdraw
 from pipeline.store.files import ASIDE, DERIVED
@@ -38,16 +37,14 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
         With `repair`, if something is damaged and a run is writing to the directory.
     """
     info = read_run(directory)
-    spec = info.parsed_spec()
-    plan = make_plan(spec)
-    found = verify(info, plan)
+    found = verify(info)
     if found.sound or not repair:  # an intact run may lie where nobody may write
         return found
     with info.files.lock():
-        found = verify(info, plan)
+        found = verify(info)
         for key in found.odd:
             info.files.move_aside(key)
-        rest = rebuild_skeleton(info, spec, plan)
+        rest = rebuild_skeleton(info)
         withdraw(info, found.damaged)
         if found.copies:
             remove_copy(info)

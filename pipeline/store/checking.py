@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from pipeline.layout.plan import Plan
 from pipeline.products.reporting import report
 from pipeline.store.commits import absent_objects, leftover_keys, scan
 from pipeline.store.errors import DamagedError
@@ -42,15 +41,15 @@ class Verification:
         return not (self.damaged or self.skeleton or self.derived or self.odd or self.copies)
 
 
-def verify(info: RunInfo, plan: Plan) -> Verification:
+def verify(info: RunInfo) -> Verification:
     """Compare every stored file of a run with its recorded sha256; return what is damaged or left over."""
     info.files.refuse_links(CUBE)
-    records, damaged = damaged_records(info, plan, contents=True)
+    records, damaged = damaged_records(info, contents=True)
     n_whole = sum(name_of(index) not in damaged for index in records)
-    leftovers = [key.removeprefix(f"{CUBE}/") for key in leftover_keys(info, plan, records)]
+    leftovers = [key.removeprefix(f"{CUBE}/") for key in leftover_keys(info, records)]
     named = {f"{COMMITS}/{name}" for name in damaged}
     return Verification(
-        n_tasks=plan.n_tasks,
+        n_tasks=info.plan.n_tasks,
         n_committed=n_whole,
         damaged=dict(sorted(damaged.items())),
         skeleton=skeleton_problems(info),
@@ -75,21 +74,21 @@ def name_of(index: int) -> str:
     return marker_key(index).removeprefix(f"{COMMITS}/")
 
 
-def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
+def damaged_records(info: RunInfo, *, contents: bool) -> tuple[Records, dict[str, str]]:
     """Return the valid commit records of a run's tasks, and the problems of the damaged records by file name.
 
     A record is damaged, too, if a file that it lists is missing or has changed: in its content, or, without `contents`,
     in its size.
     """
-    records, rejected = scan(info, plan)
+    records, rejected = scan(info)
     damaged = {name: f"{COMMITS}/{name}: {problem}" for name, problem in rejected.items()}
     found = _changed_objects(info, records) if contents else absent_objects(info, records)
     return records, damaged | {name_of(index): problem for index, problem in found.items()}
 
 
-def whole_records(info: RunInfo, plan: Plan) -> frozenset[int]:
+def whole_records(info: RunInfo) -> frozenset[int]:
     """Return the tasks with a valid commit record whose files all exist with their sizes."""
-    records, damaged = damaged_records(info, plan, contents=False)
+    records, damaged = damaged_records(info, contents=False)
     return frozenset(index for index in records if name_of(index) not in damaged)
 
 

@@ -60,9 +60,7 @@ _MOST_SCANS = 100
 # ---- writing -----------------------------------------------------------------------------------
 
 
-def write_task(
-    info: RunInfo, plan: Plan, index: int, values: Mapping[str, np.ndarray], counts: Mapping[str, int]
-) -> None:
+def write_task(info: RunInfo, index: int, values: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> None:
     """Write the results of a task, then the commit record that proves them complete.
 
     Arrays have the shape of the task's block followed by the variable's own dims; `counts` has the number of cells by
@@ -72,12 +70,12 @@ def write_task(
     the metadata of a variable have changed since the set-up, and `RefusedError` if the run directory was removed
     meanwhile.
     """
-    info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
+    info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in info.plan.variables), COMMITS)
     cube = info.files.below(CUBE)
-    _require_metadata(info, plan)
+    _require_metadata(info)
     objects: dict[str, dict[str, Any]] = {}
-    for v in plan.variables:
-        objects |= write_block(cube, plan, index, v.name, values[v.name])
+    for v in info.plan.variables:
+        objects |= write_block(cube, info.plan, index, v.name, values[v.name])
     cube.sync(objects)  # the chunks are durable before their record exists
     _require_written(cube, objects)
     # the record holds no time and no host name: its bytes do not depend on who computes the task
@@ -92,9 +90,9 @@ def write_task(
         info.files.write_once(marker_key(index), record_text(record).encode())
 
 
-def _require_metadata(info: RunInfo, plan: Plan) -> None:
+def _require_metadata(info: RunInfo) -> None:
     """Raise `DamagedError` if the metadata of a variable have changed: with them, chunks would be encoded wrongly."""
-    own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in plan.variables)}
+    own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in info.plan.variables)}
     problems = problems_of(info.files.below(CUBE), own)
     if problems:
         raise DamagedError(
@@ -165,7 +163,7 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 # ---- reading -----------------------------------------------------------------------------------
 
 
-def read_commits(info: RunInfo, plan: Plan) -> Records:
+def read_commits(info: RunInfo) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
     A record's files must all exist, and have their sizes if no record is packed. In larger runs sizes would take as
@@ -175,23 +173,23 @@ def read_commits(info: RunInfo, plan: Plan) -> Records:
     `UnreadableError` if a record or a folder exists and cannot be read: its tasks are not taken for pending, since a
     failing disk must not cause a sweep. Raise `RefusedError` if a folder is a link.
     """
-    records, _ = scan(info, plan, copies=info.files.local is None)
-    if _lost(info, plan, records):
+    records, _ = scan(info, copies=info.files.local is None)
+    if _lost(info, records):
         # another process may have withdrawn a record before its files: look at both again
-        records, _ = scan(info, plan)
-        if lost := _lost(info, plan, records):
+        records, _ = scan(info)
+        if lost := _lost(info, records):
             more = f" (and files of {len(lost) - 1} more tasks)" if len(lost) > 1 else ""
             raise DamagedError(f"{info.name}/{CUBE}/{next(iter(lost.values()))}{more}. {remedy(info.name)}")
     return records
 
 
-def _lost(info: RunInfo, plan: Plan, records: Records) -> dict[int, str]:
+def _lost(info: RunInfo, records: Records) -> dict[int, str]:
     """Find committed tasks whose files are gone, by listing the folders; return the problems by task."""
     if not records.packs:
         return absent_objects(info, records)
-    cube, owners = info.files.below(CUBE), Owners(plan)
+    cube, owners = info.files.below(CUBE), Owners(info.plan)
     found: dict[int, str] = {}
-    for folder in (v.name for v in plan.variables):
+    for folder in (v.name for v in info.plan.variables):
         there = {f"{folder}/{name}" for name in _names(cube.below(folder))}
         for key in owners.keys(folder):
             index = None if key in there else owners.task(key)
@@ -226,13 +224,13 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
     return found
 
 
-def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
+def read_commit(info: RunInfo, index: int) -> Commit | None:
     """Return the valid commit record of one task, or None; the files that it lists are not checked."""
-    return scan(info, plan, (index // BLOCK,))[0].get(index)
+    return scan(info, (index // BLOCK,))[0].get(index)
 
 
 def scan(
-    info: RunInfo, plan: Plan, blocks: Container[int] | None = None, *, copies: bool = False
+    info: RunInfo, blocks: Container[int] | None = None, *, copies: bool = False
 ) -> tuple[Records, dict[str, str]]:
     """Read the folder ``commits``; return the valid commit records, and the problems of the others by file name.
 
@@ -244,11 +242,11 @@ def scan(
     sizes = folder.sizes() if copies else {}
     names = sorted(sizes) if copies else _names(folder)
     for _ in range(_MOST_SCANS):
-        found = _Scan(info, plan, blocks)
+        found = _Scan(info, blocks)
         found.singles |= copied_records(info, sizes) if sizes else {}
         vanished = found.read(folder, names)
         records = Records(info.files, info.digest, found.singles, found.packs)
-        if not vanished and len(records) == plan.n_tasks:  # nothing can be missing
+        if not vanished and len(records) == info.plan.n_tasks:  # nothing can be missing
             return records, found.rejected
         sizes = {}  # what changes meanwhile is read itself
         before, names = names, _names(folder)
@@ -275,9 +273,8 @@ def _packs(names: Iterable[str]) -> list[str]:
 class _Scan:
     """Valid commit records and packs (files of many records) found in ``commits``, and the problems of damaged ones."""
 
-    def __init__(self, info: RunInfo, plan: Plan, blocks: Container[int] | None) -> None:
+    def __init__(self, info: RunInfo, blocks: Container[int] | None) -> None:
         self._info = info
-        self._plan = plan
         self._blocks = blocks
         self.singles: dict[int, Commit] = {}
         self.packs: dict[int, Pack] = {}
@@ -319,7 +316,7 @@ class _Scan:
     def _pack(self, name: str, content: bytes) -> str:
         block = int(name.partition("-")[0]) // BLOCK
         found = read_pack(content, self._info.digest, block)
-        is_inside = (block + 1) * BLOCK <= self._plan.n_tasks
+        is_inside = (block + 1) * BLOCK <= self._info.plan.n_tasks
         if isinstance(found, Pack) and is_inside:
             self.packs[block] = found
             return ""
@@ -334,7 +331,7 @@ class _Scan:
         if isinstance(found, str):
             return found
         # a file named after one task must not hold the record of another
-        if not 0 <= found.task < self._plan.n_tasks or marker_key(found.task) != f"{COMMITS}/{name}":
+        if not 0 <= found.task < self._info.plan.n_tasks or marker_key(found.task) != f"{COMMITS}/{name}":
             return "torn or damaged"
         self.singles[found.task] = found
         return ""
@@ -353,10 +350,10 @@ def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
 # ---- files without a record --------------------------------------------------------------------
 
 
-def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
+def leftover_keys(info: RunInfo, commits: Records) -> list[str]:
     """Return the keys of files in ``cube.zarr`` and ``commits`` that belong to no valid commit record."""
     info.files.refuse_links(CUBE, COMMITS)
-    owners = Owners(plan)
+    owners = Owners(info.plan)
 
     def is_kept(key: str) -> bool:
         owner = owners.task(key)
@@ -368,13 +365,13 @@ def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
     return chunks + [key for key in records if key not in own]
 
 
-def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None) -> int:
+def sweep(info: RunInfo, commits: Records, echo: Echo | None = None) -> int:
     """Remove files in ``cube.zarr`` and ``commits`` that belong to no valid commit record; return their number.
 
     Only the holder of the lock may call this, with all valid records, as `read_commits` has just returned them. Files
     outside ``cube.zarr`` and ``commits`` stay. A link inside them is removed, its target stays.
     """
-    leftovers = leftover_keys(info, plan, commits)
+    leftovers = leftover_keys(info, commits)
     info.files.remove(leftovers)
     if leftovers and echo:
         more = f" and {len(leftovers) - 3} more" if len(leftovers) > 3 else ""
@@ -388,10 +385,9 @@ def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None)
 class Packer:
     """Counter of committed tasks that packs the records of each complete block of tasks in one file."""
 
-    def __init__(self, info: RunInfo, plan: Plan, commits: Records) -> None:
+    def __init__(self, info: RunInfo, commits: Records) -> None:
         self._info = info
-        self._plan = plan
-        self._n_whole = plan.n_tasks // BLOCK
+        self._n_whole = info.plan.n_tasks // BLOCK
         self._counts = Counter(i // BLOCK for i in commits)
         packed = {block for block, pack in commits.packs.items() if not pack.without}
         for block in sorted(set(self._counts) - packed):
@@ -404,13 +400,13 @@ class Packer:
 
     def _pack_if_whole(self, block: int) -> None:
         if block < self._n_whole and self._counts[block] >= BLOCK:
-            pack_block(self._info, self._plan, block)
+            pack_block(self._info, block)
 
 
-def pack_block(info: RunInfo, plan: Plan, block: int) -> bool:
+def pack_block(info: RunInfo, block: int) -> bool:
     """Merge the commit records of a block of tasks into one file if all of them are valid; return whether they are."""
     tasks = range(block * BLOCK, (block + 1) * BLOCK)
-    commits, _ = scan(info, plan, blocks={block})
+    commits, _ = scan(info, blocks={block})
     if not all(index in commits for index in tasks):
         return False
     pack = commits.packs.get(block)

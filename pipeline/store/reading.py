@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numcodecs.blosc
 import numpy as np
@@ -14,12 +14,10 @@ from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 from zarr.registry import get_pipeline_class, register_pipeline
 from zarr.storage import StorePath
 
-from magpend_core.models.model import Model
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.conventions import conventional, netcdf_safe
 from pipeline.layout.identity import numbered
 from pipeline.layout.own_words import rate_attribute
-from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import (
     drift_attributes,
     model_attribute,
@@ -27,7 +25,6 @@ from pipeline.layout.vocabulary import (
     overrides_attribute,
     section_attributes,
 )
-from pipeline.specification.spec import Spec
 from pipeline.store.arrays import METADATA, consolidated_metadata
 from pipeline.store.commits import read_commit
 from pipeline.store.errors import IncompleteError
@@ -39,63 +36,56 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-class OpenedRun(Protocol):
-    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.RunDirectory`."""
+def cube_of(
+    info: RunInfo,
+    commits: Mapping[int, Commit],
+    known: Mapping[str, bytes],
+    *,
+    chunks: Any = None,
+    check: bool | None = None,
+) -> xr.Dataset:
+    """Return the result cube of a run as a dataset; cells without a commit record read as pending.
 
-    @property
-    def info(self) -> RunInfo: ...  # noqa: D102
-    @property
-    def plan(self) -> Plan: ...  # noqa: D102
-    @property
-    def commits(self) -> Mapping[int, Commit]: ...  # noqa: D102
-    @property
-    def spec(self) -> Spec: ...  # noqa: D102
-    @property
-    def model(self) -> Model: ...  # noqa: D102
-    @property
-    def known(self) -> Mapping[str, bytes]: ...  # noqa: D102
-
-
-def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """Return the result cube of an opened run as a dataset; cells without a commit record read as pending."""
+    Contents of files in `known` were compared already.
+    """
     import xarray as xr
 
-    view: Any = committed_view(run.info, run.plan, run.commits, check=check, known=run.known)
-    copies = consolidated_metadata(run.known.get(METADATA, b""))
+    view: Any = committed_view(info, commits, check=check, known=known)
+    copies = consolidated_metadata(known.get(METADATA, b""))
     whole = all(name in copies for name in view.arrays())
     with quick_reading():
         ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=whole, mask_and_scale=False)
-    ds = ds[[v.name for v in run.plan.variables]]
+    ds = ds[[v.name for v in info.plan.variables]]
     words = {str(name): _texts(ds[name]) for name in ds.coords if ds[name].dtype.kind not in "biuf"}
     ds = ds.assign_coords(words)
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_directions(ds.coords["direction"]))
-    return conventional(netcdf_safe(ds.assign_attrs(_attributes(run))))
+    return conventional(netcdf_safe(ds.assign_attrs(_attributes(info))))
 
 
-def _attributes(run: OpenedRun) -> dict[str, Any]:
+def _attributes(info: RunInfo) -> dict[str, Any]:
     """Return the attributes of a run's result cube: title, model, specification, settings and provenance."""
-    info = run.info
+    spec, dims, path = info.plan.spec, info.plan.dims, info.plan.path
     attrs: dict[str, Any] = {
         "title": info.title,
         "source": f"magpend {info.versions.get('magpend', '(not installed)')}, "
         f"engine {numbered(info.identity)['versions']['engine']}",
         **info.provenance,
-        "kind": run.plan.kind,
-        "model": model_attribute(run.spec.model),
+        "kind": spec.kind,
+        "model": model_attribute(spec.model),
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
-        **overrides_attribute(run.spec.parameters.overrides),
-        **rate_attribute(run.spec.rate),
-        **section_attributes(run.model.crossing),
-        **drift_attributes(run.model),
-        **noise_attributes(run.model.disturbance),
-        **run.spec.integration.model_dump(),
-        **{f"{name}_{k}": v for name, o in run.spec.products.items() for k, v in o.plain().items()},
+        **overrides_attribute(spec.parameters.overrides),
+        **rate_attribute(spec.rate),
+        **section_attributes(spec.model.crossing),
+        **drift_attributes(spec.model),
+        **noise_attributes(spec.model.disturbance),
+        **spec.integration.model_dump(),
+        **{f"{name}_{k}": v for name, o in spec.products.items() for k, v in o.plain().items()},
     }
-    if run.plan.path is not None:
-        attrs["path"] = run.plan.dims[run.plan.path]
+    if path is not None:
+        attrs["path"] = dims[path]
     return attrs
 
 
@@ -171,34 +161,29 @@ def quick_reading() -> Iterator[None]:
 # ---- cells of one task -----------------------------------------------------------------------------
 
 
-def read_cells(
-    info: RunInfo, plan: Plan, index: int, region: tuple[slice, ...], names: Iterable[str]
-) -> dict[str, np.ndarray]:
+def read_cells(info: RunInfo, index: int, region: tuple[slice, ...], names: Iterable[str]) -> dict[str, np.ndarray]:
     """Read variables of some cells of a committed task, in slices of the cell dims that lie in the task's block.
 
     Raise `IncompleteError` if the task is not committed here, `UnreadableError` if its record cannot be read, and
     `DamagedError` if the content of a chunk has changed since it was written.
     """
-    commit = read_commit(info, plan, index)
+    commit = read_commit(info, index)
     if commit is None:
         raise IncompleteError(
             f"{info.name}: task {index}, from which another goes on, is not committed here. Every "
             "worker must see this very folder, by this path; then give the same command again."
         )
-    return _read(info, plan, index, commit, region, names)
+    return read_block(info, commit, names, region)
 
 
-def read_block(run: OpenedRun, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read variables of one committed task of an open run. The dims of the task's block come first, then the
+def read_block(
+    info: RunInfo, commit: Commit, names: Iterable[str], region: tuple[slice, ...] | None = None
+) -> dict[str, np.ndarray]:
+    """Read variables of one committed task, by default of all its cells. The dims of the cells come first, then the
     variable's.
 
     Raise `DamagedError` if the content of a chunk has changed since it was written.
     """
-    return _read(run.info, run.plan, index, run.commits[index], run.plan.task(index), names)
-
-
-def _read(
-    info: RunInfo, plan: Plan, index: int, commit: Commit, region: tuple[slice, ...], names: Iterable[str]
-) -> dict[str, np.ndarray]:
-    view = committed_view(info, plan, {index: commit}, check=True)
+    region = info.plan.task(commit.task) if region is None else region
+    view = committed_view(info, {commit.task: commit}, check=True)
     return {name: np.asarray(zarr.open_array(view, path=name, mode="r")[region]) for name in names}

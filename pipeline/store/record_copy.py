@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
-from pipeline.layout.plan import Plan
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.records import Commit, Records, line_of, marker_key, read_record
 from pipeline.store.runfile import RunInfo
@@ -24,12 +23,12 @@ def copy_text(singles: Mapping[int, Commit], digest: str) -> bytes:
     return body + seal(json.dumps({"digest": digest, "records": len(singles)}, sort_keys=True), body).encode()
 
 
-def write_copy(info: RunInfo, plan: Plan, commits: Records) -> None:
+def write_copy(info: RunInfo, commits: Records) -> None:
     """Write the copy for a complete run whose records are not all in packs; remove it for any other run.
 
     Only the holder of the lock may call this.
     """
-    if len(commits) < plan.n_tasks or not commits.singles:
+    if len(commits) < info.plan.n_tasks or not commits.singles:
         remove_copy(info)
         return
     content = copy_text(commits.singles, info.digest)

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-from pipeline.layout.plan import Plan, check_plan, make_plan
+from pipeline.layout.plan import Plan
 from pipeline.specification.spec import Spec
 from pipeline.store.commits import cube_digest, read_commits
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RUN_FILE, Files
+from pipeline.store.reading import cube_of
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo, read_run, remade
 from pipeline.store.skeleton import check_skeleton, lacking
@@ -36,15 +37,13 @@ def _short(text: str) -> str:
 class RunDirectory:
     """An opened run directory with the commit records found when it was opened: all results use the same cells."""
 
-    info: RunInfo  # content of ``run.json``
-    spec: Spec  # specification of the run
-    plan: Plan  # plan that follows from `spec`
+    info: RunInfo  # files of the directory, and content of ``run.json``
     commits: Records  # valid commit records by task
     # contents of small files of the set-up by key, which were compared with their digests in ``run.json``
     known: Mapping[str, bytes] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def open(cls, source: str | Path | Files | RunDirectory) -> RunDirectory:
+    def open(cls, source: str | Path | Files | RunDirectory) -> Self:
         """Open a run directory with its present commit records; return an opened run unchanged.
 
         Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
@@ -57,23 +56,17 @@ class RunDirectory:
             If ``run.json``, metadata or coordinates have changed since they were written.
         UnreadableError
             If a file exists and cannot be read.
-
-        Examples
-        --------
-        >>> run = RunDirectory.open("runs/quickstart")                                # doctest: +SKIP
-        >>> run.cube().section.sel(frequency=2.2, method="nearest")          # doctest: +SKIP
         """
-        if isinstance(source, RunDirectory):
+        if isinstance(source, cls):
             return source
+        if isinstance(source, RunDirectory):
+            return cls(source.info, source.commits, source.known)
         info = read_run(source)
         known = check_skeleton(info)
-        spec = info.parsed_spec()
-        plan = make_plan(spec)
-        check_plan(plan)
-        if absent := lacking(info, spec, plan):
+        if absent := lacking(info):
             place = info.files.below(RUN_FILE).name
             raise DamagedError(f"{place}: damaged (skeleton has no {', '.join(absent[:3])}); {remade(info.name)}")
-        return cls(info, spec, plan, read_commits(info, plan), known)
+        return cls(info, read_commits(info), known)
 
     @property
     def _next(self) -> tuple[str, ...]:
@@ -110,6 +103,16 @@ class RunDirectory:
         }
 
     @property
+    def plan(self) -> Plan:
+        """Plan of the run: its cells, tasks and chunks."""
+        return self.info.plan
+
+    @property
+    def spec(self) -> Spec:
+        """Specification of the run."""
+        return self.plan.spec
+
+    @property
     def directory(self) -> Path:
         """Path of the run directory; raises `RefusedError` for a run that is not in a folder of this machine."""
         return self.info.directory
@@ -141,9 +144,7 @@ class RunDirectory:
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Open the run's result cube as an xarray dataset; see `pipeline.open_run`."""
-        from pipeline.store.reading import cube_of
-
-        return cube_of(self, chunks=chunks, check=check)
+        return cube_of(self.info, self.commits, self.known, chunks=chunks, check=check)
 
 
 def open_run(path: str | Path | RunDirectory, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:

@@ -7,10 +7,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pipeline.layout.identity import digest_of, foreign_keys
+from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import FORMAT
 from pipeline.specification.models import KEPT
 from pipeline.specification.problems import SpecError, shown
@@ -25,7 +27,7 @@ from pipeline.store.stored_json import CHECKSUM, StoredRun, fits, has_seal, pars
 
 @dataclass(frozen=True)
 class RunInfo:
-    """The content of ``run.json``."""
+    """A run directory: its files, the content of its ``run.json``, and the plan that follows from it."""
 
     files: Files  # files of the run directory
     digest: str  # digest of `identity`
@@ -52,6 +54,11 @@ class RunInfo:
                 f"{self.files.below(RUN_FILE).name}: its specification cannot be read: {error.problems[0]} It was made "
                 f"by magpend {made}; read it with that version, or run its specification into another directory."
             ) from None
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Plan of the run; raises `DamagedError` if this version cannot read its specification."""
+        return make_plan(self.parsed_spec(), self.spec_text)
 
     @property
     def directory(self) -> Path:
@@ -114,15 +121,15 @@ def remade(directory: str) -> str:
 
 
 def write_run(
-    files: Files, spec: Spec, identity: Mapping[str, Any], spec_text: str, skeleton: Mapping[str, Mapping[str, Any]]
+    files: Files, plan: Plan, identity: Mapping[str, Any], skeleton: Mapping[str, Mapping[str, Any]]
 ) -> RunInfo:
     """Write ``run.json`` and return its content."""
     content = {
         "digest": digest_of(identity),
         "identity": identity,
-        "title": spec.title,
-        "spec": spec.as_dict(),
-        "spec_text": spec_text,
+        "title": plan.spec.title,
+        "spec": plan.spec.as_dict(),
+        "spec_text": plan.text,
         "versions": versions(),
         "provenance": provenance(),
         "skeleton": skeleton,

@@ -9,7 +9,6 @@ from typing import Any
 
 from pipeline.layout.identity import differences, digest_of, numbered
 from pipeline.layout.plan import Plan
-from pipeline.specification.spec import Spec
 from pipeline.store.arrays import METADATA
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.commits import withdraw
@@ -173,28 +172,19 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
     return data if isinstance(data, str) else None
 
 
-def create(place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str) -> RunInfo:
+def create(place: str | Path | Files, plan: Plan, identity: Mapping[str, Any] | None = None) -> RunInfo:
     """Create a run directory: an empty result cube (metadata and coordinates), then ``run.json``.
 
-    Call `check` first: files with the same names are replaced.
+    Call `check` first: files with the same names are replaced. An `identity` that an earlier version wrote is kept.
     """
-    files = open_files(place)
-    contents = skeleton_files(spec, plan, identity, spec_text, spec.title)
+    files, identity = open_files(place), identity or plan.identity
+    contents = skeleton_files(plan, identity)
     files.prepare(COMMITS)
     write_skeleton(files, contents, contents)
-    return write_run(files, spec, identity, spec_text, entries_of(contents))
+    return write_run(files, plan, identity, entries_of(contents))
 
 
-def establish(
-    place: str | Path | Files,
-    spec: Spec,
-    plan: Plan,
-    identity: Mapping[str, Any],
-    spec_text: str,
-    echo: Echo,
-    *,
-    alone: bool = True,
-) -> RunInfo:
+def establish(place: str | Path | Files, plan: Plan, echo: Echo, *, alone: bool = True) -> RunInfo:
     """Create a run directory or, if it exists, open it and rebuild damaged metadata and coordinates of its result cube.
 
     Only the holder of the lock may call this. If ``run.json`` or a file of the skeleton had to be rebuilt, the
@@ -202,10 +192,10 @@ def establish(
     `check`.
     """
     files = open_files(place)
-    for key in odd_keys(files, skeleton_keys(spec, plan)):
+    for key in odd_keys(files, skeleton_keys(plan)):
         echo(f"{key}: {ODD}; moved to {files.move_aside(key)}")
-    info = check(files, identity)
-    if info is not None and lacking(info, spec, plan):
+    info = check(files, plan.identity)
+    if info is not None and lacking(info):
         info = None
     names = _names(files)
     if alone:  # else another process may be writing these files now
@@ -215,7 +205,7 @@ def establish(
         files.prepare(COMMITS)
     if info is None:
         before = _holds_something(files, COMMITS)
-        info = create(files, spec, plan, identity, spec_text)
+        info = create(files, plan)
         if not before:
             return info
         echo(f"{files.below(RUN_FILE).name}: rebuilt from the specification")
@@ -223,20 +213,20 @@ def establish(
         problems = skeleton_problems(info)
         if not problems:
             return info
-        rest = rebuild_skeleton(info, spec, plan)
+        rest = rebuild_skeleton(info)
         for problem in problems:
             echo(f"{CUBE}/{problem}: rebuilt from the specification")
         if rest:
             # another version of zarr writes other metadata: write all files and digests again
-            info = create(files, spec, plan, info.identity, info.spec_text)
-    damaged = verify(info, plan).damaged
+            info = create(files, info.plan, info.identity)
+    damaged = verify(info).damaged
     withdraw(info, damaged)
     for problem in damaged.values():
         echo(f"{problem}: its task is computed again")
     return info
 
 
-def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
+def rebuild_skeleton(info: RunInfo) -> list[str]:
     """Rebuild damaged metadata and coordinates of the result cube; return the problems that remain.
 
     A file is written only if its digest is the one in ``run.json``. Another version of zarr or of magpend may
@@ -247,7 +237,7 @@ def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
         return []
     damaged = [key for key in info.skeleton if any(p.startswith(f"{key}: ") for p in problems)]
     for described in (True, False):  # cubes of earlier versions have fewer attributes
-        contents = skeleton_files(spec, plan, info.identity, info.spec_text, info.title, described=described)
+        contents = skeleton_files(info.plan, info.identity, described=described)
         entries = entries_of(contents)
         same = [key for key in damaged if entries.get(key) == info.skeleton[key]]
         write_skeleton(info.files, contents, same)

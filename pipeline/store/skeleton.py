@@ -1,7 +1,6 @@
 """Make the files of an empty result cube: the metadata of all variables, and the coordinates.
 
-Their bytes follow from the specification, the plan, the identity and the text alone, so that a damaged file
-can be rebuilt.
+Their bytes follow from the plan and the identity alone, so that a damaged file can be rebuilt.
 """
 
 from __future__ import annotations
@@ -30,23 +29,21 @@ MOST_KEPT = 1_000_000
 """Largest size in bytes of a file of the set-up whose content an opened run keeps, so that it is read once."""
 
 
-def skeleton_files(
-    spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str, *, described: bool = True
-) -> dict[str, bytes]:
+def skeleton_files(plan: Plan, identity: Mapping[str, Any], *, described: bool = True) -> dict[str, bytes]:
     """Return the contents of all files of an empty result cube (metadata and coordinates) by key, those of the group
     first.
 
     Unless `described`, variables lack the attributes of `pipeline.layout.conventions`, as in cubes of earlier versions.
     """
     attrs = {
-        "kind": plan.kind,
-        "model": model_attribute(spec.model),
+        "kind": plan.spec.kind,
+        "model": model_attribute(plan.spec.model),
         "Conventions": CONVENTIONS,
-        "title": title,
-        "spec": spec_text,
+        "title": plan.spec.title,
+        "spec": plan.text,
         "digest": digest_of(identity),
     }
-    found = [*coordinates(spec), *_labels(spec)]
+    found = [*coordinates(plan.spec), *_labels(plan.spec)]
     data: dict[str, Any] = {}
     store = MemoryStore(data)
     names = " ".join(sorted(c.name for c in found if c.dims != (c.name,)))
@@ -81,17 +78,18 @@ def _attributes(plan: Plan, found: Iterable[Coordinate], described: bool) -> dic
     return conventional_attributes(entries) if described else {n: dict(entry.attrs) for n, entry in entries.items()}
 
 
-def lacking(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
+def lacking(info: RunInfo) -> list[str]:
     """Return the keys of files of variables and coordinates that ``run.json`` should name, and does not."""
-    found = [f"{v.name}/{METADATA}" for v in plan.variables]
+    spec = info.plan.spec
+    found = [f"{v.name}/{METADATA}" for v in info.plan.variables]
     for coordinate in (*coordinates(spec), _labels(spec)[0]):
         found += [f"{coordinate.name}/{end}" for end in (METADATA, ".".join(["c", *["0"] * len(coordinate.dims)]))]
     return [key for key in found if key not in info.skeleton]
 
 
-def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
+def skeleton_keys(plan: Plan) -> list[str]:
     """Return the keys of the metadata files of all variables and coordinates of the result cube."""
-    names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
+    names = [v.name for v in (*plan.variables, *coordinates(plan.spec), *_labels(plan.spec))]
     return [f"{name}/{METADATA}" for name in names]
 
 

@@ -19,7 +19,6 @@ from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Sto
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
-from pipeline.layout.plan import Plan
 from pipeline.store.arrays import Declared
 from pipeline.store.commits import remedy
 from pipeline.store.errors import DamagedError
@@ -43,10 +42,10 @@ def checks_chunks() -> bool:
 class Shown:
     """Files of the result cube that readers see (metadata, coordinates and committed chunks), with size and sha256."""
 
-    def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
+    def __init__(self, info: RunInfo, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
-        self._owners = Owners(plan)
-        self.declared = Declared(plan)
+        self._owners = Owners(info.plan)
+        self.declared = Declared(info.plan)
         self._commits = commits
 
     def arrays(self) -> list[str]:
@@ -183,12 +182,7 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 
 
 def committed_view(
-    info: RunInfo,
-    plan: Plan,
-    commits: Mapping[int, Commit],
-    *,
-    check: bool | None = None,
-    known: Mapping[str, bytes] | None = None,
+    info: RunInfo, commits: Mapping[int, Commit], *, check: bool | None = None, known: Mapping[str, bytes] | None = None
 ) -> CommittedStore:
     """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's result
     cube.
@@ -197,5 +191,5 @@ def committed_view(
     already.
     """
     store = info.files.below(CUBE).zarr(read_only=True)
-    shown = Shown(info, plan, commits)
+    shown = Shown(info, commits)
     return CommittedStore(store, info.files, shown, checks_chunks() if check is None else check, known)

@@ -117,7 +117,6 @@ def bytes_of():
 @pytest.fixture
 def made(tmp_path, write_spec, sweep_text):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
-    from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
     from pipeline.specification.spec import Spec
     from pipeline.store.commits import write_task
@@ -125,9 +124,8 @@ def made(tmp_path, write_spec, sweep_text):
 
     path = write_spec(sweep_text)
     spec = Spec.read(path)
-    plan = make_plan(spec)
-    identity = identity_of(spec, plan)
-    info = create(tmp_path / "run", spec, plan, identity, sweep_text)
+    plan = make_plan(spec, sweep_text)
+    info = create(tmp_path / "run", plan)
 
     def values(index: int) -> dict[str, np.ndarray]:
         shape = tuple(s.stop - s.start for s in plan.task(index))
@@ -142,9 +140,9 @@ def made(tmp_path, write_spec, sweep_text):
         return made_up
 
     def commit(index: int) -> None:
-        write_task(info, plan, index, values(index), {"bounded": plan.cells_in(index)})
+        write_task(info, index, values(index), {"bounded": plan.cells_in(index)})
 
-    return SimpleNamespace(info=info, plan=plan, spec=spec, identity=identity, values=values, commit=commit)
+    return SimpleNamespace(info=info, plan=plan, spec=spec, values=values, commit=commit)
 
 
 @pytest.fixture

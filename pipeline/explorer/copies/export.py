@@ -82,7 +82,7 @@ def export_page(
         If what is read of the run is not what was written.
     """
     check_place(out, force)
-    copied = gather(ExploredRun.of(source), quantities)
+    copied = gather(ExploredRun.open(source), quantities)
     columns, layers = read_columns(copied)
     copied.objects["cells"] = pack_zipped(layers)
     add_planes(copied, PLANES_SHARE * most_bytes * 3 / 4)
@@ -216,7 +216,7 @@ def export_folder(
     try:
         with writing(out):
             temporary.mkdir()
-            exported = _write_folder(ExploredRun.of(source), temporary, quantities, most_orbits)
+            exported = _write_folder(ExploredRun.open(source), temporary, quantities, most_orbits)
         if out.exists():
             before = temporary_beside(out)
             out.rename(before)

@@ -45,7 +45,7 @@ def diagram(run: RunDirectory, x: str, y: str, at: Mapping[str, int], most_point
     on each other swept axis. Raise RequestError if one is not there, or the cells are more than `most_points`;
     8 bytes of each point go to the page.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     upwards = vertical(explored, y)
     found = points(explored, x, y, at, most_points)
     arrays = {

@@ -33,7 +33,7 @@ def events(run: RunDirectory, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     and of the cell with the same start beyond; None if the run has no such cell), and ``orbit``: whether the orbit at
     its bifurcation can be integrated (`event_orbit`). ``note`` says why there are none.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     explored.axis(x)
     found = _kept(explored, x, explored.place(at, but=x))
     if found is None:
@@ -111,7 +111,7 @@ def event_orbit(run: RunDirectory, x: str, at: Mapping[str, int], event: int) ->
 
     Raise RequestError if the event has no such orbit, ArithmeticError if the trajectory ends early.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     listed = {one["event"]: one for one in events(run, x, at)["events"]}
     if event not in listed or not listed[event]["orbit"]:
         raise RequestError(f"event = {event}: no orbit is located there.")

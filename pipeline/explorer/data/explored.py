@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from pipeline.explorer import RequestError
-from pipeline.layout.cells import CellMap, parameter_axes
+from pipeline.layout.cells import parameter_axes
 from pipeline.layout.own_words import with_plain_names
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
 from pipeline.motion.steady import Inputs
@@ -22,7 +22,6 @@ from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     import xarray as xr
 
@@ -52,14 +51,6 @@ class ExploredRun(RunDirectory):
     _opened: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     _lock: Any = field(default_factory=threading.RLock, compare=False, repr=False)
 
-    @classmethod
-    def of(cls, source: str | Path | RunDirectory) -> ExploredRun:
-        """Open a run directory for the explorer, or convert a run that is open already."""
-        run = RunDirectory.open(source)
-        if isinstance(run, cls):
-            return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(RunDirectory)})
-
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Return the run's result cube as a lazy dataset; each chunk is verified when it is read."""
         if chunks is not None or check is not None:
@@ -81,12 +72,12 @@ class ExploredRun(RunDirectory):
 
     def bifurcation_curves(self) -> xr.Dataset | None:
         """Return the stored bifurcation curves of this run, or of the run named for them; None if there are none."""
-        return self.kept("curves") if self.curves is None else ExploredRun.of(self.curves).kept("curves")
+        return self.kept("curves") if self.curves is None else ExploredRun.open(self.curves).kept("curves")
 
     def refreshed(self) -> ExploredRun:
         """Return the run as it is now, with the cells and results that were added since it was opened."""
         if not self.complete:
-            return replace(ExploredRun.of(RunDirectory.open(self.info.files)), curves=self.curves)
+            return replace(ExploredRun.open(self.info.files), curves=self.curves)
         if self._derived_names() == self.remembered("derived names", self._derived_names):
             return self
         # the cells of a complete run stay as they are
@@ -194,4 +185,4 @@ class ExploredRun(RunDirectory):
 
     def inputs(self, index: Mapping[str, int]) -> Inputs:
         """Return the inputs of a cell's integration: packed parameters, frequency and initial state."""
-        return CellMap(self.spec).inputs(tuple(slice(index[d], index[d] + 1) for d in self.plan.dims))
+        return self.plan.cells.inputs(tuple(slice(index[d], index[d] + 1) for d in self.plan.dims))

@@ -158,7 +158,7 @@ def orbit(run: RunDirectory, cell: int, point: int, *, linearised: bool = True) 
     early.
     """
     usual = 10  # drive periods, or returns, that are shown of a motion that does not close
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     if problem := run.spec.motion.refusal("an orbit"):
         raise RequestError(f"{run.name}: {problem}")
     found = cell_of(explored, cell)

@@ -47,7 +47,7 @@ def curves(run: RunDirectory, x: str, at: Mapping[str, int]) -> dict[str, Any]:
     Each of ``curves`` has a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x`` rising, and
     ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     axis, place = explored.axis(x), explored.place(at, but=x)
     found = [*_cube_exponents(explored, x, place), *_attractor_curves(explored, x, place)]
     for one in found:
@@ -137,7 +137,7 @@ def branches(run: RunDirectory, x: str, y: str, at: Mapping[str, int]) -> dict[s
     ``branches`` have segments of one stability, cut where an angle wraps; ``note`` says why there is nothing. Branches
     that were followed at other values than `at` are left out; extremes have none.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     place, upwards = explored.place(at, but=x), vertical(explored, y)
     explored.axis(x)
     kept = explored.kept_each("branches")
@@ -225,7 +225,7 @@ def attractors(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
 
     ``note`` says how to get them, where they are not known.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     place = explored.place(at)
     found = explored.kept("attractors")
     if found is None:
@@ -271,7 +271,7 @@ def disturbances(run: RunDirectory, at: Mapping[str, int]) -> dict[str, Any]:
     ``shortest`` (of all states, at the section); ``notes`` say how to get what is not stored for this point. States are
     lists in the order of the model's.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     place = explored.place(at)
     shocks = next((list(_shocks(explored, one)) for one in _here(explored, "resilience", place)), None)
     edges = [edge for one in _here(explored, "edge", place) for edge in _edges(one)]

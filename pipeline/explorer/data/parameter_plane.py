@@ -31,7 +31,7 @@ def parameter_plane(run: RunDirectory) -> dict[str, Any]:
     ``axes`` are across and upwards, ``points`` those of codimension two; ``map`` has values of both axes, the number of
     attractors at each point, and colours; ``note`` says why there are no curves.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     found = explored.bifurcation_curves()
     if found is None:
         return {"axes": [], "curves": [], "points": [], "map": None, "note": NOTHING}
@@ -99,7 +99,7 @@ def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
 
     Raise RequestError if there is no such point, ArithmeticError if the trajectory ends early.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     found = explored.bifurcation_curves()
     n_curves = 0 if found is None else found.sizes["curve"]
     if found is None or not 0 <= curve < n_curves:
@@ -111,7 +111,7 @@ def curve_orbit(run: RunDirectory, curve: int, point: int) -> bytes:
         raise RequestError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
     if CURVE_KINDS[int(found["kind"][curve])] == HOMOCLINIC:
         raise RequestError(f"curve {curve} has homoclinic orbits, which never return to the section.")
-    source = explored if explored.curves is None else ExploredRun.of(explored.curves)
+    source = explored if explored.curves is None else ExploredRun.open(explored.curves)
     parameters, clock_hz = _parameters_at(source, found.isel(curve=curve, point=point))
     state, period = found["section"].values[curve, point], int(found["orbit_period"][curve])
     return packed_orbit(source, parameters, clock_hz, state, period, NAMES[CURVE_KINDS[int(found["kind"][curve])]])

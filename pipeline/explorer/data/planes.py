@@ -40,7 +40,7 @@ class Plane:
 
 def plane(run: RunDirectory, at: Mapping[str, int]) -> bytes:
     """Return the labelled plane of initial states at a parameter point, packed for the page."""
-    found = plane_of(ExploredRun.of(run), at)
+    found = plane_of(ExploredRun.open(run), at)
     arrays = {name: getattr(found, name) for name in ("u", "v", "label", "starts", "start_label")}
     attrs = {
         "states": list(found.states),

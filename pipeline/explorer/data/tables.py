@@ -45,7 +45,7 @@ def table(run: RunDirectory, kind: str, asked: Asked, form: str = "csv") -> byte
         raise RequestError(unknown_name("view", kind, list(_TABLES)))
     if form not in FORMATS:
         raise RequestError(unknown_name("format", form, list(FORMATS)))
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     ds = _TABLES[kind](explored, asked)
     ds = ds.assign_attrs({"title": f"{kind} of a run", **ds.attrs})
     return _csv(ds) if form == "csv" else _netcdf(explored, ds)

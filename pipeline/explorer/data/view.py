@@ -34,13 +34,13 @@ def describe_view(run: RunDirectory, live: bool) -> dict[str, Any]:
     Only coordinates, the cells' status and what is kept in ``derived/`` are read. `live` says whether the page can have
     trajectories integrated while one watches. Values of states and parameters are in the model's own units.
     """
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     return {
         "format": VIEW_FORMAT,
         "title": run.info.title,
         "name": _name(run),
         "digest": run.digest,
-        "kind": run.plan.kind,
+        "kind": run.spec.kind,
         "version": _version(),
         "complete": run.complete,
         "cells": _cells(explored),

@@ -25,7 +25,7 @@ from pipeline.explorer.data.orbits import orbit_series
 from pipeline.explorer.live.catalog import Catalog, Entry, Known
 from pipeline.explorer.live.jobs import PATIENCE_S
 from pipeline.explorer.live.settling import LiveFlight, Place
-from pipeline.layout.cells import CellMap, parameter_axes
+from pipeline.layout.cells import parameter_axes
 from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import ABSENT, ATTRACTS, EQUILIBRIUM, STABILITIES, axis_name
 from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
@@ -173,7 +173,7 @@ class LiveRun:
         problem = live_problem(run)
         if problem is not None:
             raise RequestError(problem)
-        self.run, self.model, self.spec = ExploredRun.of(run), run.model, run.spec
+        self.run, self.model, self.spec = ExploredRun.open(run), run.model, run.spec
         self.integration = run.spec.integration
         self.threads = max(1, min(os.cpu_count() or 1, most))
         self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
@@ -326,7 +326,7 @@ class LiveRun:
 
     def first_start(self) -> tuple[Place, np.ndarray]:
         """Return the parameter point and the initial state of the run's first cell."""
-        cells = CellMap(self.spec)
+        cells = self.run.plan.cells
         block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
         inputs = cells.inputs(block)
         values = dict(zip(self.spec.values.names, map(float, inputs.parameters[0, 0]), strict=True))

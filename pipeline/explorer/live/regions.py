@@ -23,7 +23,7 @@ from pipeline.explorer.live.jobs import PATIENCE_S, Job
 from pipeline.explorer.live.messages import Region, RunRequest
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.identity import canonical
-from pipeline.layout.plan import check_plan, make_plan
+from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name
 from pipeline.runs.status import state
 from pipeline.runs.zoom import Changes, to_toml, zoom
@@ -44,7 +44,7 @@ _PACKAGES = Path(__file__).parents[3]
 
 def zoomed(run: RunDirectory, region: Region) -> tuple[Spec, list[str]]:
     """Return the specification for a selected region, and notes on the parts of it that lie outside the run."""
-    ExploredRun.of(run).check_axes(region.at)
+    ExploredRun.open(run).check_axes(region.at)
     return zoom(run.spec, changes_of(run, region))
 
 
@@ -94,7 +94,7 @@ def _names(run: RunDirectory, region: Region, swept: list[str]) -> tuple[str, st
         return first, None
     # a state over a parameter is the diagram's vertical axis, not a range of starts
     if given[1] not in (*known, *states):
-        vertical(ExploredRun.of(run), names[1])
+        vertical(ExploredRun.open(run), names[1])
     fits = given[1] in known and (given[1] in swept or first in states)
     return first, given[1] if fits else None
 
@@ -135,19 +135,19 @@ class RegionRunner:
         """Compute the run of the region that a job describes, and report its progress."""
         request = job.request
         assert isinstance(request, RunRequest)
-        spec = self._checked(request)
-        out = self._live.run.directory.resolve().parent / region_name(self._live.run, spec)
+        plan = self._checked(request)
+        out = self._live.run.directory.resolve().parent / region_name(self._live.run, plan.spec)
         if not self._busy.acquire(blocking=False):
             raise RequestError("a region is being run already; cancel it, or wait.")
         try:
             with tempfile.TemporaryDirectory(prefix="magpend-region-") as folder:
                 path = Path(folder) / "region.toml"
-                path.write_text(to_toml(spec), "utf-8")
-                self._watch(job, spec, path, out)
+                path.write_text(to_toml(plan.spec), "utf-8")
+                self._watch(job, plan, path, out)
         finally:
             self._busy.release()
 
-    def _checked(self, request: Region) -> Spec:
+    def _checked(self, request: Region) -> Plan:
         run = self._live.run
         if run.info.files.local is None:
             raise RequestError(f"{run.name} lies in an object store; download the specification and run it.")
@@ -157,20 +157,17 @@ class RegionRunner:
                 f"the model is the Python object {reference[KEY]}, which running would import; download the "
                 "specification and run it yourself."
             )
-        spec, _ = zoomed(run, request)
-        plan = make_plan(spec)
-        check_plan(plan)
+        plan = make_plan(zoomed(run, request)[0])
         if plan.n_cells > MOST_OF_REGION:
             raise RequestError(
                 f"the region has {plan.n_cells} cells; the explorer runs at most {MOST_OF_REGION}: download the "
                 "specification and run it yourself."
             )
-        return spec
+        return plan
 
-    def _watch(self, job: Job, spec: Spec, path: Path, out: Path) -> None:
+    def _watch(self, job: Job, plan: Plan, path: Path, out: Path) -> None:
         """Run a region's specification in a process of its own; report its progress, and wait for its end."""
         every_s = 0.4  # how often progress is looked at [s]
-        plan = make_plan(spec)
         words = ["run", str(path), "--out", str(out), *(["--workers", "0"] if plan.n_tasks == 1 else [])]
         job.tell("progress", done=0, total=plan.n_cells, name=out.name)
         with (path.parent / "said").open("w+b") as said, _group(words, path.parent, said) as process:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pipeline.explorer.widget import Explorer
     from pipeline.runs.status import State
     from pipeline.store.checking import Verification
-    from pipeline.store.files import Files
 
 
 class Run(Analyses, RunDirectory):
@@ -40,11 +39,11 @@ class Run(Analyses, RunDirectory):
     Attributes
     ----------
     info : RunInfo
-        Content of ``run.json``.
+        Files of the directory, and content of ``run.json``.
     spec : Spec
         Specification of the run.
     plan : Plan
-        Plan that follows from `spec`.
+        Plan of the run: its cells, tasks and chunks.
     commits : Records
         Valid commit records by task.
 
@@ -64,24 +63,6 @@ class Run(Analyses, RunDirectory):
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *ANALYSES.listed})
-
-    @classmethod
-    def open(cls, source: str | Path | Files | RunDirectory) -> Self:
-        """Open a run directory with its present commit records; return an opened run unchanged.
-
-        Raises
-        ------
-        RefusedError
-            If there is no run in `source`.
-        DamagedError
-            If ``run.json``, metadata or coordinates have changed since they were written.
-        UnreadableError
-            If a file exists and cannot be read.
-        """
-        if isinstance(source, cls):
-            return source
-        run = RunDirectory.open(source)
-        return cls(run.info, run.spec, run.plan, run.commits)
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Open the run's result cube as an xarray dataset; see `magpend.open_run`."""

@@ -16,8 +16,6 @@ from magpend_core.sections import run_branches
 from pipeline import open_run
 from pipeline.compute.refinement import NO_ORBIT, SAME_ORBIT_CLOSURES, Orbits, infer, refine
 from pipeline.compute.task import compute
-from pipeline.layout.cells import CellMap
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import REFINEMENT, base_variables
 from pipeline.runs.status import state
@@ -274,7 +272,7 @@ def test_compute__one_and_four_grid_dims(lengths):
     plan = make_plan(spec)
     assert plan.shape == (2, *lengths)
     block = plan.task(0)
-    values, expected = (compute(s, CellMap(s), block) for s in (spec, full))
+    values, expected = (compute(make_plan(s), block) for s in (spec, full))
     assert values["status"].shape == tuple(s.stop - s.start for s in block)
     own = values["status"] != Status.INFERRED
     assert not own.all()
@@ -322,7 +320,7 @@ def test_identity__refinement_counts():
     for change in ("refine = 8\n", "refine = 4\n", ""):
         spec = Spec.parse(tomllib.loads(text.replace("refine = 8\n", change)))
         assert Spec.parse(spec.as_dict()) == spec
-        found[change] = identity_of(spec, make_plan(spec))
+        found[change] = make_plan(spec).identity
     assert found["refine = 8\n"]["refinement"] == REFINEMENT
     assert "refinement" not in found[""]
     assert "refine" not in found[""]["spec"]["initial_conditions"]

@@ -97,7 +97,7 @@ def test_disturbances__refuse_an_index_off_the_axis(wells):
 
 @pytest.mark.slow
 def test_disturbances__are_answered_and_copied(wells):
-    explored, at = ExploredRun.of(wells), {"amplitude": SMOOTH}
+    explored, at = ExploredRun.open(wells), {"amplitude": SMOOTH}
     answer = ANSWERS["disturbances"].give(explored, Query({"at.amplitude": str(SMOOTH)}), None)
     assert json.loads(answer.content) == disturbances(explored, at)
     kept = gather(explored).about["answers"]["disturbances"]

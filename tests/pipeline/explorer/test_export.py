@@ -129,7 +129,7 @@ def test_fit__gives_numbers_that_are_those_of_what_it_keeps():
 
 
 def test_choose__an_orbit_for_each_attractor_else_the_nearest(run):
-    explored = ExploredRun.of(run)
+    explored = ExploredRun.open(run)
     shape = run.plan.shape
     frequency = np.indices(shape)[0].ravel()
     count = np.full(run.plan.n_cells, 3)

@@ -38,7 +38,7 @@ def ask(run, name, **words):
 
 @pytest.mark.slow
 def test_answers__of_a_map_name_iterations_and_no_frequency(henon):
-    run = ExploredRun.of(RunDirectory.open(henon))
+    run = ExploredRun.open(RunDirectory.open(henon))
     view = json.loads(ask(run, "view").content)
     assert (view["model"]["period"], view["model"]["time"], view["model"]["forced"]) == (
         "iteration",

@@ -39,7 +39,7 @@ def test_line__its_own_curves(bent):
 def test_plane__curves_of_another_run(bent):
     """Over the number of attractors, which two folds bound."""
     line, plane = bent
-    explored = replace(ExploredRun.of(plane), curves=RunDirectory.open(line))
+    explored = replace(ExploredRun.open(plane), curves=RunDirectory.open(line))
     found, attractors = parameter_plane(explored), dense(derive(plane, "attractors"))
     assert len(found["curves"]) >= 1
     number = np.array(found["map"]["number"]).reshape(len(found["map"]["y"]), len(found["map"]["x"]))
@@ -57,7 +57,7 @@ def test_no_curves(bent):
     found = parameter_plane(RunDirectory.open(plane))
     assert found["curves"] == []
     assert "magpend analyse curves" in found["note"]
-    assert not describe_view(ExploredRun.of(plane), False)["has"]["curves"]
+    assert not describe_view(ExploredRun.open(plane), False)["has"]["curves"]
 
 
 @pytest.mark.slow

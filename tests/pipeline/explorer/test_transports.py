@@ -146,7 +146,7 @@ def test_answers__refuse_in_the_same_sentence(ask, name, words, body, said):
 
 @pytest.mark.slow
 def test_answers__are_those_of_the_run(ask, little):
-    explored = ExploredRun.of(little)
+    explored = ExploredRun.open(little)
     assert ask("diagram", DIAGRAM, None)[1] == diagram(explored, "frequency", "x", {})
     assert ask("attractors", {}, None)[1] == json.dumps(attractors(explored, {})).encode()
     assert ask("orbit", {"cell": "2", "point": "3"}, None)[1] == orbit(explored, 2, 3)

@@ -25,7 +25,6 @@ from pipeline.explorer.data.planes import plane
 from pipeline.explorer.data.tables import table
 from pipeline.explorer.data.verticals import plain
 from pipeline.explorer.data.view import describe_view
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
 from pipeline.results.ragged import dense
@@ -98,7 +97,7 @@ def flow(tmp_path_factory):
 
 @pytest.mark.slow
 def test_describe_view__says_what_stands_in_a_run(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     found = describe_view(explored, True)
     json.dumps(found, allow_nan=False)
     cube = explored.cube()
@@ -125,14 +124,14 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
 @pytest.mark.slow
 def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made):
     # of what a run of two parameters is to be followed along, a person has to say
-    assert describe_view(ExploredRun.of(sweep), False)["commands"] == {}
-    assert "basins" not in describe_view(ExploredRun.of(walk), False)["commands"]  # a walk has no basins
-    assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made.info.directory), False)["commands"].keys()
+    assert describe_view(ExploredRun.open(sweep), False)["commands"] == {}
+    assert "basins" not in describe_view(ExploredRun.open(walk), False)["commands"]  # a walk has no basins
+    assert {"attractors", "basins"} <= describe_view(ExploredRun.open(made.info.directory), False)["commands"].keys()
 
 
 @pytest.mark.slow
 def test_describe_view__reads_what_is_computed_later(walk):
-    explored = ExploredRun.of(walk)
+    explored = ExploredRun.open(walk)
     view = describe_view(explored, False)
     assert not view["has"]["basins"]
     assert view["axes"][0]["path"]
@@ -141,8 +140,8 @@ def test_describe_view__reads_what_is_computed_later(walk):
     assert explored.refreshed() is not explored
     # whoever holds an opened run may hand it over; an explored one is taken as it is
     opened = RunDirectory.open(walk)
-    assert ExploredRun.of(ExploredRun.of(opened)).digest == opened.digest
-    assert ExploredRun.of(explored) is explored
+    assert ExploredRun.open(ExploredRun.open(opened)).digest == opened.digest
+    assert ExploredRun.open(explored) is explored
 
 
 def test_plain__labels_have_no_latex():
@@ -165,7 +164,7 @@ def test_plain__labels_have_no_latex():
 @pytest.mark.parametrize("y", ["v", "energy.max"])
 def test_diagram__has_every_point_of_the_cube(sweep, x, y):
     """Cells are where their numbers say, and points are the cube's, whichever axis is horizontal."""
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     cube = explored.cube().load()
     other = "amplitude" if x == "frequency" else "frequency"
     arrays, attrs = unpack_arrays(diagram(explored, x, y, {other: 1}))
@@ -189,7 +188,7 @@ def test_diagram__has_every_point_of_the_cube(sweep, x, y):
 
 @pytest.mark.slow
 def test_diagram__colours_are_those_of_the_analyses(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
     ids = derive(sweep, "attractors")["attractor_id"].transpose("frequency", "amplitude", "x_0", "v_0").values.ravel()
     expected = ids[arrays["cell"]]
@@ -201,7 +200,7 @@ def test_diagram__colours_are_those_of_the_analyses(sweep):
 
 @pytest.mark.slow
 def test_diagram__tells_directions_and_seeds(walk):
-    explored = ExploredRun.of(walk)
+    explored = ExploredRun.open(walk)
     arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {}))
     cube = explored.cube()
     branch = arrays["cell"] % cube.sizes["branch"]
@@ -211,7 +210,7 @@ def test_diagram__tells_directions_and_seeds(walk):
 
 @pytest.mark.slow
 def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     whole, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
     part, attrs = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}, 72 * 5))
     assert (attrs["kept"], attrs["n_keep"]) == (5, 12)
@@ -225,7 +224,7 @@ def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep):
 @pytest.mark.slow
 def test_diagram__of_a_run_in_progress_has_what_is_committed(made):
     """Pending cells are there without points; after a commit and a fresh look they have them."""
-    explored = ExploredRun.of(made.info.directory)
+    explored = ExploredRun.open(made.info.directory)
     assert describe_view(explored, False)["cells"]["pending"] == made.plan.n_cells
     made.commit(0)
     assert explored.refreshed() is not explored
@@ -257,7 +256,7 @@ def some_cells(explored, n=4):
 @pytest.mark.parametrize("which", ["sweep", "walk", "flow"])
 def test_orbit__ends_where_the_cube_goes_on(which, request):
     """The first point is the section asked for, and each period ends at the cube's next one."""
-    explored = ExploredRun.of(request.getfixturevalue(which))
+    explored = ExploredRun.open(request.getfixturevalue(which))
     cells = some_cells(explored)
     assert cells
     for number in cells:
@@ -282,7 +281,7 @@ def test_orbit__ends_where_the_cube_goes_on(which, request):
 @pytest.mark.slow
 def test_orbit__agrees_with_scipy(sweep):
     """The whole path of one period is that of DOP853 on the model's own rates."""
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     number = some_cells(explored)[0]
     cell = cell_of(explored, number)
     arrays, attrs = unpack_arrays(orbit(explored, number, 3))
@@ -299,7 +298,7 @@ def test_orbit__agrees_with_scipy(sweep):
 
 @pytest.mark.slow
 def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     found = dense(derive(sweep, "attractors"), points=True)
     for number in some_cells(explored, 6):
         _, attrs = unpack_arrays(orbit(explored, number, 0))
@@ -326,7 +325,7 @@ def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
 @pytest.mark.slow
 def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
     """Polishing the cell's own section gives those that the analysis of attractors gives; first it says they come."""
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     found = dense(derive(sweep, "attractors"), points=True)
     compared = 0
     for number in some_cells(explored, 6):
@@ -340,7 +339,7 @@ def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
             assert seconds == pytest.approx(cell.period / cell.clock_hz)
             compared += 1
     assert compared
-    explored = ExploredRun.of(walk)
+    explored = ExploredRun.open(walk)
     assert explored.kept("attractors") is not None  # what branches rest on
     number = some_cells(explored)[0]
     object.__setattr__(explored, "_opened", {**explored._opened, "derived attractors": None})
@@ -353,7 +352,7 @@ def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
 
 
 def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
-    explored = ExploredRun.of(flow)
+    explored = ExploredRun.open(flow)
     _, attrs = unpack_arrays(orbit(explored, some_cells(explored)[0], 0))
     assert attrs["frequency"] is None
     assert attrs["exponents"][0] == pytest.approx(0.0, abs=1e-9)
@@ -362,7 +361,7 @@ def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
 
 def test_orbit__of_a_pending_cell_is_refused(made):
     with pytest.raises(RequestError, match="not computed yet"):
-        orbit(ExploredRun.of(made.info.directory), 0, 0)
+        orbit(ExploredRun.open(made.info.directory), 0, 0)
 
 
 def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
@@ -376,9 +375,9 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
     )
     (tmp_path / "spec.toml").write_text(text, "utf-8")
     spec = Spec.read(tmp_path / "spec.toml")
-    plan = make_plan(spec)
-    create(tmp_path / "run", spec, plan, identity_of(spec, plan), text)
-    explored = ExploredRun.of(tmp_path / "run")
+    plan = make_plan(spec, text)
+    create(tmp_path / "run", plan)
+    explored = ExploredRun.open(tmp_path / "run")
     view = describe_view(explored, False)
     assert view["commands"] == {}
     assert [v["name"] for v in view["verticals"]] == list(explored.model.state_names)
@@ -393,7 +392,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
 
 @pytest.mark.slow
 def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     found = dense(derive(sweep, "attractors"), points=True).isel(frequency=1)
     listed = curves(explored, "amplitude", {"frequency": 1})["curves"]
     json.dumps(listed, allow_nan=False)
@@ -413,7 +412,7 @@ def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
 @pytest.mark.slow
 def test_branches__lie_on_the_diagram(walk):
     """Where a branch is stable, points of the cube lie on it; every located point has its branch."""
-    explored = ExploredRun.of(walk)
+    explored = ExploredRun.open(walk)
     found = branches(explored, "amplitude", "x", {})
     json.dumps(found, allow_nan=False)
     assert found["note"] is None
@@ -438,7 +437,7 @@ def test_branches__lie_on_the_diagram(walk):
 
 @pytest.mark.slow
 def test_attractors__are_those_of_the_point(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     here = dense(derive(sweep, "attractors"), points=True).isel(frequency=0, amplitude=2)
     found = attractors(explored, {"frequency": 0, "amplitude": 2})["attractors"]
     json.dumps(found, allow_nan=False)
@@ -453,7 +452,7 @@ def test_attractors__are_those_of_the_point(sweep):
 
 @pytest.mark.slow
 def test_plane__has_the_label_of_every_start(sweep):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     arrays, attrs = unpack_arrays(plane(explored, {"frequency": 1, "amplitude": 0}))
     assert (attrs["states"], attrs["source"]) == (["x", "v"], "basins")
     found = derive(sweep, "basins").isel(frequency=1, amplitude=0)
@@ -467,7 +466,7 @@ def test_plane__has_the_label_of_every_start(sweep):
 
 @pytest.mark.slow
 def test_plane__of_scattered_starts_lists_them(walk):
-    explored = ExploredRun.of(walk)
+    explored = ExploredRun.open(walk)
     arrays, attrs = unpack_arrays(plane(explored, {"amplitude": 1}))
     assert attrs["source"] is None
     assert arrays["label"].size == 0
@@ -483,7 +482,7 @@ def test_plane__of_scattered_starts_lists_them(walk):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["diagram", "curves", "orbit", "plane", "attractors"])
 def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
-    explored = ExploredRun.of(sweep)
+    explored = ExploredRun.open(sweep)
     at = {"frequency": 0} if kind in ("diagram", "curves") else {"frequency": 0, "amplitude": 1}
     asked = {"x": "amplitude", "y": "x", "at": at, "cell": some_cells(explored)[0], "point": 0}
     text = table(explored, kind, asked).decode()

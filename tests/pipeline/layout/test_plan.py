@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,17 +17,9 @@ from magpend_core.models import load_model
 from pipeline.layout import identity
 from pipeline.layout import plan as planning
 from pipeline.layout.cells import CellMap, coordinates, initial_states
-from pipeline.layout.identity import differences, digest_of, identity_of
+from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import base_variables, sizes_of
 from pipeline.specification.spec import Spec
-
-VARIABLES = base_variables(load_model())
-
-
-def sizes(n_keep):
-    return sizes_of(load_model(), {}, n_keep)
-
 
 ROOT = Path(__file__).parents[3]
 
@@ -38,7 +31,8 @@ SHAPES = st.lists(st.integers(1, 9), min_size=0, max_size=4)
 def test_tasks__every_cell_in_one_task(shape, wanted, data):
     path = data.draw(st.sampled_from([None, *range(len(shape))]))
     block = planning._block(tuple(shape), path, wanted)
-    plan = Plan("sweep", tuple("abcd"[: len(shape)]), tuple(shape), path, block, VARIABLES, sizes(3), 1.0)
+    cells = SimpleNamespace(dims=tuple("abcd"[: len(shape)]), shape=tuple(shape), path=path)
+    plan = Plan(None, cells, block)
     seen = np.zeros(shape, dtype=int)
     for task in plan.tasks():
         seen[task] += 1
@@ -55,8 +49,10 @@ def test_tasks__every_cell_in_one_task(shape, wanted, data):
 def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
     shape = (n_points, n_branches)
     block = planning._block(shape, 0, 16)
-    plan = Plan("continuation", ("frequency", "branch"), shape, 0, block, VARIABLES, sizes(n_keep), 1.0)
-    for variable in VARIABLES:
+    cells = SimpleNamespace(dims=("frequency", "branch"), shape=shape, path=0)
+    spec = SimpleNamespace(model=load_model(), products={}, integration=SimpleNamespace(n_keep=n_keep))
+    plan = Plan(spec, cells, block)
+    for variable in plan.variables:
         chunks = plan.chunks(variable)
         for task in plan.tasks():
             for s, c, n in zip(task, chunks, shape, strict=False):
@@ -79,7 +75,7 @@ def test_make_plan__same_on_any_machine(monkeypatch, sweep_text):
 def test_identity__what_counts(sweep_text):
     def digest(text):
         spec = Spec.parse(tomllib.loads(text))
-        return digest_of(identity_of(spec, make_plan(spec)))
+        return digest_of(make_plan(spec).identity)
 
     same = digest(sweep_text)
     assert digest(sweep_text.replace("small sweep", "another title")) == same
@@ -104,7 +100,7 @@ def test_identity__versions_of_what_is_computed(sweep_text):
     spectra = Spec.parse(tomllib.loads(f"{sweep_text}\n[products]\nlyapunov = {{}}"))
     assert set(identity.versions_of(plain)) == {"engine", "cells"}
     assert set(identity.versions_of(spectra)) == {"engine", "cells", "lyapunov"}
-    lines = differences(*(identity_of(s, make_plan(s)) for s in (plain, spectra)))
+    lines = differences(*(make_plan(s).identity for s in (plain, spectra)))
     assert any(line.startswith("versions.lyapunov: (absent)") for line in lines)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import magpend
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.files import shipped_workflows
@@ -106,7 +105,7 @@ def built():
 
 
 def identity(spec):
-    return identity_of(spec, make_plan(spec))
+    return make_plan(spec).identity
 
 
 def same_run(spec, text):

@@ -10,7 +10,6 @@ from magpend_core.status import Status
 from pipeline import open_run
 from pipeline.analysis.tipping.analysis import tipping_table
 from pipeline.analysis.tipping.delay import delay_table, lags, left_at
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
@@ -119,12 +118,12 @@ def test_spec__comes_back_and_is_the_identity():
     spec = Spec.parse(SPEC)
     assert Spec.parse(spec.as_dict(), KEPT).as_dict() == spec.as_dict()
     plan = make_plan(spec)
-    one = identity_of(spec, plan)
-    other = identity_of(Spec.parse(with_changes(drift={"l": {"to": 21.0}})), plan)
+    one = plan.identity
+    other = make_plan(Spec.parse(with_changes(drift={"l": {"to": 21.0}}))).identity
     assert one["spec"]["drift"] == {"l": {"to": LENGTH, "shape": "linear"}}
     assert one["spec"]["drift"] != other["spec"]["drift"]
     plain = Spec.parse({k: v for k, v in SPEC.items() if k not in ("drift", "axes")})
-    without = identity_of(plain, make_plan(plain))
+    without = make_plan(plain).identity
     assert "drift" not in without["spec"]
 
 

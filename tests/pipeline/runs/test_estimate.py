@@ -14,7 +14,6 @@ import pytest
 from pipeline.compute import integrate as branches
 from pipeline.compute import task
 from pipeline.compute.task import warm_up
-from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs import estimate as estimates
@@ -35,8 +34,7 @@ CLOSING = duffing(
 
 
 def read(text):
-    spec = Spec.parse(tomllib.loads(text))
-    return spec, make_plan(spec)
+    return make_plan(Spec.parse(tomllib.loads(text)))
 
 
 def test_mean_with_tail():
@@ -52,8 +50,8 @@ def test_mean_with_tail():
 
 def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
     """On a machine of which the clock goes on by what the rule of thumb says: no other time counts."""
-    spec, plan = read(CLOSING)
-    warm_up(spec)
+    plan = read(CLOSING)
+    warm_up(plan)
     clock, original = [0.0], branches.integrate
 
     def integrate(spec, inputs):
@@ -62,13 +60,12 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
         clock[0] += float((a_period * values["n_periods"]).sum())
         return values
 
-    cells = CellMap(spec)
     for block in plan.tasks():
-        task.compute(spec, cells, block, integrate=integrate)
+        task.compute(plan, block, integrate=integrate)
     true, clock[0] = clock[0], 0.0
     monkeypatch.setattr(branches, "integrate", integrate)
     monkeypatch.setattr(estimates, "time", SimpleNamespace(process_time=lambda: clock[0]))
-    found = estimate(spec, plan)
+    found = estimate(plan)
     assert true / 1.5 < found.core_seconds < 1.5 * true
     assert "until it has closed" in found.how
     assert plan.core_seconds > found.core_seconds
@@ -76,15 +73,15 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
 
 @pytest.mark.slow
 def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_text, tmp_path, monkeypatch):
-    spec, plan = read(sweep_text)
+    plan = read(sweep_text)
     original = commits.write_task
     monkeypatch.setattr(commits, "write_task", lambda *given: (time.sleep(0.2), original(*given)))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    assert writing_seconds(spec, plan) >= 0.2
+    assert writing_seconds(plan) >= 0.2
     assert list(tmp_path.iterdir()) == []
     # many cells are not tried: by the rule
     monkeypatch.setattr(estimates, "MOST_WRITTEN_CELLS", plan.n_cells - 1)
-    assert writing_seconds(spec, plan) == pytest.approx((len(plan.variables) + 1) * estimates.FILE_S)
+    assert writing_seconds(plan) == pytest.approx((len(plan.variables) + 1) * estimates.FILE_S)
 
 
 # ---- progress --------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from pipeline.layout.identity import digest_of, identity_of
+from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
 from pipeline.specification.problems import SpecError
 from pipeline.specification.recorded_drive import load_drive, parse_drive, rising_edges
@@ -132,7 +132,7 @@ def test_parse_spec__keeps_the_drive_and_reads_back_without_its_file(tmp_path):
 
 def test_identity__is_of_the_values_and_not_of_the_name(tmp_path):
     def digest(spec):
-        return digest_of(identity_of(spec, make_plan(spec)))
+        return digest_of(make_plan(spec).identity)
 
     first = parsed(tmp_path)
     write(tmp_path, EDGES, "other.csv")

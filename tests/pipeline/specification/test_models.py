@@ -14,7 +14,6 @@ from magpend_core.models.parameters import ParameterError
 from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
-from pipeline.runs.run import identity_here
 from pipeline.runs.zoom import Changes, Source, to_toml, write_zoom, zoom
 from pipeline.specification.files import model_toml
 from pipeline.specification.models import KEPT, find_model, read_model_file
@@ -265,7 +264,7 @@ def write(folder, preset="rig.toml", **fit):
 
 
 def digest(spec):
-    return digest_of(identity_here(spec, make_plan(spec)))
+    return digest_of(make_plan(spec).identity)
 
 
 def test_load_spec__reads_the_preset_beside_it_and_keeps_it_whole(tmp_path):
@@ -276,7 +275,7 @@ def test_load_spec__reads_the_preset_beside_it_and_keeps_it_whole(tmp_path):
     again = Spec.parse(spec.as_dict())
     assert again == spec
     assert again.parameters.chosen.provenance["c1"] == "fit of curve 3"
-    assert identity_here(spec, make_plan(spec))["spec"]["parameters"]["preset"]["title"] == "test rig"
+    assert make_plan(spec).identity["spec"]["parameters"]["preset"]["title"] == "test rig"
 
 
 def test_load_spec__smoke_may_choose_another_preset(tmp_path):

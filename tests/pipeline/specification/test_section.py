@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pipeline.layout.cells import CellMap, coordinates
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
@@ -62,7 +61,7 @@ def test_identity__every_key_of_the_section():
     spec = Spec.parse(SPEC)
     for change in ({"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}):
         other = Spec.parse({**SPEC, "section": {**SPEC["section"], **change}})
-        assert identity_of(spec, make_plan(spec)) != identity_of(other, make_plan(other)), change
+        assert make_plan(spec).identity != make_plan(other).identity, change
 
 
 def test_parse_spec__swept_level():

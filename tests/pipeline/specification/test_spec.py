@@ -11,7 +11,6 @@ import pytest
 import magpend
 from magpend_core.models import load_model
 from pipeline.compute.task import compute
-from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan
 from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
 from pipeline.runs.zoom import Changes, read_source, write_zoom
@@ -234,8 +233,8 @@ def spec_of(method, **more):
 
 
 def cells_of(spec):
-    cells = CellMap(spec)
-    return compute(spec, cells, tuple(slice(0, n) for n in cells.shape))
+    plan = make_plan(spec)
+    return compute(plan, tuple(slice(0, n) for n in plan.shape))
 
 
 @pytest.mark.slow

@@ -12,10 +12,7 @@ import numcodecs.blosc
 import numpy as np
 import pytest
 
-from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import derive
-from pipeline.specification.models import KEPT
-from pipeline.specification.spec import Spec
 from pipeline.store import products
 from pipeline.store.arrays import Declared
 from pipeline.store.commits import read_commits
@@ -29,7 +26,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def plan_of(directory):
-    return make_plan(Spec.parse(read_run(directory).spec, KEPT))
+    return read_run(directory).plan
 
 
 def bomb(n_bytes):
@@ -85,14 +82,14 @@ def test_declared__metadata_of_other_shapes_and_codecs(place, change, words):
 def committed(directory, key, content):
     """Put a chunk in place with a record that vouches for it, as who made the directory could."""
     opened = RunDirectory.open(directory)
-    commits = dict(read_commits(opened.info, opened.plan))
+    commits = dict(read_commits(opened.info))
     for commit in commits.values():
         if key in commit.objects:
             objects = dict(commit.objects)
             objects[key] = {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
             object.__setattr__(commit, "objects", objects)
     (directory / "cube.zarr" / key).write_bytes(content)
-    return RunDirectory(opened.info, opened.spec, opened.plan, commits)
+    return RunDirectory(opened.info, commits)
 
 
 @pytest.mark.parametrize("key", ["section/c.0.0.0.0.0", "n_steps/c.0.0.0"])

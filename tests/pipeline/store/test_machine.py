@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from magpend_core.status import Status
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
 from pipeline.runs.run import sound_commits
@@ -69,10 +68,8 @@ class Directory:
         self.path = folder / "run"
         text = spec_of(N_TASKS)
         (folder / "spec.toml").write_text(text)
-        self.spec = Spec.read(folder / "spec.toml")
-        self.plan = make_plan(self.spec)
-        self.identity = identity_of(self.spec, self.plan)
-        self.info = create(self.path, self.spec, self.plan, self.identity, text)
+        self.plan = make_plan(Spec.read(folder / "spec.toml"), text)
+        self.info = create(self.path, self.plan)
 
     def values(self, index: int) -> dict[str, np.ndarray]:
         cube, block = computed(N_TASKS)[1], self.plan.task(index)
@@ -81,13 +78,13 @@ class Directory:
     def commit(self, index: int) -> None:
         values = self.values(index)
         (status,) = values["status"].ravel()
-        write_task(self.info, self.plan, index, values, {Status(status).name.lower(): 1})
+        write_task(self.info, index, values, {Status(status).name.lower(): 1})
 
     def go_on(self) -> None:
         """What a run does."""
-        self.info = establish(self.path, self.spec, self.plan, self.identity, spec_of(N_TASKS), silent)
-        found = sound_commits(self.info, self.plan, silent)
-        packer = Packer(self.info, self.plan, found)
+        self.info = establish(self.path, self.plan, silent)
+        found = sound_commits(self.info, silent)
+        packer = Packer(self.info, found)
         for index in range(N_TASKS):
             if index not in found:
                 self.commit(index)
@@ -151,11 +148,11 @@ class Life(RuleBasedStateMachine):
             raise KilledError
 
         if step == "none":
-            pack_block(self.run.info, self.run.plan, block)
+            pack_block(self.run.info, block)
             return
         with patch.object(type(self.run.info.files), step, die):
             try:
-                pack_block(self.run.info, self.run.plan, block)
+                pack_block(self.run.info, block)
             except KilledError:
                 return
 
@@ -219,7 +216,7 @@ class Life(RuleBasedStateMachine):
             cube = opened.cube().load()
         except StoreError:
             return
-        committed = read_commits(opened.info, opened.plan)
+        committed = read_commits(opened.info)
         for index in range(N_TASKS):
             written, block = self.run.values(index), self.run.plan.task(index)
             for variable in self.run.plan.variables:

@@ -77,12 +77,12 @@ def sweep_text(sweep_text):
 @pytest.fixture
 def remote(made, s3):
     """The run of `made`, in the object store."""
-    info = create(PLACE, made.spec, made.plan, made.identity, made.info.spec_text)
+    info = create(PLACE, made.plan)
 
     def commit(index):
-        write_task(info, made.plan, index, made.values(index), {"bounded": made.plan.cells_in(index)})
+        write_task(info, index, made.values(index), {"bounded": made.plan.cells_in(index)})
 
-    return SimpleNamespace(info=info, commit=commit, plan=made.plan, spec=made.spec, identity=made.identity)
+    return SimpleNamespace(info=info, commit=commit, plan=made.plan, spec=made.spec)
 
 
 def stored(place=PLACE):
@@ -139,12 +139,12 @@ def test_write_task__few_requests(made, remote, s3):
 def test_run__same_bytes_whatever_the_network_does(whole, s3, bytes_of, kinds):
     made = whole
     s3.harm = in_turn(*kinds)
-    info = establish(PLACE, made.spec, made.plan, made.identity, made.info.spec_text, silent)
+    info = establish(PLACE, made.plan, silent)
     for index in range(made.plan.n_tasks):
-        write_task(info, made.plan, index, made.values(index), {"bounded": made.plan.cells_in(index)})
-    commits = read_commits(info, made.plan)
+        write_task(info, index, made.values(index), {"bounded": made.plan.cells_in(index)})
+    commits = read_commits(info)
     assert len(commits) == made.plan.n_tasks
-    assert sweep(info, made.plan, commits) == 0
+    assert sweep(info, commits) == 0
     assert verify_run(PLACE).sound
     assert s3.harmed.total() - s3.harmed[None] > 30
     s3.reset()
@@ -165,7 +165,7 @@ def test_write_task__an_answer_that_never_comes(remote, s3, part, kind):
     assert s3.harmed[kind] == 1
     puts = [path for method, path, _ in s3.requests if method == "PUT" and part in path]
     assert len(puts) > 1 or (kind in ("lost", "late") and "commits" in part)
-    assert set(read_commits(remote.info, remote.plan)) == {0}
+    assert set(read_commits(remote.info)) == {0}
     assert verify_run(PLACE).sound
 
 
@@ -220,9 +220,9 @@ def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeyp
             patch.setattr(objects.ObjectFiles, "write_once", never)
             with pytest.raises(CrashError):
                 remote.commit(0)
-        commits = read_commits(remote.info, remote.plan)
+        commits = read_commits(remote.info)
         assert 0 not in commits
-        assert sweep(remote.info, remote.plan, commits) == n
+        assert sweep(remote.info, commits) == n
     remote.commit(0)
     assert stored() == bytes_of(made.info.directory)
 
@@ -376,7 +376,7 @@ def test_run__credentials_are_nowhere(s3, write_spec, magpend, environment, tmp_
 @pytest.fixture
 def copied(whole, s3):
     """A complete run with the copy of its records, put into the object store file by file; returns its files."""
-    write_copy(whole.info, whole.plan, read_commits(whole.info, whole.plan))
+    write_copy(whole.info, read_commits(whole.info))
     files, here = open_files(PLACE), whole.info.files
     for key in here.everything():
         if key.rpartition("/")[2] != "lock":

@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from pipeline.compute import execute, task
-from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import prune
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
@@ -60,26 +59,26 @@ def test_check__a_folder_with_a_file_of_somebody_else_stays(made, tmp_path, what
     text, words = FOREIGN[what]
     path = tmp_path / "theirs" / what.partition(" of ")[0]
     path.parent.mkdir(parents=True)
-    assert check(tmp_path / "theirs", made.identity) is None
+    assert check(tmp_path / "theirs", made.plan.identity) is None
     path.write_text(text)
     with pytest.raises(RefusedError, match=f"(?s){words}.*[Gg]ive another --out"):
-        check(tmp_path / "theirs", made.identity)
+        check(tmp_path / "theirs", made.plan.identity)
     assert [f.read_text() for f in (tmp_path / "theirs").rglob("*") if f.is_file()] == [text]
     with pytest.raises(RefusedError, match="is a file"):
-        check(path, made.identity)
+        check(path, made.plan.identity)
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "nowhere")
     with pytest.raises(RefusedError, match="is a link that leads nowhere; remove it, or give another --out"):
-        check(link, made.identity)
+        check(link, made.plan.identity)
 
 
 def test_check__another_run_stays(whole):
-    directory, other = whole.info.directory, {**whole.identity, "versions": {"engine": 1000}}
-    assert check(directory, whole.identity) == whole.info
+    directory, other = whole.info.directory, {**whole.plan.identity, "versions": {"engine": 1000}}
+    assert check(directory, whole.plan.identity) == whole.info
     (directory / "run.json").unlink()
     with pytest.raises(RefusedError, match="what another run has left"):
         check(directory, other)
-    assert check(directory, whole.identity) is None
+    assert check(directory, whole.plan.identity) is None
 
 
 # ---- links: what they lead to is never touched ---------------------------------------------------
@@ -184,7 +183,7 @@ def test_lost_chunk__is_damage_and_not_pending(place, main, command, packed, mon
         for module in (records, commits):
             monkeypatch.setattr(module, "BLOCK", 2)
         info = read_run(place)
-        pack_block(info, make_plan(info.parsed_spec()), 0)
+        pack_block(info, 0)
         assert not (place / marker_key(1)).exists()
     chunk = place / "cube.zarr/section/c.1.0.0.0.0"
     chunk.unlink()
@@ -217,7 +216,7 @@ def test_lost_chunk__of_a_record_that_another_process_withdraws_meanwhile(place,
         return absent_objects(*arguments) if asked[1:] else {1: "status/c.1.0.0 is missing"}
 
     monkeypatch.setattr(commits, "absent_objects", meanwhile)
-    assert set(read_commits(info, make_plan(info.parsed_spec()))) == {0, 2}
+    assert set(read_commits(info)) == {0, 2}
 
 
 def test_verify__repairs_nothing_of_an_intact_run_that_it_may_not_write_to(place, main, monkeypatch):
@@ -274,7 +273,7 @@ def test_scan__commits_that_never_stay_the_same_stop(place, monkeypatch):
 
     monkeypatch.setattr(commits, "_names", names)
     with pytest.raises(UnreadableError, match="changes while it is read"):
-        commits.scan(opened.info, opened.plan)
+        commits.scan(opened.info)
 
 
 def fail_at(monkeypatch, name, kind):
@@ -316,11 +315,11 @@ def test_run__removed_while_it_goes_on_ends_and_can_be_made_again(sound, tmp_pat
     shutil.copy(sound / "spec.toml", tmp_path)
     write_task, write_block, done = task.write_task, commits.write_block, []
 
-    def writing_task(info, plan, index, *rest):
+    def writing_task(info, index, *rest):
         done.append(index)
         if len(done) == 2 and moment == "before writing":
             shutil.rmtree(tmp_path / "run")
-        write_task(info, plan, index, *rest)
+        write_task(info, index, *rest)
 
     def writing_block(cube, *rest):
         if len(done) == 2 and moment == "while writing" and (tmp_path / "run").exists():
@@ -381,7 +380,7 @@ def test_sweep__removes_and_names_what_no_record_vouches_for_and_nothing_else(wh
     (directory / "cube.zarr/status/folder").symlink_to(outside)
     leftovers = ["section/c.0.0.abc.partial", "status/c.link", "status/folder"]
     assert verify_run(directory).leftovers == leftovers
-    assert sweep(whole.info, whole.plan, read_commits(whole.info, whole.plan), said.append) == 3
+    assert sweep(whole.info, read_commits(whole.info), said.append) == 3
     assert "removed 3 files that no commit record vouches for: cube.zarr/" in said[0]
     assert contents(directory) == before
     assert (outside / "kept").read_text() == "x"
@@ -397,7 +396,7 @@ def test_rebuild__files_worded_by_another_version(whole):
     found = verify_run(directory, repair=True)
     assert found.skeleton == ["q/zarr.json: its content has changed"]
     assert "another version" in describe(found, directory, repaired=True)[-1]
-    establish(directory, whole.spec, whole.plan, whole.identity, whole.info.spec_text, silent)
+    establish(directory, whole.plan, silent)
     assert verify_run(directory).sound
     assert len(RunDirectory.open(directory).commits) == whole.plan.n_tasks
 

@@ -18,7 +18,7 @@ from zarr.storage import LocalStore
 from magpend_core import Status
 from magpend_core.models import load_model
 from pipeline import open_run
-from pipeline.layout.identity import digest_of, identity_of
+from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import base_variables
 from pipeline.runs.run import sound_commits
@@ -56,8 +56,8 @@ def names_in(made):
 
 def go_on(made):
     """What a run does with a directory: compare, sweep, compute what is missing, pack."""
-    found = sound_commits(made.info, made.plan, silent)
-    packer = Packer(made.info, made.plan, found)
+    found = sound_commits(made.info, silent)
+    packer = Packer(made.info, found)
     missing = [i for i in range(made.plan.n_tasks) if i not in found]
     for index in missing:
         made.commit(index)
@@ -79,7 +79,7 @@ def packed(made, bytes_of):
 def test_write_task__reads_back_and_the_others_are_pending(made):
     """Also fill values leave files, which the record names."""
     made.commit(1)
-    assert set(read_commits(made.info, made.plan)) == {1}
+    assert set(read_commits(made.info)) == {1}
     marker = json.loads((made.info.directory / marker_key(1)).read_text())
     assert sorted({key.split("/")[0] for key in marker["objects"]}) == sorted(v.name for v in made.plan.variables)
     assert all((made.info.directory / "cube.zarr" / key).is_file() for key in marker["objects"])
@@ -96,7 +96,7 @@ def test_write_task__refuses_wrong_shapes_cut_chunks_and_damaged_metadata(made):
     values = made.values(0)
     values["status"] = values["status"][..., :1]
     with pytest.raises(ValueError, match="status"):
-        write_task(made.info, made.plan, 0, values, {})
+        write_task(made.info, 0, values, {})
     for cut in (slice(1, 4), slice(0, 3)):
         with pytest.raises(ValueError, match="cuts chunks"):
             commits.chunk_keys("x", (cut,), (4,), (8,))
@@ -105,7 +105,7 @@ def test_write_task__refuses_wrong_shapes_cut_chunks_and_damaged_metadata(made):
     path.write_text(path.read_text().replace('"little"', '"big"'))
     with pytest.raises(DamagedError, match=r"section/zarr\.json: its content has changed"):
         made.commit(0)
-    assert read_commits(made.info, made.plan) == {}
+    assert read_commits(made.info) == {}
 
 
 def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
@@ -114,11 +114,10 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
         f"{name} = {{ values = [1.5, 1.6] }}\n" for name in ("q", "frequency_hz", "eps_drive")
     )
     spec = Spec.read(write_spec(f'{text}[initial_conditions]\nkind = "grid"\n'))
-    identity = identity_of(spec, make_plan(spec))
-    create(tmp_path / "run", spec, make_plan(spec), identity, text)
+    info = create(tmp_path / "run", make_plan(spec, text))
     again = Spec.parse(read_run(tmp_path / "run").spec)
     assert list(again.axes) == list(spec.axes) == ["q", "frequency_hz", "eps_drive"]
-    assert digest_of(identity_of(again, make_plan(again))) == digest_of(identity)
+    assert digest_of(make_plan(again).identity) == info.digest
 
 
 # ---- one bit that flips, on the way to the disk or later --------------------------------------------
@@ -142,7 +141,7 @@ def test_write_task__a_bit_flips_while_a_chunk_is_written(made, monkeypatch):
         patch.setattr(LocalStore, "set", harmed)
         with pytest.raises(DamagedError, match="while it was written"):
             made.commit(0)
-    assert not read_commits(made.info, made.plan)
+    assert not read_commits(made.info)
     assert not list((made.info.directory / "cube.zarr/section").glob("c*"))
     made.commit(0)
     assert (open_run(made.info.directory).section.isel(frequency=0, q=0) == made.values(0)["section"][0, 0]).all()
@@ -210,7 +209,7 @@ def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
 def test_packs__same_bytes_in_any_order_late_and_twice(packed, bytes_of, order):
     withdraw(packed.info, [f"{i:06d}.json" for i in range(5)])
     assert names_in(packed) == []
-    packer = Packer(packed.info, packed.plan, read_commits(packed.info, packed.plan))
+    packer = Packer(packed.info, read_commits(packed.info))
     for index in order:
         packed.commit(index)
         packer.add(index)
@@ -227,11 +226,11 @@ def test_read_commits__while_records_move_into_a_pack(whole, monkeypatch):
         keys = list(keys)
         if not moved:
             moved.append(True)
-            pack_block(whole.info, whole.plan, 0)
+            pack_block(whole.info, 0)
         return original(self, keys)
 
     monkeypatch.setattr(files, "read_each", read_each)
-    assert len(read_commits(whole.info, whole.plan)) == 5
+    assert len(read_commits(whole.info)) == 5
     assert moved
 
 
@@ -241,7 +240,7 @@ def test_read_commits__while_records_move_into_a_pack(whole, monkeypatch):
 @pytest.fixture
 def copied(whole):
     """A complete run with the copy of its records, and the copy's path."""
-    write_copy(whole.info, whole.plan, read_commits(whole.info, whole.plan))
+    write_copy(whole.info, read_commits(whole.info))
     return whole, whole.info.directory / RECORD_COPY
 
 
@@ -251,13 +250,13 @@ def test_write_copy__has_the_lines_of_the_records_and_counts_only_with_them(copi
     assert lines[:-1] == [f.read_bytes() for f in records]
     assert json.loads(lines[-1])["records"] == whole.plan.n_tasks
     sizes = {f.name: f.stat().st_size for f in records}
-    assert copied_records(whole.info, sizes) == dict(read_commits(whole.info, whole.plan))
+    assert copied_records(whole.info, sizes) == dict(read_commits(whole.info))
     del sizes["000001.json"]
     sizes["000002.json"] += 1
     assert set(copied_records(whole.info, sizes)) == {0, 3, 4}
     # of an incomplete run there is none
     records[1].unlink()
-    write_copy(whole.info, whole.plan, read_commits(whole.info, whole.plan))
+    write_copy(whole.info, read_commits(whole.info))
     assert not path.exists()
 
 
@@ -282,7 +281,7 @@ def test_copy__is_not_read_where_each_file_is_at_hand(copied):
     """In a folder, and by commands that write, the records themselves are read."""
     whole, path = copied
     (path.parent / "commits/000001.json").write_bytes(b"{}")
-    for found in (scan(whole.info, whole.plan)[0], sound_commits(whole.info, whole.plan, silent)):
+    for found in (scan(whole.info)[0], sound_commits(whole.info, silent)):
         assert set(found) == {0, 2, 3, 4}
 
 
@@ -291,12 +290,12 @@ def test_copy__is_not_read_where_each_file_is_at_hand(copied):
 
 def remade(made, change, **options):
     """The run with other files of the set-up, and a run.json whose digests fit them."""
-    contents = skeleton_files(made.spec, made.plan, made.info.identity, made.info.spec_text, made.info.title, **options)
+    contents = skeleton_files(made.plan, made.info.identity, **options)
     group = json.loads(contents[METADATA])
     change(group)
     contents = {**contents, METADATA: json.dumps(group).encode()}
     write_skeleton(made.info.files, contents, contents)
-    return write_run(made.info.files, made.spec, made.info.identity, made.info.spec_text, entries_of(contents))
+    return write_run(made.info.files, made.plan, made.info.identity, entries_of(contents))
 
 
 def test_group__metadata_that_disagree_are_damage(whole):

@@ -16,7 +16,6 @@ from magpend_core.models import ModelError
 from magpend_core.models.text.functions import read_function
 from magpend_core.models.text.numeric import rates_of
 from magpend_core.models.text.tracing import RULES
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.specification.spec import Spec
 
@@ -157,7 +156,7 @@ def test_model__is_that_of_the_same_text():
     specs = [Spec("sweep", m).with_parameters(frequency_hz=0.2).with_start_grid(x=(-1, 1, 2)) for m in (model, text)]
     again = Spec.read(specs[0].toml())
     assert again.model.reference == model.reference
-    assert identity_of(again, make_plan(again)) == identity_of(specs[1], make_plan(specs[1]))
+    assert make_plan(again).identity == make_plan(specs[1]).identity
 
 
 def test_model__source_that_a_run_keeps_is_never_executed():

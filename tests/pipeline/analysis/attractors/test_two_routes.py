@@ -8,7 +8,6 @@ from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics,
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.explorer.live.live import LiveRun
 from pipeline.explorer.live.settling import settle_cells
-from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import model_of, overrides_of, parameters_of
 from pipeline.runs.derive import derive
@@ -26,8 +25,8 @@ def test_settings__of_run_json_are_those_of_the_cubes_attributes(name, tmp_path)
     (tmp_path / "drive.csv").write_text(DRIVE, "utf-8")
     (tmp_path / "spec.toml").write_text(RUNS[name], "utf-8")
     spec = Spec.read(tmp_path / "spec.toml")
-    plan = make_plan(spec)
-    create(tmp_path / "run", spec, plan, identity_of(spec, plan), RUNS[name])
+    plan = make_plan(spec, RUNS[name])
+    create(tmp_path / "run", plan)
     run = RunDirectory.open(tmp_path / "run")
     spec, cube = run.spec, run.cube()
     assert model_of(cube) is run.model is spec.model

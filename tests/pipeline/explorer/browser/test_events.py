@@ -43,7 +43,7 @@ def test_events__lead_to_cells_on_the_orbits(line: Path) -> None:
     for one in folds:
         row = rows[one["event"]]
         assert (one["sentence"], one["x"]) == (row["sentence"], row["frequency_hz"])
-        places = [ExploredRun.of(run).cell(one[name]) for name in ("before", "after")]
+        places = [ExploredRun.open(run).cell(one[name]) for name in ("before", "after")]
         assert [float(cube["frequency"][place["frequency"]]) for place in places] == [row["seen"], row["beyond"]]
         # the same branch of the continuation, in its direction, jumps to another orbit
         assert places[0]["branch"] == places[1]["branch"]
