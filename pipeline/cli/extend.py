@@ -76,7 +76,7 @@ def extend(
         dashboard=dashboard,
         echo=console.note,
     )
-    console.result(f"cube: {state.files.below('cube.zarr').name}")
+    console.result(f"cube: {state.info.files.below('cube.zarr').name}")
 
 
 def _axes(texts: list[str]) -> dict[str, dict[str, Any]]:

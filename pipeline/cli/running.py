@@ -154,12 +154,12 @@ def status(directory: Directory, json: Json = None) -> None:
     found = state(directory)
     row = {
         "directory": found.name,
-        "title": found.title,
+        "title": found.spec.title,
         "complete": found.complete,
         "cells": found.plan.n_cells,
         "committed_cells": found.n_committed,
         "tasks": found.plan.n_tasks,
-        "committed_tasks": len(found.done),
+        "committed_tasks": len(found.commits),
         "status": dict(found.cells),
     }
     tell(Table([row], describe_state(found)), None, json)

@@ -150,10 +150,8 @@ def _fitting(runs: Sequence[RunDirectory], plan: Plan) -> tuple[list[RunDirector
             continue
         fitting.append(run)
         if not run.complete:
-            done = sum(run.plan.cells_in(i) for i in run.commits)
-            notes.append(
-                f"{run.name}: is not complete; only its {done} of {run.plan.n_cells} committed cells are reused"
-            )
+            some = f"only its {run.n_committed} of {run.plan.n_cells} committed cells are reused"
+            notes.append(f"{run.name}: is not complete; {some}")
     return fitting, notes
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from magpend_core.status import Status
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
-from pipeline.layout.plan import Plan
 from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
 from pipeline.runs.preview import figure_command
@@ -22,44 +21,14 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-@dataclass(frozen=True)
-class State:
-    """State of a run: its committed tasks, and the number of committed cells by status.
-
-    Attributes
-    ----------
-    files : Files
-        Files of the run directory.
-    title : str
-        Title of the run.
-    plan : Plan
-        Plan of the run.
-    done : frozenset of int
-        Committed tasks.
-    cells : dict
-        Number of committed cells by status name.
-    """
-
-    files: Files
-    title: str
-    plan: Plan
-    done: frozenset[int]
-    cells: dict[str, int] = field(default_factory=dict)
+@dataclass(frozen=True, repr=False)
+class State(RunDirectory):
+    """An opened run whose text says how many cells are committed, by status."""
 
     @property
-    def name(self) -> str:
-        """Path or URL of the run directory."""
-        return self.files.name
-
-    @property
-    def n_committed(self) -> int:
-        """Number of cells that are computed and committed."""
-        return sum(self.cells.values())
-
-    @property
-    def complete(self) -> bool:
-        """Whether every task of the run is committed."""
-        return len(self.done) == self.plan.n_tasks
+    def cells(self) -> dict[str, int]:
+        """Number of committed cells by status name."""
+        return self.commits.cells()
 
     def __str__(self) -> str:
         return "\n".join(describe_state(self))
@@ -73,22 +42,21 @@ def state(source: str | Path | Files | RunDirectory) -> State:
     RefusedError, DamagedError, UnreadableError
         See `RunDirectory.open`.
     """
-    run = RunDirectory.open(source)
-    return State(run.info.files, run.info.title, run.plan, frozenset(run.commits), run.commits.cells())
+    return State.open(source)
 
 
 def describe_state(found: State) -> list[str]:
     """Return the lines that ``magpend status`` prints."""
     plan = found.plan
     share = 100 * found.n_committed / plan.n_cells
-    lines = [found.title] if found.title else []
+    lines = [found.spec.title] if found.spec.title else []
     lines += [
         f"{found.name}: {'complete' if found.complete else 'incomplete'}",
         f"committed: {found.n_committed} of {plan.n_cells} cells ({share:.1f} %), "
-        f"{len(found.done)} of {plan.n_tasks} tasks",
+        f"{len(found.commits)} of {plan.n_tasks} tasks",
     ]
     lines += _status_lines(found.cells, plan.n_cells - found.n_committed)
-    return lines + (small_states(RunDirectory.open(found.files).cube()) if found.complete else [])
+    return lines + (small_states(found.cube()) if found.complete else [])
 
 
 def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:

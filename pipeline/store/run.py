@@ -94,12 +94,11 @@ class RunDirectory:
         """Model, cells and progress of the run in words, by name, for its `repr`."""
         states, plan = ", ".join(self.model.state_names), self.plan
         shape = " x ".join(f"{dim} ({n})" for dim, n in zip(plan.dims, plan.shape, strict=True))
-        here = sum(plan.cells_in(i) for i in self.commits)
         missing = "" if self.complete else "; run the specification again to complete it"
         return {
             "model": f"{self.model.name}; states {_short(states)}",
             "cells": f"{plan.n_cells}: {shape}",
-            "computed": f"{here} of {plan.n_cells}{missing}",
+            "computed": f"{self.n_committed} of {plan.n_cells}{missing}",
         }
 
     @property
@@ -136,6 +135,11 @@ class RunDirectory:
     def complete(self) -> bool:
         """Whether every task of the run has been computed and committed."""
         return len(self.commits) == self.plan.n_tasks
+
+    @property
+    def n_committed(self) -> int:
+        """Number of cells that are computed and committed."""
+        return sum(self.plan.cells_in(i) for i in self.commits)
 
     @cached_property
     def digest(self) -> str:

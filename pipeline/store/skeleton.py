@@ -89,7 +89,7 @@ def lacking(info: RunInfo) -> list[str]:
 
 def skeleton_keys(plan: Plan) -> list[str]:
     """Return the keys of the metadata files of all variables and coordinates of the result cube."""
-    names = [v.name for v in (*plan.variables, *coordinates(plan.spec), *_labels(plan.spec))]
+    names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(plan.spec), *_labels(plan.spec))]
     return [f"{name}/{METADATA}" for name in names]
 
 

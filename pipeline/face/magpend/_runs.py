@@ -465,14 +465,13 @@ def _tree_of(run: Run, chunks: Any, check: bool | None) -> xr.DataTree:
         for k, result in enumerate(stored_each(run, name, lazy=True)):
             folder = str(result.encoding["source"]).rpartition("/")[2]
             nodes[folder.removesuffix(".zarr") if k else name] = result if chunks is None else result.chunk(chunks)
-    computed = sum(run.plan.cells_in(i) for i in run.commits)
     attrs = {
         "title": run.info.title,
         "source": str(nodes["cube"].attrs["source"]),
         "digest": run.info.digest,
         "cells": run.plan.n_cells,
-        "computed": computed,
-        "pending": run.plan.n_cells - computed,
+        "computed": run.n_committed,
+        "pending": run.plan.n_cells - run.n_committed,
         "left_out": [name.rpartition("/")[2] for name in stale(run)],
     }
     return xr.DataTree.from_dict({"/": xr.Dataset(attrs=attrs), **nodes}, name=run.name.rpartition("/")[2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -167,7 +168,10 @@ def test_run__refuses_steps_that_are_too_long(tmp_path):
 def test_warn_of_steps__counts_the_cells_above_the_tolerance(directory):
     lines: list[str] = []
     for tolerance in (0.01, 1e-9):
-        warn_of_steps(Spec.parse(spec(noise={"tolerance": tolerance})), RunDirectory.open(directory), lines.append)
+        run = SimpleNamespace(
+            spec=Spec.parse(spec(noise={"tolerance": tolerance})), cube=RunDirectory.open(directory).cube
+        )
+        warn_of_steps(run, lines.append)
     assert len(lines) == 1
     assert lines[0].startswith("warning: in 600 of 600 cells the last period changes by more than noise.tolerance")
 

@@ -116,7 +116,7 @@ def test_run__same_bytes_everywhere_and_where_it_was_stopped(kind, write_spec, t
         with pytest.raises(InterruptedRunError, match="the same command continues") as caught:
             quietly(path, tmp_path / "stopped")
     assert caught.value.signal_number == signal.SIGINT
-    assert len(state(tmp_path / "stopped").done) == 2
+    assert len(state(tmp_path / "stopped").commits) == 2
     assert quietly(path, tmp_path / "stopped").complete
     found.append(bytes_of(tmp_path / "stopped"))
     assert all(other == found[0] for other in found[1:])
@@ -186,7 +186,7 @@ def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, m
             quietly(path, tmp_path / "run")
     assert len(tried) == n_tasks + 1
     assert tried[2] == tried[-1]
-    assert state(tmp_path / "run").done == set(range(n_tasks)) - {2}
+    assert set(state(tmp_path / "run").commits) == set(range(n_tasks)) - {2}
     for leftover in ("cube.zarr/section/c.2.0.0.0.0.abc.partial", "cube.zarr/status/c.2.0.0.0", "commits/.2.tmp"):
         (tmp_path / "run" / leftover).write_bytes(b"left by a crash")
     calls = counted(monkeypatch)

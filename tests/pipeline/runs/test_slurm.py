@@ -108,12 +108,12 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert job in shell("squeue", "-h", "-o", "%i")
     refused = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out", code=3)
     assert f"job {job} of this run exists already" in refused
-    wait_for(lambda: is_run(out) and len(state(out).done) >= 2)
+    wait_for(lambda: is_run(out) and len(state(out).commits) >= 2)
     shell("scancel", job)
     wait_for(lambda: not shell("squeue", "-h"))
     assert "incomplete" in magpend("status", "out")
     assert "Stopped. Committed results" in (logs / f"coordinator-{job}.out").read_text()
-    assert 2 <= len(state(out).done) < 12
+    assert 2 <= len(state(out).commits) < 12
 
     # gone on with by a coordinator in a job, with workers in jobs of their own
     explained = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out", "--dry-run", "--quiet")
