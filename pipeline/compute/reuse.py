@@ -49,7 +49,7 @@ class Source:
     goes_on: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        self.finder = Finder(self.run.spec)
+        self.finder = Finder(self.run.plan.cells)
         same = same_products(self.run, self.wanted)
         self.goes_on = self.run.spec.integration.n_keep < self.wanted.integration.n_keep
         # exponents begin at the last section, which is another then
@@ -152,7 +152,7 @@ class Pool:
 
     def count(self, block: tuple[slice, ...]) -> list[int]:
         """Count the cells of a block that can be copied from each earlier run."""
-        inputs, way = self.plan.cells.inputs(block), way_of(self.plan.spec, block)
+        inputs, way = self.plan.cells.inputs(block), way_of(self.plan.cells, block)
         counts, rest = [], np.arange(len(inputs.initial_states))
         for source in self.sources:
             place = source.find(inputs.take(rest), way)
@@ -170,7 +170,7 @@ class Pool:
 
         The numbers of cells that were taken are appended to `tally`.
         """
-        way = way_of(self.plan.spec, block)
+        way = way_of(self.plan.cells, block)
         if way is None:
             return lambda spec, inputs: self._give(spec, inputs, inputs, None, tally)
         return lambda spec, inputs: self._give(spec, inputs, self.plan.cells.inputs(block), way, tally)

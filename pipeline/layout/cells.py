@@ -201,34 +201,34 @@ class CellMap:
 
     def __init__(self, spec: Spec) -> None:
         base = spec.values
-        self._names = base.names
-        self._packed = base.pack()
-        self._fixed_hz = spec.frequency_hz
-        self._axes = parameter_axes(spec)
-        self._states = initial_states(spec.initial_conditions)
-        self._walk = spec.continuation
-        if self._walk is None:
-            self.dims = (*(a.dim for a in self._axes), *self._states.dims)
-            self.shape = (*(len(a.values) for a in self._axes), *self._states.shape)
+        self.names = base.names
+        self.packed = base.pack()
+        self.fixed_hz = np.nan if spec.frequency_hz is None else spec.frequency_hz
+        self.axes = parameter_axes(spec)
+        self.states = initial_states(spec.initial_conditions)
+        self.walk = spec.continuation
+        if self.walk is None:
+            self.dims = (*(a.dim for a in self.axes), *self.states.dims)
+            self.shape = (*(len(a.values) for a in self.axes), *self.states.shape)
             self.path: int | None = None
         else:
-            n_branches = len(self._states) * len(self._walk.directions)
-            self.dims = (*(a.dim for a in self._axes), BRANCH)
-            self.shape = (*(len(a.values) for a in self._axes), n_branches)
-            self.path = [a.parameter for a in self._axes].index(self._walk.path)
+            n_branches = len(self.states) * len(self.walk.directions)
+            self.dims = (*(a.dim for a in self.axes), BRANCH)
+            self.shape = (*(len(a.values) for a in self.axes), n_branches)
+            self.path = [a.parameter for a in self.axes].index(self.walk.path)
 
     def inputs(self, block: tuple[slice, ...]) -> Inputs:
         """Return the kernel's input arrays for a block of cells."""
         sizes = [s.stop - s.start for s in block]
         index = self._branch_first(np.indices(sizes).reshape(len(block), math.prod(sizes)), block)
-        values = {a.parameter: a.values[index[i]] for i, a in enumerate(self._axes)}
+        values = {a.parameter: a.values[index[i]] for i, a in enumerate(self.axes)}
         shape = index.shape[1:]
-        parameters = np.broadcast_to(self._packed, (*shape, len(self._packed))).copy()
+        parameters = np.broadcast_to(self.packed, (*shape, len(self.packed))).copy()
         for name, value in values.items():
             if name != FREQUENCY:
-                parameters[..., self._names.index(name)] = value
-        fixed = np.full(shape, np.nan if self._fixed_hz is None else self._fixed_hz)
-        return Inputs(parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0])))
+                parameters[..., self.names.index(name)] = value
+        fixed = np.full(shape, self.fixed_hz)
+        return Inputs(parameters, values.get(FREQUENCY, fixed), self.states.at(self._start_of(index[:, :, 0])))
 
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """Return slices that select the last cell of each branch of a block. All branches of the block must run in the
@@ -241,12 +241,12 @@ class CellMap:
         return tuple(last if i == self.path else s for i, s in enumerate(block))
 
     def _start_of(self, index: np.ndarray) -> np.ndarray:
-        own = index[len(self._axes) :]
-        if self._walk is not None:
-            return np.asarray(own[0] % len(self._states))
-        if not self._states.shape:
+        own = index[len(self.axes) :]
+        if self.walk is not None:
+            return np.asarray(own[0] % len(self.states))
+        if not self.states.shape:
             return np.zeros(index.shape[1], dtype=np.int64)
-        return np.asarray(np.ravel_multi_index(tuple(own), self._states.shape))
+        return np.asarray(np.ravel_multi_index(tuple(own), self.states.shape))
 
     def _branch_first(self, cells: np.ndarray, block: tuple[slice, ...]) -> np.ndarray:
         """Return cell indices, shape (dim, branch, point). The points of a branch are in the order in which the
@@ -264,9 +264,9 @@ class CellMap:
 
     def _down(self, branches: np.ndarray) -> np.ndarray:
         """Return a mask of the branches that are continued towards falling parameter values."""
-        assert self._walk is not None
-        directions = np.array([d == "down" for d in self._walk.directions])
-        return np.asarray(directions[branches // len(self._states)])
+        assert self.walk is not None
+        directions = np.array([d == "down" for d in self.walk.directions])
+        return np.asarray(directions[branches // len(self.states)])
 
     def outputs(self, block: tuple[slice, ...], values: np.ndarray) -> np.ndarray:
         """Reshape a kernel result of shape (branch, point, ...) to the shape of its block of cells."""

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.layout.cells import InitialStates, initial_states, parameter_axes
+from pipeline.layout.cells import CellMap, InitialStates
 from pipeline.layout.identity import differences, numbered
 from pipeline.motion.steady import Inputs
 from pipeline.specification.noise import NoiseTable
-from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
 NOWHERE = -1
@@ -58,28 +57,17 @@ class Way:
     first: int  # number of points on the path before the block
 
 
-def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
+def way_of(cells: CellMap, block: tuple[slice, ...]) -> Way | None:
     """Return the order in which a block of cells of a continuation visits the parameter values. Return None for a
     sweep.
     """
-    if spec.continuation is None:
+    if cells.walk is None or cells.path is None:
         return None
-    path, values = _path_of(spec)
-    directions, part = spec.continuation.directions, block[path]
-    direction = directions[block[-1].start // len(initial_states(spec.initial_conditions))]
+    values, part = cells.axes[cells.path].values, block[cells.path]
+    direction = cells.walk.directions[block[-1].start // len(cells.states)]
     if direction == "down":
         return Way(direction, values[::-1], len(values) - part.stop)
     return Way(direction, values, part.start)
-
-
-def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
-    """Return the continuation parameter's axis: its index among the parameter axes of the result cube, and
-    its values.
-    """
-    assert spec.continuation is not None
-    axes = parameter_axes(spec)
-    path = [a.parameter for a in axes].index(spec.continuation.path)
-    return path, axes[path].values
 
 
 class Finder:
@@ -90,24 +78,13 @@ class Finder:
 
     Parameters
     ----------
-    spec
-        Specification of the run that has the cells.
+    cells
+        Cells of the run.
     """
 
-    def __init__(self, spec: Spec) -> None:
-        self._names = spec.values.names
-        self._packed = spec.values.pack()
-        self._hz = np.float64(np.nan if spec.frequency_hz is None else spec.frequency_hz)
-        self._axes = parameter_axes(spec)
-        states = initial_states(spec.initial_conditions)
-        self._starts = _Grid(states) if states.grid is not None else _Rows(states)
-        self._path: int | None = None
-        self._directions: tuple[str, ...] = ()
-        n_last = states.shape
-        if spec.continuation is not None:
-            self._path, self._directions = _path_of(spec)[0], spec.continuation.directions
-            n_last = (len(states) * len(self._directions),)
-        self.shape = (*(len(a.values) for a in self._axes), *n_last)
+    def __init__(self, cells: CellMap) -> None:
+        self.cells = cells
+        self._starts = _index(cells.states)
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
         """Return the flat index in this run of each given cell, shape (branch, point); `NOWHERE` for a cell not in this
@@ -123,8 +100,9 @@ class Finder:
         n_branches, n_points = inputs.frequency_hz.shape
         here = self._fixed(inputs)
         steps: list[np.ndarray] = []
-        for i, axis in enumerate(self._axes):
-            if i == self._path:
+        axes, path = self.cells.axes, self.cells.path
+        for i, axis in enumerate(axes):
+            if i == path:
                 steps.append(np.zeros((n_branches, 1), np.int64))
                 continue
             step, on = _on_axis(axis.values, self._values(inputs, axis.parameter))
@@ -133,34 +111,35 @@ class Finder:
         start, on = self._starts.find(inputs.initial_states)
         here = np.repeat((here & on)[:, None], n_points, axis=1)
         if way is not None:
-            assert self._path is not None
-            if way.direction not in self._directions:
+            assert path is not None
+            assert self.cells.walk is not None
+            directions, own = self.cells.walk.directions, axes[path].values
+            if way.direction not in directions:
                 return np.full(here.shape, NOWHERE)
-            start = start + self._directions.index(way.direction) * len(self._starts)
-            own = self._axes[self._path].values
+            start = start + directions.index(way.direction) * len(self._starts)
             point = way.first + np.arange(n_points)
             here &= point < _n_alike(own if way.direction == "up" else own[::-1], way.values)
             point = np.minimum(point, len(own) - 1)
-            steps[self._path] = point if way.direction == "up" else len(own) - 1 - point
-        n_starts = math.prod(self.shape[len(self._axes) :])
+            steps[path] = point if way.direction == "up" else len(own) - 1 - point
+        n_starts = math.prod(self.cells.shape[len(axes) :])
         place = np.zeros((n_branches, n_points), np.int64)
-        for axis, step in zip(self._axes, steps, strict=True):
+        for axis, step in zip(axes, steps, strict=True):
             place = place * len(axis.values) + step
         return np.where(here, place * n_starts + start[:, None], NOWHERE)
 
     def _fixed(self, inputs: Inputs) -> np.ndarray:
         """Return a mask of the branches that agree with this run in every parameter that this run does not sweep."""
-        swept = {a.parameter for a in self._axes}
-        fixed = [i for i, name in enumerate(self._names) if name not in swept]
-        here = (_bits(inputs.parameters[:, 0, fixed]) == _bits(self._packed[fixed])).all(axis=1)
+        swept = {a.parameter for a in self.cells.axes}
+        fixed = [i for i, name in enumerate(self.cells.names) if name not in swept]
+        here = (_bits(inputs.parameters[:, 0, fixed]) == _bits(self.cells.packed[fixed])).all(axis=1)
         if FREQUENCY not in swept:
-            here &= _bits(inputs.frequency_hz[:, 0]) == _bits(self._hz)
+            here &= _bits(inputs.frequency_hz[:, 0]) == _bits(self.cells.fixed_hz)
         return np.asarray(here)
 
     def _values(self, inputs: Inputs, name: str) -> np.ndarray:
         if name == FREQUENCY:
             return inputs.frequency_hz[:, 0]
-        return inputs.parameters[:, 0, self._names.index(name)]
+        return inputs.parameters[:, 0, self.cells.names.index(name)]
 
 
 def _n_alike(old: np.ndarray, new: np.ndarray) -> int:
@@ -212,6 +191,10 @@ class _Rows:
         return row, (_bits(self._table[row]) == _bits(wanted)).all(axis=1)
 
 
+def _index(states: InitialStates) -> _Grid | _Rows:
+    return _Rows(states) if states.grid is None else _Grid(states)
+
+
 def _bits(values: Any) -> np.ndarray:
     """Return the bit patterns of floats as integers. In this form 0.0 and -0.0 differ, and NaNs with the same bits are
     equal.
@@ -233,7 +216,7 @@ def _marks(rows: np.ndarray) -> np.ndarray:
     return mark
 
 
-def apart(old: Spec, new: Spec) -> list[str]:
+def apart(old: CellMap, new: CellMap) -> list[str]:
     """Return a line of text per reason why two runs with equal integration settings have no cell in common.
 
     Returns
@@ -246,19 +229,15 @@ def apart(old: Spec, new: Spec) -> list[str]:
     for name in left:
         if not np.isin(_bits(right[name]), _bits(left[name])).any():
             lines.append(f"{name}: {_said(left[name])} there, {_said(right[name])} now; no value is the same")
-    states = initial_states(new.initial_conditions)
-    own = initial_states(old.initial_conditions)
-    starts = _Grid(own) if own.grid is not None else _Rows(own)
-    if not starts.find(states.at(np.arange(len(states))))[1].any():
+    if not _index(old.states).find(new.states.at(np.arange(len(new.states))))[1].any():
         lines.append("initial_conditions: no initial state is the same, to the last bit")
     return lines or ["there is no cell in which all parameters and the initial state are the same"]
 
 
-def _swept(spec: Spec) -> dict[str, np.ndarray]:
+def _swept(cells: CellMap) -> dict[str, np.ndarray]:
     """Return all values of each parameter and of the drive frequency in a run, by name."""
-    hz = np.nan if spec.frequency_hz is None else spec.frequency_hz
-    values = {FREQUENCY: np.array([hz]), **dict(zip(spec.values.names, spec.values.pack()[:, None], strict=True))}
-    return values | {axis.parameter: axis.values for axis in parameter_axes(spec)}
+    values = {FREQUENCY: np.array([cells.fixed_hz]), **dict(zip(cells.names, cells.packed[:, None], strict=True))}
+    return values | {axis.parameter: axis.values for axis in cells.axes}
 
 
 def _said(values: np.ndarray) -> str:

@@ -114,7 +114,7 @@ def plan_extension(
     fitting, notes = _fitting(runs, plan)
     counts = _census(plan, fitting)
     if not sum(counts):
-        reasons = notes + [line for run in fitting for line in _strangers(run, wide)]
+        reasons = notes + [line for run in fitting for line in _strangers(run, plan)]
         raise RefusedError(
             "no cell can be reused, so a new run is as quick (magpend run SPEC --out NEW). "
             "Differences:\n  " + "\n  ".join(reasons)
@@ -165,11 +165,11 @@ def _census(plan: Plan, runs: Sequence[RunDirectory]) -> list[int]:
     return counts
 
 
-def _strangers(run: RunDirectory, wide: Spec) -> list[str]:
+def _strangers(run: RunDirectory, plan: Plan) -> list[str]:
     """Return why none of the cells of an earlier run can be copied, although its settings fit."""
     if not run.commits:
         return [f"{run.name}: it has no committed cells"]
-    return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
+    return [f"{run.name}: {line}" for line in apart(run.plan.cells, plan.cells)]
 
 
 def describe_extension(extension: Extension, *, workers: int | None = None) -> Iterator[str]:
@@ -259,7 +259,7 @@ def extend(
     old = RunDirectory.open(first)
     if extension.digest == old.info.digest:
         return _as_it_is(old, echo)
-    _refuse_loss(old, extension.plan.spec)
+    _refuse_loss(old, extension.plan)
     with first.lock():
         _build(extension, built, **how)
         _exchange(_folder(first), _folder(built), echo)
@@ -433,13 +433,13 @@ def _as_it_is(run: RunDirectory, echo: Echo) -> State:
     return state(run)
 
 
-def _refuse_loss(run: RunDirectory, wide: Spec) -> None:
+def _refuse_loss(run: RunDirectory, plan: Plan) -> None:
     """Raise RefusedError if the wider run lacks cells or products of the run that it would replace."""
-    cells, finder, lost = run.plan.cells, Finder(wide), 0
+    cells, finder, lost = run.plan.cells, Finder(plan.cells), 0
     for index in run.commits:
         block = run.plan.task(index)
-        lost += int((finder.find(cells.inputs(block), way_of(run.spec, block)) == NOWHERE).sum())
-    absent = [name for name in run.spec.products if name not in wide.products]
+        lost += int((finder.find(cells.inputs(block), way_of(cells, block)) == NOWHERE).sum())
+    absent = [name for name in run.spec.products if name not in plan.spec.products]
     what = [f"{lost} of its cells"] if lost else []
     what += [f"its product {name}" for name in absent]
     if what:

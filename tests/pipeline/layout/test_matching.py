@@ -87,28 +87,29 @@ def test_find__what_the_same_numbers_go_into(kind, data):
     by_history = {}
     for place, history in have.items():
         by_history.setdefault(history, set()).add(place)
-    cells, plan, finder = CellMap(new), make_plan(new), Finder(old)
+    cells, plan, finder = CellMap(new), make_plan(new), Finder(CellMap(old))
     n_found = 0
     for block in plan.tasks():
         inputs = cells.inputs(block)
-        found = cells.outputs(block, finder.find(inputs, way_of(new, block)))
+        found = cells.outputs(block, finder.find(inputs, way_of(cells, block)))
         flat = np.arange(plan.n_cells).reshape(plan.shape)[block]
         for place, there in zip(flat.ravel(), found.ravel(), strict=True):
             same = by_history.get(wanted[int(place)], set())
             assert (there in same) if same else (there == NOWHERE)
             n_found += bool(same)
     if not n_found and kind == "sweep":
-        assert apart(old, new)
+        assert apart(CellMap(old), cells)
 
 
 @pytest.mark.parametrize("kind", ["sweep", "continuation"])
 @given(st.data())
 def test_find__every_cell_in_its_own_run(kind, data):
     spec = data.draw(specs(kind))
-    cells, plan, finder = CellMap(spec), make_plan(spec), Finder(spec)
+    cells, plan = CellMap(spec), make_plan(spec)
+    finder = Finder(cells)
     states = {}
     for block in plan.tasks():
-        found = cells.outputs(block, finder.find(cells.inputs(block), way_of(spec, block)))
+        found = cells.outputs(block, finder.find(cells.inputs(block), way_of(cells, block)))
         flat = np.arange(plan.n_cells).reshape(plan.shape)[block]
         states |= dict(zip(flat.ravel().tolist(), found.ravel().tolist(), strict=True))
     assert NOWHERE not in states.values()
