@@ -20,9 +20,9 @@ from pipeline.runs.progress import Progress, duration
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import start_remarks
-from pipeline.store.checking import damaged_records, name_of
-from pipeline.store.commits import Packer, log_timing, scan, sweep, withdraw
-from pipeline.store.errors import DamagedError, IncompleteError, RefusedError
+from pipeline.store.checking import require_all, sound_commits
+from pipeline.store.commits import Packer, log_timing
+from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import Files
 from pipeline.store.objects import open_files
 from pipeline.store.record_copy import remove_copy, write_copy
@@ -30,7 +30,6 @@ from pipeline.store.records import Records
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import RunInfo, is_run, read_run
 from pipeline.store.setup import check, establish
-from pipeline.store.view import VERIFY, checks_chunks
 
 if TYPE_CHECKING:
     from pipeline.compute.clients import Where
@@ -209,7 +208,7 @@ def _complete(info: RunInfo, commits: Records, workers: int | None, where: Where
                 log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
                 packer.add(result["task"])
                 progress.add(result["cells"])
-    _require_all(info, echo)
+    require_all(info, echo)
 
 
 def _compile(plan: Plan, echo: Echo) -> None:
@@ -219,60 +218,3 @@ def _compile(plan: Plan, echo: Echo) -> None:
     seconds = task.warm_up(plan)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")
-
-
-def _require_all(info: RunInfo, echo: Echo) -> None:
-    """Raise IncompleteError unless every task is committed; remove the files that stopped tasks left."""
-    commits, problems = damaged_records(info, contents=False)
-    n_tasks = info.plan.n_tasks
-    absent = [i for i in range(n_tasks) if i not in commits or name_of(i) in problems]
-    if absent:
-        why = f" {next(iter(problems.values()))}." if problems else ""
-        raise IncompleteError(
-            f"{info.name}: {len(absent)} of {n_tasks} tasks were computed but are not committed "
-            f"here (the first is {absent[0]}).{why} Every worker must see this folder under this path, "
-            "and have space to write. Then give the same command again; it computes only these tasks."
-        )
-    sweep(info, commits, echo)
-    write_copy(info, commits)
-
-
-_LONG_SECONDS = 5.0
-_NAMED = 10
-
-
-def sound_commits(info: RunInfo, echo: Echo, *, alone: bool = True) -> Records:
-    """Return the commit records of all undamaged tasks; damaged tasks are discarded, to be computed again.
-
-    Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
-    environment only sizes are compared. Files without a record are removed. Only the holder of the lock may
-    call this.
-
-    Parameters
-    ----------
-    info
-        The run.
-    echo
-        Function that prints a line about each task that is computed again, with the reason.
-    alone
-        Whether no other process can be writing here. Otherwise files without a record stay, since another
-        process may be about to commit them.
-    """
-    started = time.perf_counter()
-    contents = checks_chunks()
-    records, damaged = damaged_records(info, contents=contents)
-    seconds = time.perf_counter() - started
-    if contents and seconds > _LONG_SECONDS:
-        echo(
-            f"{len(records)} committed tasks compared with their records in {duration(seconds)} ({VERIFY}=0 skips this)"
-        )
-    for problem in list(damaged.values())[:_NAMED]:
-        echo(f"{problem}: computed again")
-    if len(damaged) > _NAMED:
-        echo(f"and {len(damaged) - _NAMED} more")
-    if damaged:
-        withdraw(info, damaged)
-        records, _ = scan(info)
-    if alone:
-        sweep(info, records, echo)
-    return records

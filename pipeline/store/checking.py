@@ -1,23 +1,29 @@
-"""Compare the stored files of a run with their recorded sizes or sha256 digests."""
+"""Compare the stored files of a run with their recorded sizes or sha256 digests; discard damaged tasks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from pipeline.products.reporting import report
-from pipeline.store.commits import absent_objects, leftover_keys, scan
-from pipeline.store.errors import DamagedError
+from pipeline.store.commits import absent_objects, leftover_keys, scan, sweep, withdraw
+from pipeline.store.errors import DamagedError, IncompleteError
 from pipeline.store.files import COMMITS, CUBE, DERIVED, Files, problems_of
 from pipeline.store.products import products_in, read_product_attrs
-from pipeline.store.record_copy import copy_problem
+from pipeline.store.record_copy import copy_problem, write_copy
 from pipeline.store.records import Records, marker_key
 from pipeline.store.runfile import RunInfo
 from pipeline.store.skeleton import skeleton_problems
+from pipeline.store.view import VERIFY, checks_chunks
+
+Echo = Callable[[str], None]
 
 ODD = "is a folder where a file should be, or a file where a folder should be"
 
 _TASKS_PER_REPORT = 50
+_LONG_SECONDS = 5.0
+_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,57 @@ def whole_records(info: RunInfo) -> frozenset[int]:
     """Return the tasks with a valid commit record whose files all exist with their sizes."""
     records, damaged = damaged_records(info, contents=False)
     return frozenset(index for index in records if name_of(index) not in damaged)
+
+
+def sound_commits(info: RunInfo, echo: Echo, *, alone: bool = True) -> Records:
+    """Return the commit records of all undamaged tasks; damaged tasks are discarded, to be computed again.
+
+    Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
+    environment only sizes are compared. Files without a record are removed. Only the holder of the lock may
+    call this.
+
+    Parameters
+    ----------
+    info
+        The run.
+    echo
+        Function that prints a line about each task that is computed again, with the reason.
+    alone
+        Whether no other process can be writing here. Otherwise files without a record stay, since another
+        process may be about to commit them.
+    """
+    started = time.perf_counter()
+    contents = checks_chunks()
+    records, damaged = damaged_records(info, contents=contents)
+    seconds = time.perf_counter() - started
+    if contents and seconds > _LONG_SECONDS:
+        echo(f"{len(records)} committed tasks compared with their records in {seconds:.0f} s ({VERIFY}=0 skips this)")
+    for problem in list(damaged.values())[:_NAMED]:
+        echo(f"{problem}: computed again")
+    if len(damaged) > _NAMED:
+        echo(f"and {len(damaged) - _NAMED} more")
+    if damaged:
+        withdraw(info, damaged)
+        records, _ = scan(info)
+    if alone:
+        sweep(info, records, echo)
+    return records
+
+
+def require_all(info: RunInfo, echo: Echo) -> None:
+    """Raise IncompleteError unless every task is committed; remove the files that stopped tasks left."""
+    commits, problems = damaged_records(info, contents=False)
+    n_tasks = info.plan.n_tasks
+    absent = [i for i in range(n_tasks) if i not in commits or name_of(i) in problems]
+    if absent:
+        why = f" {next(iter(problems.values()))}." if problems else ""
+        raise IncompleteError(
+            f"{info.name}: {len(absent)} of {n_tasks} tasks were computed but are not committed "
+            f"here (the first is {absent[0]}).{why} Every worker must see this folder under this path, "
+            "and have space to write. Then give the same command again; it computes only these tasks."
+        )
+    sweep(info, commits, echo)
+    write_copy(info, commits)
 
 
 def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:

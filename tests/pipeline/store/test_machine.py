@@ -22,11 +22,11 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from magpend_core.status import Status
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
-from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
 from pipeline.store import commits, records
+from pipeline.store.checking import sound_commits
 from pipeline.store.commits import Packer, pack_block, read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.run import RunDirectory

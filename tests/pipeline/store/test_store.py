@@ -21,12 +21,12 @@ from pipeline import open_run
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import base_variables
-from pipeline.runs.run import sound_commits
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
 from pipeline.store import commits, consolidate, products, reading, records
 from pipeline.store.arrays import METADATA
+from pipeline.store.checking import sound_commits
 from pipeline.store.commits import Packer, marker_key, pack_block, read_commits, scan, withdraw, write_task
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
