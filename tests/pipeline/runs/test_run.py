@@ -154,11 +154,11 @@ def counted(monkeypatch, fail_at=None):
     calls = []
     original = task.compute
 
-    def compute(spec, cells, block):
+    def compute(plan, block):
         calls.append(block)
         if fail_at is not None and block == calls[min(fail_at, len(calls)) - 1] and len(calls) >= fail_at:
             raise RuntimeError("out of luck")
-        return original(spec, cells, block)
+        return original(plan, block)
 
     monkeypatch.setattr(task, "compute", compute)
     return calls
