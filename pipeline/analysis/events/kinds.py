@@ -179,11 +179,18 @@ def _power(row: Row, times: str) -> str:
     return f"{times} grow with the power -{row['exponent']:.2f} ± {row['exponent_error']:.2f} of the distance"
 
 
+# ---- orbits ---------------------------------------------------------------------------------------
+
+
+def _touch(name: str, text: str, how: str, mark: str = "") -> EventKind:
+    detector = f"{_ROOM}.grazing:name_touch"
+    return EventKind(name, text, "<", f"{text}, {how}", mark=mark, ends=("periodic_orbit",), detector=detector)
+
+
 # ---- the list -------------------------------------------------------------------------------------
 
-_CHAOS, _TORUS, _CYCLE = ("chaotic_set",), ("torus",), ("periodic_orbit",)
+_CHAOS, _TORUS = ("chaotic_set",), ("torus",)
 _PASSAGES, _CRISES = f"{_ROOM}.passages:name_passage", f"{_ROOM}.crises:name_crisis"
-_TOUCH = f"{_ROOM}.grazing:name_touch"
 
 EVENTS = {
     kind.name: kind
@@ -219,23 +226,8 @@ EVENTS = {
         _crisis(BANDS, "merging of bands", "d"),
         _crisis(TWINS, "merging of attractors", "H"),
         EventKind(TRANSIENT, "lost into a transient", "x", _transient, ends=_CHAOS, detector=_CRISES),
-        EventKind(
-            GRAZING,
-            "grazing",
-            "<",
-            "grazing, a peak of it begins to touch a surface of impacts or switches",
-            ends=_CYCLE,
-            detector=_TOUCH,
-        ),
-        EventKind(
-            SLIDING,
-            "grazing-sliding",
-            "<",
-            "grazing-sliding, its stay on the surface of a switch shrinks to a touch",
-            mark="S",
-            ends=_CYCLE,
-            detector=_TOUCH,
-        ),
+        _touch(GRAZING, "grazing", "a peak of it begins to touch a surface of impacts or switches"),
+        _touch(SLIDING, "grazing-sliding", "its stay on the surface of a switch shrinks to a touch", mark="S"),
     )
 }
 """Kinds of events by name.
