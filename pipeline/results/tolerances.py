@@ -24,6 +24,9 @@ PORTRAIT_RTOL = 1e-9
 CROSSING_RTOL = 1e-9
 """Crossings of a limit cycle: they are compared within `SAME_RETURN`."""
 
+PASSAGE_RTOL = 1e-9
+"""Trajectories that pass the place of an orbit that is gone: the lengths of their stays are statistics."""
+
 NEAR_RTOL = 1e-8
 """First polish of guesses, which ends at `NEAR_RESIDUAL`."""
 

@@ -25,14 +25,21 @@ from pipeline.analysis.events.scene import Born, Event, Scene, Stretch, opposite
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, TORUS
 from pipeline.results.ragged import points_of_rows
 
-VALUES, ROUNDS = 15, 3
-"""Further values in each round, and rounds, each between the last torus and the first chaotic set of the one before."""
 
-MOST_OPEN = 2
-"""Most values of a round whose sets are neither tori nor chaotic nor locked: too near to the break-up to tell."""
+@dataclass(frozen=True)
+class BreakupSettings:
+    """Numbers of the search for the value at which a torus breaks up."""
 
-TRANSIENT, LENGTH = 1000, 2048
-"""Sections of each trajectory before it counts, and those along which its exponents are computed."""
+    # further values in each round, and rounds, each between the last torus and the first chaotic set of the one before:
+    # more find the value more exactly, and take longer
+    values: int = 15
+    rounds: int = 3
+    # most values of a round whose sets are neither tori nor chaotic nor locked: too near to the break-up to tell
+    most_open: int = 2
+    # sections of each trajectory before it counts, and those along which its exponents are computed
+    transient: int = 1000
+    length: int = 2048
+
 
 LOCKED, DIFFERENT = -1, -2
 """Codes beside the kinds of sets: trajectories converge to an orbit; those of both starts differ."""
@@ -78,7 +85,13 @@ def _between(scene: Scene, torus: Stretch, chaos: Stretch, rises: bool) -> Born:
     return breakup_of(scene.located, map_along(scene, torus.places[rises]), values, sets)
 
 
-def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets: Sequence[np.ndarray]) -> Born:
+def breakup_of(
+    ds: xr.Dataset,
+    along: SectionMap,
+    values: Sequence[float],
+    sets: Sequence[np.ndarray],
+    settings: BreakupSettings = BreakupSettings(),
+) -> Born:
     """Judge whether a torus breaks up into a chaotic set between two parameter values.
 
     Parameters
@@ -91,6 +104,8 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         Values of the run on the torus and on the chaotic set.
     sets
         Section points of the two, shape (n, state).
+    settings
+        Numbers to choose.
 
     Returns
     -------
@@ -99,9 +114,9 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         length.
     """
     (torus, chaos), n, rate = values, 0, np.nan
-    for _ in range(ROUNDS):
-        between = np.linspace(torus, chaos, VALUES + 2)[1:-1]
-        found = [_found(along, x, sets) for x in between]
+    for _ in range(settings.rounds):
+        between = np.linspace(torus, chaos, settings.values + 2)[1:-1]
+        found = [_found(along, x, sets, settings) for x in between]
         n += len(between)
         kinds = np.array([one.kind for one in found])
         first = int(np.argmin([*(kinds == TORUS), False]))
@@ -109,7 +124,7 @@ def breakup_of(ds: xr.Dataset, along: SectionMap, values: Sequence[float], sets:
         torus, chaos = [torus, *between][first], [*between, chaos][last]
         rate = found[last].rate if last < len(found) else rate
         told = f"by {n} further values it is a torus up to {at(ds, torus)} and chaotic from {at(ds, chaos)} on"
-        if (kinds[first:last] != BOUNDED_SET).any() or last - first > MOST_OPEN:
+        if (kinds[first:last] != BOUNDED_SET).any() or last - first > settings.most_open:
             listed = _listed(ds, between[first:last], found[first:last])
             return Born("", f"whether the torus breaks up is open: {told}; between, it is {listed}")
         if first < last:
@@ -127,9 +142,11 @@ def _listed(ds: xr.Dataset, values: np.ndarray, found: list[_Found]) -> str:
     return "; ".join(parts)
 
 
-def _found(along: SectionMap, value: float, sets: Sequence[np.ndarray]) -> _Found:
+def _found(along: SectionMap, value: float, sets: Sequence[np.ndarray], settings: BreakupSettings) -> _Found:
     """Return the kind of the set at a value, from a trajectory that starts on each of two sets."""
-    paths = along.paths(value, np.array([points[-1] for points in sets]), TRANSIENT + LENGTH)[:, TRANSIENT:]
+    paths = along.paths(value, np.array([points[-1] for points in sets]), settings.transient + settings.length)[
+        :, settings.transient :
+    ]
     first, second = (_kind(along, value, path) for path in paths)
     return first if first.kind == second.kind else _Found(DIFFERENT, max(first.rate, second.rate))
 

@@ -20,24 +20,6 @@ from pipeline.results.tabular import words_of
 DELTA = 4.669201609
 """Feigenbaum's constant: the limit of the ratio of successive intervals between doublings of smooth maps."""
 
-RATIOS = (4.0, 5.5)
-"""Range of the last ratio within which doublings count as a cascade."""
-
-MERGING = 0.187
-"""Distance from the limit at which the bands of chaos have merged to those of a doubling, as a share of that
-doubling's distance: (3.592572 - 3.569946)/(3.569946 - 3.449490) for the logistic map, where four bands merge to two.
-
-The bands merge at the same rate as orbits double. So nearer to the limit a chaotic set has the cascade's bands, and no
-crisis lies between.
-"""
-
-NEAR = 0.15
-"""Largest mean distance of a chaotic set from the last doubled orbit, in units of the orbit's size."""
-
-
-SQUARE_ROOT = 0.25
-"""Largest deviation from 1 of the ratio of a torus's squared sizes to that of its distances from the point."""
-
 
 def name_cascade(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
     """Name the end of a chaotic set by the cascade of doublings of the orbit to which its cells go on."""
@@ -73,6 +55,13 @@ def cascade_of(
         The limit follows from the last two doublings and Feigenbaum's constant; its error is the change if the
         measured ratio takes the place of the constant.
     """
+    allowed = (4.0, 5.5)  # range of the last ratio within which doublings count as a cascade
+    # distance from the limit at which the bands of chaos have merged to those of a doubling, as a share of that
+    # doubling's distance: (3.592572 - 3.569946)/(3.569946 - 3.449490) for the logistic map, where four bands merge to
+    # two. The bands merge at the same rate as orbits double. So nearer to the limit a chaotic set has the cascade's
+    # bands, and no crisis lies between.
+    merging = 0.187
+    near = 0.15  # largest mean distance of a chaotic set from the last doubled orbit, in units of the orbit's size
     chain = _chain(ds, fate.bifurcation)
     way = np.sign(bracket[1] - bracket[0])
     found = ds["value"].values[chain]
@@ -84,19 +73,19 @@ def cascade_of(
     limit = float(found[-1] + steps[-1] / (DELTA - 1.0))
     error = abs(float(steps[-1]) * (1.0 / (DELTA - 1.0) - 1.0 / (ratio - 1.0))) if ratio > 1.0 else np.inf
     told = f"doublings at {at(ds, *found)}, last ratio {ratio:.4f}, limit at {at(ds, limit)}"
-    if not RATIOS[0] < ratio < RATIOS[1]:
+    if not allowed[0] < ratio < allowed[1]:
         return Born("", f"{told}: the ratio is not near {DELTA:.4f}")
     if (limit - bracket[0]) * way < -error or (limit - bracket[1]) * way > error:
         return Born("", f"{told}: the limit lies outside of {at(ds, *bracket)}")
     orbit = ds["bifurcation_section"].values[chain[-1]]
     orbit = orbit[np.isfinite(orbit).all(axis=-1)]
     ratios = steps[:-1] / steps[1:]
-    regular = next(k for k in range(len(ratios)) if ((ratios[k:] > RATIOS[0]) & (ratios[k:] < RATIOS[1])).all())
-    if abs(bracket[1] - limit) > MERGING * abs(limit - found[regular]):
+    regular = next(k for k in range(len(ratios)) if ((ratios[k:] > allowed[0]) & (ratios[k:] < allowed[1])).all())
+    if abs(bracket[1] - limit) > merging * abs(limit - found[regular]):
         return Born("", f"{told}: the set is seen so far from the limit that crises may lie between")
     size = float(geometry.distance(orbit[:, None], orbit[None]).max())
     away = mean_distance(points, orbit, geometry) / size
-    if away > NEAR:
+    if away > near:
         return Born("", f"{told}: the set is {away:.2f} of the orbit's size away from the last orbit")
     why = f"{told}; the set is {away:.3f} of the orbit's size away from the last orbit"
     return Born(CASCADE, why, limit, error, tuple(map(float, found)), ratio)
@@ -153,6 +142,7 @@ def torus_of(
     tori
         Section points of the torus at these two values.
     """
+    largest = 0.25  # deviation from 1 of the ratio of a torus's squared sizes to that of its distances from the point
     k, (beyond, seen, inner) = fate.bifurcation, bracket
     value, kind = float(ds["value"].values[k]), KINDS[int(ds["kind"].values[k])]
     degree = words_of(ds["criticality"])[int(ds["criticality"].values[k])]
@@ -164,6 +154,6 @@ def torus_of(
     near, far = (mean_distance(points, orbit, geometry) for points in tori)
     share = near**2 / far**2 / ((seen - value) / (inner - value))
     told += f"; the torus shrinks as the root of the distance to {share:.2f}"
-    if abs(share - 1.0) > SQUARE_ROOT:
+    if abs(share - 1.0) > largest:
         return Born("", told)
     return Born(TORUS, told, value, float(ds["bracket"].values[k]))

@@ -43,25 +43,9 @@ from pipeline.results.sets import nearest_distances
 OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
 
-OF_BANDS = 12
-"""Longest period of the orbits that are looked for because it is one to three times the number of bands."""
 
-SURE = 4.0
-"""Largest distance of the value from lifetimes, in units of its error."""
-
-GROWN, STRAY = 0.1, 1e-3
-"""Distance from a set, as a share of its size, beyond which points are outside; share of points that may lie there."""
-
-JOINED = 0.5
-"""Least share of the points outside that lie on another set, if the two merge, as a merged set may be larger than both;
-and the largest share of the set itself that lies on the other one."""
-
-RETURNING, LOST = 0.5, 0.02
-"""Shares of trajectories that leave and pass the orbit again: at least, of a set that lives on; at most, of a lost one.
-"""
-
-JUMP = 5.0
-"""Ratio of a set's growth between neighbouring values to its motion from which a crisis is looked for."""
+GROWN = 0.1
+"""Distance from a set, as a share of its size, beyond which points are outside."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +132,8 @@ class Crises:
 
     def _changes(self, one: Stretch) -> list[int]:
         """Return the places of a stretch beyond which the set changes its number of bands or its size."""
+        # ratio of the set's growth between neighbouring values to its motion from which a crisis is looked for
+        jump = 5.0
         places = range(one.places[0], one.places[1] + 1)
         if len(places) < 2:
             return []
@@ -165,7 +151,7 @@ class Crises:
         for k in range(len(places) - 1):
             size = float(geometry.distance(sets[k], sets[k][:1]).max())
             ways = [float(nearest_distances(sets[i], sets[j], geometry).max()) for i, j in ((k, k + 1), (k + 1, k))]
-            grows = max(ways) > GROWN * size and max(ways) > JUMP * min(ways)
+            grows = max(ways) > GROWN * size and max(ways) > jump * min(ways)
             if bands[k] != bands[k + 1] or grows:
                 found.append(places[k])
         return found
@@ -251,10 +237,11 @@ class Crises:
 
     def _orbits(self, along: SectionMap, sample: Sample, seen: float, effort: Effort) -> list[Saddle]:
         """Return the saddle orbits at a parameter value: those of located branches, and those around the set."""
+        longest = 12  # period of the orbits that are looked for because it is one to three times the number of bands
         system = along.family.system
         rows = along.rows(seen, sample.points[:1])
         m = sample.n_bands
-        periods = sorted({*range(1, effort.longest + 1), *(p for p in (m, 2 * m, 3 * m) if p <= OF_BANDS)})
+        periods = sorted({*range(1, effort.longest + 1), *(p for p in (m, 2 * m, 3 * m) if p <= longest)})
         starts = [starts_around(sample.points[::7], effort.starts, 0, system)] * len(periods)
         asked = np.repeat(periods, effort.starts)
         for line in self.scene.lines:
@@ -305,6 +292,7 @@ def _judged(
     scene: Scene, approach: Approach, contact: Contact, beyond: float, others: Mapping[int, np.ndarray]
 ) -> Crisis:
     """Return the crisis at a contact, without a name if lifetimes disagree with the contact or no kind is seen."""
+    sure = 4.0  # largest distance of the value from lifetimes, in units of its error
     ds, period = scene.located, approach.first.period
     state = ", ".join(f"{x:.6g}" for x in approach.first.points[0])
     told = (
@@ -316,7 +304,7 @@ def _judged(
         return Crisis("", f"{told}; too few trajectories leave beyond it for lifetimes")
     told += f"; {_law(scene.located, times, times.exponent, times.exponent_error)}"
     far = max(abs(times.values[0] - contact.value), 1e-300)
-    if abs(times.value - contact.value) > SURE * times.value_error + contact.error or times.value_error > 0.25 * far:
+    if abs(times.value - contact.value) > sure * times.value_error + contact.error or times.value_error > 0.25 * far:
         return Crisis("", f"{told}: they do not agree with the clearance")
     what, twin, bands = _kind(approach, contact, times, others)
     if not what:
@@ -343,15 +331,21 @@ def _kind(
     approach: Approach, contact: Contact, times: Lifetimes, others: Mapping[int, np.ndarray]
 ) -> tuple[str, int, tuple[int, int]]:
     """Return the kind of a crisis (empty if open), the id of the set that is joined, and the numbers of bands."""
+    # shares of trajectories that leave and pass the orbit again: at most, of a lost set; at least, of one that lives on
+    lost, returning = 0.02, 0.5
+    stray = 1e-3  # share of points that may lie outside of a set
+    # least share of the points outside that lie on another set, if the two merge, as a merged set may be larger than
+    # both; and the largest share of the set itself that lies on the other one
+    joins = 0.5
     along, sample, effort = approach.along, approach.sample, approach.effort
     k = next((i for i, mean in enumerate(times.means) if mean > 2 * SETTLE), 0)
     value, length = times.values[k], max(4 * effort.length, int(32 * times.means[k]))
     paths = approach.paths(value, length)
     share = approach.returning(value, paths)
     m = sample.n_bands
-    if share <= LOST:
+    if share <= lost:
         return BOUNDARY, -1, (m, 0)
-    if share < RETURNING:
+    if share < returning:
         return "", -1, (m, 0)
     geometry, size = along.geometry, approach.size
     old = approach.paths(2.0 * contact.value - value, effort.length)[:, SETTLE:].reshape(-1, geometry.n_states)
@@ -359,13 +353,13 @@ def _kind(
     new = new[np.isfinite(new).all(axis=1)]
     after = count_bands(paths[int(np.isfinite(paths).all(axis=2).sum(axis=1).argmax())], geometry)
     outside = new[nearest_distances(new, old, geometry) > GROWN * size]
-    if len(outside) <= STRAY * len(new):
+    if len(outside) <= stray * len(new):
         return (BANDS, -1, (m, after)) if after < m else ("", -1, (m, after))
     for number, points in others.items():
         here = along.paths(2.0 * contact.value - value, points[-effort.lanes :], effort.length)[:, SETTLE:]
         here = here.reshape(-1, geometry.n_states)
         here = here[np.isfinite(here).all(axis=1)]
         same, joined = (nearest_distances(x, here, geometry) <= GROWN * size for x in (old, outside))
-        if same.mean() < JOINED <= joined.mean():
+        if same.mean() < joins <= joined.mean():
             return TWINS, number, (m, after)
     return INTERIOR, -1, (m, after)

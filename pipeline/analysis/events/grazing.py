@@ -30,32 +30,8 @@ from pipeline.analysis.events.lines import LOCATED, Line
 from pipeline.analysis.events.scene import Event, Scene
 from pipeline.results.tolerances import BRANCH_RTOL
 
-SAMPLES = 4000
-"""Instants of an orbit between which its peaks are interpolated."""
-
-CORNER = 3.0
-"""Change of a rate between two instants, in units of those before and after, from which on it is a jump: an impact."""
-
-ROUNDED = 1e-9
+ON_SURFACE = 1e-9
 """Values of the surface's function, in units of its range, that are 0 at neighbouring instants: sliding, or at rest."""
-
-STUCK, TANGENT = 1e-12, 100.0
-"""Value of a switch's function, in units of its range, up to which an orbit sticks. Largest value of the function one
-stay before an orbit comes to stick, in units of its range and of the square of the stay's share of the period: beyond
-it the orbit comes in across the surface, and not along it.
-"""
-
-NODES, APART = 30, 2.0
-"""Last points of a branch that are looked at, and the least ratio of the heights of those that are used."""
-
-ORBITS = 4
-"""Most orbits from which the end is extrapolated."""
-
-NEAR = 0.02
-"""Largest height of the last peak below the surface, in units of that function's range on the orbit."""
-
-REACH = 1e-4
-"""Largest distance of the touch from the last orbit, and largest error, in units of the interval of the parameter."""
 
 
 def name_touch(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
@@ -72,7 +48,7 @@ def name_touch(scene: Scene, one: Event, named: Sequence[Event]) -> Event:
     return replace(one, fate=fate, what=what, error=max(error, LOCATED * scene.scale))
 
 
-def grazing_of(line: Line, node: int, family: Family) -> tuple[str, float, float, str] | None:
+def grazing_of(line: Line, node: int, family: Family, n_samples: int = 4000) -> tuple[str, float, float, str] | None:
     """Return the name of the touch at which an orbit ends, its value, error and evidence; None if there is no touch.
 
     Parameters
@@ -81,21 +57,26 @@ def grazing_of(line: Line, node: int, family: Family) -> tuple[str, float, float
         Branch of the orbit, and its end.
     family
         Family of the orbits of the branch.
+    n_samples
+        Instants of an orbit between which its peaks are interpolated.
     """
+    n_nodes = 30  # last points of the branch that are looked at
+    # distance of the touch from the last orbit, and largest error, in units of the interval of the parameter
+    largest = 1e-4
     system = family.system
     if not system.n_switches + system.n_impacts or not line.period:
         return None
-    nodes = range(node, max(node - NODES, -1), -1) if node else range(min(NODES, len(line.value)))
+    nodes = range(node, max(node - n_nodes, -1), -1) if node else range(min(n_nodes, len(line.value)))
     guesses = [family.unknowns(line.points[i][0], [line.value[i]]) for i in nodes if line.bifurcation[i] < 0]
     points = [p for p in run_together([at_value(family, guess) for guess in guesses]) if p is not None]
     values = np.array([family.values(point.u)[0] for point in points])
-    orbits = [_heights(family, point, np.linspace(0.0, point.value.seconds, SAMPLES)) for point in points]
-    peaks = [_peaks(h, rate, p.value.seconds / (SAMPLES - 1)) for (h, rate), p in zip(orbits, points, strict=True)]
+    orbits = [_heights(family, point, np.linspace(0.0, point.value.seconds, n_samples)) for point in points]
+    peaks = [_peaks(h, rate, p.value.seconds / (n_samples - 1)) for (h, rate), p in zip(orbits, points, strict=True)]
     stays = [_stays(family, point, h) for (h, _), point in zip(orbits, points, strict=True)]
     for name, measured in ((GRAZING, peaks), (SLIDING, stays)):
         for of in range(len(measured[0]) if measured else 0):
             touch = _touch(values, [one[of] for one in measured])
-            if touch is not None and max(abs(touch[0] - values[0]), touch[1]) <= REACH * family.scales[0]:
+            if touch is not None and max(abs(touch[0] - values[0]), touch[1]) <= largest * family.scales[0]:
                 return name, touch[0], touch[1], _evidence(name, of, touch[2], system.n_switches)
     return None
 
@@ -116,14 +97,16 @@ def _touch(values: np.ndarray, peaks: Sequence[float]) -> tuple[float, float, li
 
     Peaks are shares of the range of the surface's function. Return the value, its error, and the peaks used.
     """
+    apart, most = 2.0, 4  # least ratio of the heights of the orbits that are used, and the most orbits
+    near = 0.02  # largest height of the last peak below the surface, in units of that function's range on the orbit
     chosen: list[int] = []
     for i, peak in enumerate(peaks):
         if not peak < 0.0:  # no peak on this side
             break
-        if not chosen or peak < APART * peaks[chosen[-1]]:
+        if not chosen or peak < apart * peaks[chosen[-1]]:
             chosen.append(i)
-    chosen = chosen[:ORBITS]
-    if len(chosen) < 3 or peaks[chosen[0]] < -NEAR:
+    chosen = chosen[:most]
+    if len(chosen) < 3 or peaks[chosen[0]] < -near:
         return None
     x, y = values[chosen], np.array(peaks)[chosen]
     if not (np.diff(x) > 0.0).all() and not (np.diff(x) < 0.0).all():
@@ -166,16 +149,19 @@ def _stays(family: Family, point: Point, values: np.ndarray) -> list[float]:
 
     NaN if it does not stick, more than once, at its ends, or if it comes in across the surface.
     """
-    times = np.linspace(0.0, point.value.seconds, SAMPLES)
+    # largest value of the function one stay before an orbit comes to stick, in units of its range and of the square of
+    # the stay's share of the period: beyond it the orbit comes in across the surface, and not along it
+    tangent = 100.0
+    times = np.linspace(0.0, point.value.seconds, len(values))
     found = []
     for of, h in enumerate(values.T[: family.system.n_switches]):
         extent = max(float(np.ptp(h)), 1e-300)
-        on = np.flatnonzero(np.abs(h) <= max(ROUNDED * extent, float(np.abs(h).min())))
+        on = np.flatnonzero(np.abs(h) <= max(ON_SURFACE * extent, float(np.abs(h).min())))
         share = np.nan
         n = len(on)
         before = on[0] - n
-        if before >= 0 and on[-1] < SAMPLES - 1 and abs(h[before]) <= TANGENT * extent * (n / SAMPLES) ** 2:
-            near = np.linspace(times[on[0] - 1], times[on[-1] + 1], SAMPLES)
+        if before >= 0 and on[-1] < len(h) - 1 and abs(h[before]) <= tangent * extent * (n / len(h)) ** 2:
+            near = np.linspace(times[on[0] - 1], times[on[-1] + 1], len(h))
             share = _stay(_heights(family, point, near)[0][:, of] / extent) * (near[-1] - near[0]) / times[-1]
         found.append(-share)
     return found
@@ -186,7 +172,8 @@ def _stay(h: np.ndarray) -> float:
 
     The function comes to 0 along a straight line, and leaves it along a parabola.
     """
-    on = np.flatnonzero(np.abs(h) <= STUCK)
+    stuck = 1e-12  # value of a switch's function, in units of its range, up to which an orbit sticks
+    on = np.flatnonzero(np.abs(h) <= stuck)
     if not len(on) or len(on) != on[-1] - on[0] + 1 or on[0] < 2 or on[-1] > len(h) - 3:
         return np.nan
     before, after = np.abs(h[on[0] - 2 : on[0]]), np.sqrt(np.abs(h[on[-1] + 1 : on[-1] + 3]))
@@ -200,12 +187,14 @@ def _peak(h: np.ndarray, rate: np.ndarray, step: float) -> float:
 
     NaN if there is none, or if the function stays at 0 for a while.
     """
-    on = np.abs(h) <= ROUNDED * np.ptp(h)
+    # change of a rate between two instants, in units of those before and after, from which on it is a jump: an impact
+    corner = 3.0
+    on = np.abs(h) <= ON_SURFACE * np.ptp(h)
     if (on[:-2] & on[1:-1] & on[2:]).any():
         return np.nan
     jump = np.abs(np.diff(rate))
     usual = np.maximum(np.append(jump[1:], 0.0), np.append(0.0, jump[:-1]))
-    at = np.flatnonzero((rate[:-1] > 0.0) & (rate[1:] <= 0.0) & (jump <= CORNER * usual))
+    at = np.flatnonzero((rate[:-1] > 0.0) & (rate[1:] <= 0.0) & (jump <= corner * usual))
     a, b, ra, rb = h[at], h[at + 1], step * rate[at], step * rate[at + 1]
     s = ra / (ra - rb)
     # the cubic through both values and rates

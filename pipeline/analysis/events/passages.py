@@ -36,6 +36,7 @@ from pipeline.layout.vocabulary import TORUS as TORUS_SET
 from pipeline.results.ragged import points_of_rows
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import plain
+from pipeline.results.tolerances import PASSAGE_RTOL
 
 TYPES = {FOLD: "i", TORUS: "ii", DOUBLING: "iii"}
 """Types of intermittency by the bifurcation of the orbit."""
@@ -67,31 +68,19 @@ MEASURED = {
 POWERS = {FOLD: 6, TORUS: 2, DOUBLING: 2}
 """Powers m in the ratio of means that is the length of laminar phases."""
 
-GATE, OF_GAP = 0.1, 0.25
-"""Largest distance from the orbit in a laminar phase: as a share of the extent of the set, and at most as a share of
-the least distance between two section points of the orbit.
-"""
 
-LEAST_LENGTH = 10.0
-"""Least length that is fitted, in periods of the orbit."""
+@dataclass(frozen=True)
+class PassageSettings:
+    """Numbers of the measurement of laminar phases and of the verdict on their law."""
 
-LEAST_VALUES, MOST_VALUES = 4, 6
-"""Numbers of values that are fitted, the nearest ones."""
-
-GROUPS = 8
-"""Groups of trajectories whose spread gives the error of a length."""
-
-AGREES, LARGEST_ERROR = 0.12, 0.15
-"""Largest deviation of an exponent from the expected one beyond its error, and largest error."""
-
-REGULAR = 0.2
-"""Largest spread of the lengths of laminar phases on a torus; on chaotic sets it is larger."""
-
-WHOLE = 0.1
-"""Largest distance of the turns over the period of an orbit from a whole number, on a torus that passes it."""
-
-TOLERANCE = 1e-9
-"""Tolerance of the integrations."""
+    # least length that is fitted, in periods of the orbit; less fits more values, farther from the law
+    least_length: float = 10.0
+    least_values: int = 4  # numbers of values that are fitted, the nearest ones
+    most_values: int = 6
+    groups: int = 8  # groups of trajectories whose spread gives the error of a length
+    agrees: float = 0.12  # largest deviation of an exponent from the expected one beyond its error, and largest error
+    largest_error: float = 0.15
+    regular: float = 0.2  # largest spread of the lengths of laminar phases on a torus; on chaotic sets it is larger
 
 
 @dataclass(frozen=True)
@@ -130,6 +119,7 @@ def passage_of(
     points: np.ndarray,
     geometry: Geometry,
     is_torus: bool,
+    settings: PassageSettings = PassageSettings(),
 ) -> Born:
     """Judge whether a chaotic set or a torus ends at a bifurcation of the orbit to which its cells go on.
 
@@ -147,6 +137,8 @@ def passage_of(
         Geometry of the states.
     is_torus
         Whether the set is a torus.
+    settings
+        Numbers to choose.
 
     Returns
     -------
@@ -164,9 +156,11 @@ def passage_of(
     distances = abs(bracket[1] - value) * 0.5 ** np.arange(effort.n_values)
     values = value + np.sign(bracket[1] - value) * distances
     sections = _sections(family, values, points, effort.many, effort.n_sections)
-    found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind])
-    fitted = scaling(found, kind, len(ghost), effort)
-    born = replace(_judged(ds, found, fitted, kind, told, value, is_torus), error=float(ds["bracket"].values[k]))
+    found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind], settings)
+    fitted = scaling(found, kind, len(ghost), effort, settings)
+    born = replace(
+        _judged(ds, found, fitted, kind, told, value, is_torus, settings), error=float(ds["bracket"].values[k])
+    )
     if born.what != LOCKING or fitted is None:
         return born
     return replace(born, rotation=rotation_of(sections[fitted[2][-1]], len(ghost), geometry))
@@ -180,6 +174,7 @@ def _judged(
     told: str,
     value: float,
     is_torus: bool,
+    settings: PassageSettings = PassageSettings(),
 ) -> Born:
     """Name the end if the lengths grow towards the bifurcation with its exponent."""
     if fitted is None:
@@ -188,10 +183,10 @@ def _judged(
     lengths, away = found.length[chosen], [own_width(ds, value, x) for x in found.distance[chosen]]
     told += f"; lengths of laminar phases near it from {lengths[0]:.3g} to {lengths[-1]:.3g} sections at distances from"
     told += f" {away[0]:.2g} to {away[-1]:.2g}: exponent {exponent:.3f} ± {error:.1g}"
-    if (found.spread[chosen].max() <= REGULAR) != is_torus:
+    if (found.spread[chosen].max() <= settings.regular) != is_torus:
         return Born("", f"{told}, but they are {'uneven, as in chaos' if is_torus else 'equally long, as on a torus'}")
     expected = EXPONENTS[kind]
-    if error > LARGEST_ERROR or abs(exponent - expected) > max(AGREES, error):
+    if error > settings.largest_error or abs(exponent - expected) > max(settings.agrees, error):
         return Born("", f"{told}, and {expected:g} is expected")
     what = LOCKING if is_torus else INTERMITTENCY[TYPES[kind]]
     return Born(what, told, value, exponent=-exponent, exponent_error=error)
@@ -199,9 +194,12 @@ def _judged(
 
 def _gate(points: np.ndarray, ghost: np.ndarray, geometry: Geometry) -> float:
     """Return the distance from the orbit up to which a section belongs to a laminar phase."""
+    # largest distance from the orbit in a laminar phase: as a share of the extent of the set, and at most as a share of
+    # the least distance between two section points of the orbit
+    gate, of_gap = 0.1, 0.25
     extent = float(np.ptp(geometry.difference(points, points[0]), axis=0).max())
     gaps = geometry.distance(ghost[:, None], ghost[None])[np.triu_indices(len(ghost), 1)]
-    return float(min([GATE * extent, *(OF_GAP * gaps)]))
+    return float(min([gate * extent, *(of_gap * gaps)]))
 
 
 def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int, n: int) -> np.ndarray:
@@ -215,14 +213,20 @@ def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int,
         rows.states,
         np.zeros(len(rows.states)),
         n_more=n,
-        **limits_at(TOLERANCE),
+        **limits_at(PASSAGE_RTOL),
         system=family.system,
     )
     return np.asarray(found.section[:, 0].reshape(len(values), many, n, -1))
 
 
 def phases(
-    sections: np.ndarray, ghost: np.ndarray, gate: float, distances: np.ndarray, geometry: Geometry, power: int
+    sections: np.ndarray,
+    ghost: np.ndarray,
+    gate: float,
+    distances: np.ndarray,
+    geometry: Geometry,
+    power: int,
+    settings: PassageSettings = PassageSettings(),
 ) -> Phases:
     """Measure the lengths of the laminar phases of trajectories: of their stays near an orbit.
 
@@ -240,6 +244,8 @@ def phases(
         Geometry of the states.
     power
         The power m of `POWERS`.
+    settings
+        Numbers to choose.
     """
     rows = []
     for one in sections:
@@ -248,11 +254,11 @@ def phases(
             near |= geometry.distance(one, point) <= gate
         # at the ends of a channel some points of the orbit are near and others are not
         stays = [stay[stay >= 2 * len(ghost)] for stay in map(_runs, near)]
-        groups = [_ratio(np.concatenate(stays[i::GROUPS]), power) for i in range(GROUPS)]
+        groups = [_ratio(np.concatenate(stays[i :: settings.groups]), power) for i in range(settings.groups)]
         every = np.concatenate(stays)
         length, middle = _ratio(every, power), _ratio(every, 2)
         # a length is a whole number of sections
-        error = float(np.std(groups)) / np.sqrt(GROUPS - 1.0) + 0.5
+        error = float(np.std(groups)) / np.sqrt(settings.groups - 1.0) + 0.5
         spread = np.sqrt(max(_ratio(every, 3) / middle - 1.0, 0.0))
         rows.append((length, error / length, spread, len(every)))
     length, error, spread, number = np.array(rows).T
@@ -273,16 +279,20 @@ def _ratio(lengths: np.ndarray, power: int) -> float:
     return float((lengths**power).sum() / (lengths ** (power - 1)).sum()) if len(lengths) else np.nan
 
 
-def scaling(found: Phases, kind: str, period: int, effort: Effort) -> tuple[float, float, np.ndarray] | None:
+def scaling(
+    found: Phases, kind: str, period: int, effort: Effort, settings: PassageSettings = PassageSettings()
+) -> tuple[float, float, np.ndarray] | None:
     """Fit the power with which the lengths grow near the bifurcation, with its error.
 
     The difference between the exponents without the farthest and without the nearest distance is part of the error.
     Return also the numbers of the distances; None if there are too few.
     """
     longest = effort.longest * effort.n_sections
-    serves = (found.length >= LEAST_LENGTH * period) & (found.length <= longest) & (found.number >= effort.n_phases)
-    chosen = np.flatnonzero(serves)[-MOST_VALUES:]
-    if len(chosen) < LEAST_VALUES:
+    serves = (
+        (found.length >= settings.least_length * period) & (found.length <= longest) & (found.number >= effort.n_phases)
+    )
+    chosen = np.flatnonzero(serves)[-settings.most_values :]
+    if len(chosen) < settings.least_values:
         return None
     law = passage if kind == FOLD else straight
     x, y, error = np.log(found.distance[chosen]), np.log(found.length[chosen]), found.error[chosen]
@@ -322,6 +332,8 @@ def rotation_of(trajectories: np.ndarray, period: int, geometry: Geometry) -> st
     one alone, else in the plane of the first two states about the middle of their extent, clockwise as in `rotation`;
     p is known up to multiples of q. The text is empty if the points do not turn by p/q.
     """
+    # largest distance of the turns over the period of an orbit from a whole number, on a torus that passes it
+    whole = 0.1
     flat = trajectories.reshape(-1, trajectories.shape[-1])
     away = geometry.difference(trajectories, 0.5 * (flat.max(axis=0) + flat.min(axis=0)))
     if sum(geometry.is_angle) == 1:
@@ -334,4 +346,4 @@ def rotation_of(trajectories: np.ndarray, period: int, geometry: Geometry) -> st
     middle = float(np.angle(np.exp(1j * moved).mean()))
     turns = (middle + np.angle(np.exp(1j * (moved - middle)))).mean() / (2.0 * np.pi) * period
     p = round(turns)
-    return f"{p % period}/{period}" if abs(turns - p) < WHOLE and gcd(p, period) == 1 else ""
+    return f"{p % period}/{period}" if abs(turns - p) < whole and gcd(p, period) == 1 else ""

@@ -14,10 +14,6 @@ from pipeline.results.run import OpenRun
 from pipeline.results.tabular import counted, words_of
 from pipeline.specification.tables import RATES
 
-PARTS = 4
-"""Parts into which a round divides an interval. Bisection needs a third fewer cells and twice as many rounds, each of
-which follows the branches again."""
-
 
 def refined(run: OpenRun, options: EventOptions) -> xr.Dataset:
     """Name the events of the run beside this one, which has further values in the intervals of open events.
@@ -66,6 +62,9 @@ def further_values(ds: xr.Dataset, width: float, word: str = "") -> list[float]:
     word
         Word for the drive's rate in which the width is given, if the parameter is the frequency.
     """
+    # parts into which a round divides an interval. Bisection needs a third fewer cells and twice as many rounds, each
+    # of which follows the branches again.
+    parts = 4
     what = np.array(words_of(ds["what"]))[ds["what"].values]
     seen, beyond = ds["seen"].values, ds["beyond"].values
     ends = np.sort(np.stack([seen, beyond]), axis=0)
@@ -74,6 +73,6 @@ def further_values(ds: xr.Dataset, width: float, word: str = "") -> list[float]:
     long = np.abs(shown[1] - shown[0]) > width * (1.0 + 1e-9)
     is_open = (what == UNDECIDED) | (ds["value_error"].values > width)
     chosen = np.flatnonzero(long & is_open & ~np.isin(what, [RANGE_END, LIVES_ON]))
-    shares = np.arange(1, PARTS) / PARTS
+    shares = np.arange(1, parts) / parts
     values = {float(a + share * (b - a)) for a, b in ends.T[chosen].tolist() for share in shares}
     return sorted(values - {x for pair in ends.T[chosen].tolist() for x in pair})

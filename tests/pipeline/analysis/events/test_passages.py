@@ -11,7 +11,7 @@ from scipy.optimize import brentq, fsolve
 import magpend
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD
 from pipeline.analysis.events import grazing, passages
-from pipeline.analysis.events.passages import Phases, phases, rotation_of, scaling
+from pipeline.analysis.events.passages import PassageSettings, Phases, phases, rotation_of, scaling
 from pipeline.results.sets import Geometry
 
 LOGISTIC = magpend.model("x' = r*x*(1 - x)", name="logistic", kind="map", r=3.83)
@@ -67,7 +67,7 @@ def test_events__intermittency(name, tmp_path):
     table = sweep(model, tmp_path, starts, **axes).table("events")
     ((value, error, found, spread, _),) = of(table, name)
     assert abs(value - known) <= error < 1e-8
-    assert abs(found - exponent) <= 2.0 * spread <= 2.0 * passages.LARGEST_ERROR
+    assert abs(found - exponent) <= 2.0 * spread <= 2.0 * PassageSettings.largest_error
     assert not (table["what"] == "not_decided").any()
 
 
@@ -212,9 +212,9 @@ LINE = Geometry((False,), (1.0,))
 def test_phases__of_known_runs():
     """Stays of 3, 5 and 3 sections between excursions; those that are cut off or shorter than 2 do not count."""
     near = np.array([1, 0, 1, 1, 1, 0, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1, 0, 1], float)
-    sections = np.tile(1.0 - near, (1, passages.GROUPS, 1))[..., None]
+    sections = np.tile(1.0 - near, (1, PassageSettings.groups, 1))[..., None]
     found = phases(sections, np.zeros((1, 1)), 0.5, np.ones(1), LINE, 2)
-    assert found.number == [3 * passages.GROUPS]
+    assert found.number == [3 * PassageSettings.groups]
     assert found.length == pytest.approx([(9 + 25 + 9) / (3 + 5 + 3)])
 
 
@@ -226,7 +226,7 @@ def test_scaling__refuses_the_other_law(kind, exponent):
         found = Phases(d, length, np.full(6, 0.02), np.full(6, 500), np.full(6, 0.5))
         slope, error, chosen = scaling(found, kind, 1, passages.MEASURED[kind])
         assert slope == pytest.approx(other, abs=2e-3)
-        assert len(chosen) >= passages.LEAST_VALUES
+        assert len(chosen) >= PassageSettings.least_values
         told = passages._judged(ALONG_R, found, (slope, error, chosen), kind, "", 0.0, False)
         assert bool(told.what) == (other == exponent)
         assert not passages._judged(ALONG_R, found, (slope, error, chosen), kind, "", 0.0, True).what
@@ -264,6 +264,6 @@ def test_touch__extrapolates_and_refuses():
     peaks = -away - away**2
     value, error, used = grazing._touch(2.0 - away, peaks)
     assert abs(value - 2.0) <= max(error, 1e-12)
-    assert len(used) == grazing.ORBITS
+    assert len(used) == 4
     assert grazing._touch(2.0 - away, peaks - 0.1) is None
     assert grazing._touch(2.0 - away, [np.nan] * 7) is None

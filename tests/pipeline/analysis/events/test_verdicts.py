@@ -8,7 +8,7 @@ import xarray as xr
 
 from pipeline.analysis.branches.kinds import DOUBLING, KINDS, TORUS
 from pipeline.analysis.events import breakups
-from pipeline.analysis.events.breakups import LOCKED, ROUNDS, VALUES, _Found, breakup_of
+from pipeline.analysis.events.breakups import LOCKED, _Found, breakup_of
 from pipeline.analysis.events.cascades import DELTA, _chain, cascade_of, torus_of
 from pipeline.analysis.events.kinds import BREAKUP, CASCADE
 from pipeline.analysis.events.lines import Fate
@@ -129,7 +129,7 @@ def test_torus_of__needs_a_supercritical_point_in_the_bracket(kind, degree, brac
 
 def judged(monkeypatch, kind_at, ends: tuple[float, float] = (0.0, 1.0)):
     """Judge a break-up by a rule for the kind of the set at a value."""
-    monkeypatch.setattr(breakups, "_found", lambda along, value, sets: _Found(kind_at(value), 0.25))
+    monkeypatch.setattr(breakups, "_found", lambda along, value, *given: _Found(kind_at(value), 0.25))
     return breakup_of(xr.Dataset(attrs={"parameter": "mu"}), None, ends, [])
 
 
@@ -139,9 +139,9 @@ def test_breakup_of__halves_around_the_value(monkeypatch, ends) -> None:
     at, rises = 0.618, ends[0] < ends[1]
     found = judged(monkeypatch, lambda x: TORUS_SET if (x < at) == rises else CHAOTIC_SET, ends)
     assert found.what == BREAKUP
-    assert found.error == pytest.approx(0.5 / (VALUES + 1) ** ROUNDS)
+    assert found.error == pytest.approx(0.5 / 16**3)
     assert abs(found.value - at) <= found.error
-    assert f"by {VALUES * ROUNDS} further values" in found.why
+    assert "by 45 further values" in found.why
     assert "largest exponent 0.25 per section" in found.why
 
 
