@@ -101,6 +101,25 @@ def test_tolerances__of_the_analyses_stand_in_one_table():
     assert [name_of(path) for path in others if own.search(path.read_text("utf-8"))] == []
 
 
+def test_numbers__have_a_name_for_each_meaning():
+    """The names of numbers that modules hold; what somebody might choose is a field of a method's settings instead."""
+    named = Counter(name for path in PIPELINE for name in numbers_in(path))
+    assert {name for name, n in named.items() if n > 1} == set()
+
+
+def numbers_in(path: Path) -> Iterator[str]:
+    """Names of a module's constants that are numbers, or tuples of them."""
+    for node in ast.parse(path.read_text("utf-8")).body:
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        )
+        parts = list(ast.walk(node.value)) if targets and node.value is not None else []
+        is_number = any(isinstance(part, ast.Constant) and type(part.value) in (int, float) for part in parts)
+        if is_number and not any(isinstance(part, (ast.Dict, ast.Call)) for part in parts):
+            names = (part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name))
+            yield from (name for name in names if name.isupper())
+
+
 @pytest.fixture(scope="module")
 def graph():
     """Which modules each module imports; imports inside functions and for types count too."""

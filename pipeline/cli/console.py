@@ -56,7 +56,7 @@ _SENTENCES = {
 
 LOG = logging.getLogger("magpend")
 
-FIRST_LINE_S, LINE_EVERY_S, BAR_EVERY_S = 2.0, 10.0, 0.3
+FIRST_LINE_S, NEXT_LINE_S, BAR_EVERY_S = 2.0, 10.0, 0.3
 
 
 class EnoughError(Exception):
@@ -203,7 +203,7 @@ class Display:
         pause = FIRST_LINE_S
         while not self._over.wait(pause):
             self.show()
-            pause = BAR_EVERY_S if self._terminal else LINE_EVERY_S
+            pause = BAR_EVERY_S if self._terminal else NEXT_LINE_S
 
     def stop(self) -> None:
         """Stop redrawing the progress, and remove the progress bar."""

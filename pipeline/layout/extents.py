@@ -28,13 +28,13 @@ from pipeline.specification.models import KEPT
 from pipeline.specification.spec import Spec
 from pipeline.specification.tables import FREQUENCY
 
-MOST_CELLS, MOST_POINTS = 32, 8
+MOST_MOVED, MOST_POINTS = 32, 8
 """Most cells whose motion is integrated, and most parameter points that they are spread over."""
 
 ATTEMPTS = 400
 """Attempted steps or iterates."""
 
-GROWS = 1.2
+LEAVES_BY = 1.2
 """A state whose later motion leaves the range of the earlier one by this factor is on its way to somewhere else."""
 
 
@@ -99,7 +99,7 @@ def _measured(spec: Spec, model: TextModel) -> dict[str, tuple[float, tuple[floa
     points = parameter_points(spec)
     points = [points[i] for i in np.unique(np.linspace(0, len(points) - 1, MOST_POINTS).astype(int))]
     states = initial_states(spec.initial_conditions)
-    chosen = np.unique(np.linspace(0, len(states) - 1, MOST_CELLS // len(points)).astype(np.int64))
+    chosen = np.unique(np.linspace(0, len(states) - 1, MOST_MOVED // len(points)).astype(np.int64))
     y = np.tile(states.at(chosen), (len(points), 1)).T
     columns: dict[str, Any] = {"pi": np.pi}
     for name in (*model.parameter_names, FREQUENCY):
@@ -121,7 +121,7 @@ def _size(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     last = times[-1]
     late = np.where(times >= 0.75 * last, values, 0.0).max(axis=0)
     early = np.where(times < 0.75 * last, values, 0.0).max(axis=0)
-    settles = whole & (late <= GROWS * early)
+    settles = whole & (late <= LEAVES_BY * early)
     if not settles.any():
         start = float(values[0].max())
         return start, start
@@ -138,7 +138,7 @@ def _extent(times: np.ndarray, values: np.ndarray) -> tuple[float, float] | None
     """
     is_late = times >= 0.5 * times[-1]
     early, late = _range(values, ~is_late), _range(values, is_late)
-    more = (GROWS - 1.0) * (early[1] - early[0])
+    more = (LEAVES_BY - 1.0) * (early[1] - early[0])
     settles = np.isfinite(values).all(axis=0) & (late[0] >= early[0] - more) & (late[1] <= early[1] + more)
     if settles.any():
         low, high = late[0][settles].min(), late[1][settles].max()

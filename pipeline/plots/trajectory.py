@@ -140,9 +140,6 @@ def equalise(ax: Axes) -> None:
     ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
 
 
-MOST_PANELS, MOST_LINES = 3, 2
-"""Most panels of variables that are no states, and most lines in each."""
-
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY)
 """Of the pairs of states that portraits show; a seventh begins again."""
 
@@ -290,12 +287,13 @@ def _units(model: Model) -> list[tuple[str, ...]]:
 
 def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
     """Group the other variables of the time series into panels by unit, up to a limit."""
+    most_panels, most_lines = 3, 2  # most panels of variables that are no states, and most lines in each
     found: dict[str, tuple[str, ...]] = {}
     for name, values in ds.data_vars.items():
         if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
             unit = shown_unit(values.attrs, "")
-            found[unit] = (*found.get(unit, ()), str(name))[:MOST_LINES]
-    return list(found.values())[:MOST_PANELS]
+            found[unit] = (*found.get(unit, ()), str(name))[:most_lines]
+    return list(found.values())[:most_panels]
 
 
 def _colour(pair: int) -> str:

@@ -21,7 +21,7 @@ from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.spec import Spec
 
-BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
+BRANCHES, MOST_SAMPLED_BRANCHES, POINTS = 32, 256, 8
 """Size of a sample: branches (two groups of lanes or more), most branches, points of each branch."""
 
 
@@ -218,7 +218,7 @@ def _periods_until_closed(plan: Plan, most: float, ratio: float) -> float:
         periods = values["n_periods"]
         found = np.append(found, periods[:, 1::2] if periods.shape[1] > 1 else periods)
         per_branch = float(found.mean()) * a_period * periods.shape[1]
-        n_branches = int(np.clip(left / per_branch, 1, MOST_BRANCHES))
+        n_branches = int(np.clip(left / per_branch, 1, MOST_SAMPLED_BRANCHES))
         if len(found) >= plan.n_cells or n_branches < BRANCHES:
             break
     return mean_with_tail(found, cap, most)

@@ -17,8 +17,7 @@ import xarray as xr
 from magpend_core.status import Status
 from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.extension.clouds import INSIDE, REACHED, Cloud, members
-from pipeline.analysis.attractors.extension.courses import DIVERGED as COURSE_DIVERGED
-from pipeline.analysis.attractors.extension.courses import Course, rest_number
+from pipeline.analysis.attractors.extension.courses import COURSE_DIVERGED, Course, rest_number
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
@@ -37,8 +36,6 @@ from pipeline.results.tolerances import CELL_CLOSURE
 UNDECIDED, ELSEWHERE = -1, -3
 """Labels of trajectories that end on no known attractor: undecided, and on an attractor that no cell shows."""
 
-LEAST, MOST = 256, 4096
-"""Least and most sections after which undecided trajectories are handed to the extension."""
 
 IN_CLOUD = 2 * LEG
 """Section points that a trajectory needs on a set that does not close to count as on it."""
@@ -182,9 +179,10 @@ class Destinations(KnownSets):
         near
             If above 0, also find when each trajectory came within this scaled distance of its attractor for good.
         """
-        flight = self.fly(states, MOST if near else IN_CLOUD)
+        least, most = 256, 4096  # sections after which undecided trajectories are handed to the extension, and most
+        flight = self.fly(states, most if near else IN_CLOUD)
         ends = Followed(np.full(len(states), UNDECIDED, np.int64), np.full(len(states), np.nan))
-        for size in _legs(min(max(self.settings.seen, LEAST), MOST)):
+        for size in _legs(min(max(self.settings.seen, least), most)):
             if not len(flight.rows):
                 break
             self._take(flight, flight.advance(size), ends, near)

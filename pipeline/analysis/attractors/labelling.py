@@ -13,8 +13,7 @@ from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
 from pipeline.analysis.attractors.extension.conservative import conservative_sets
 from pipeline.analysis.attractors.extension.courses import AT_REST as RESTS
-from pipeline.analysis.attractors.extension.courses import DIVERGED, ON_SET, Course, rest_number
-from pipeline.analysis.attractors.extension.courses import GROWS as GROWS_ON
+from pipeline.analysis.attractors.extension.courses import COURSE_DIVERGED, COURSE_GROWS, ON_SET, Course, rest_number
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.features import Cells, Features
@@ -177,7 +176,7 @@ def _conservative(point: Point, labels: _Labels, search: Search) -> Work[Found]:
     for i, one in enumerate(sets):
         labels.put(one.cells, i, SAME_SET)
     for course in courses:
-        if course.end == GROWS_ON:
+        if course.end == COURSE_GROWS:
             labels.put(np.array([course.cell]), -1, GROWS)
     result = _describe(point, [], sets, labels, search)
     _fill_growth(result, courses, point, search)
@@ -186,7 +185,7 @@ def _conservative(point: Point, labels: _Labels, search: Search) -> Work[Found]:
 
 def _fill_growth(result: Found, courses: Sequence[Course], point: Point, search: Search) -> None:
     """Describe the growth of the cells that grow, by the median over those that were integrated further."""
-    growing = [course for course in courses if course.end == GROWS_ON]
+    growing = [course for course in courses if course.end == COURSE_GROWS]
     known = [(Escape.of(course.extension, search.geometry), course) for course in growing]
     rates = [
         (one.rate * (course.length / course.seconds if course.seconds else point.frequency), one.factor, one.length)
@@ -273,8 +272,8 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
         keys = keys_of(block.section[rows], search.settings.closure, search.geometry)
         end = looked_up(ends, keys, looked_up(by_group, groups[cells], ON_SET))
         labels.put(cells[end >= 0], end[end >= 0], EXTENDED)
-        labels.decision[cells[end == DIVERGED]] = DIVERGES
-        labels.decision[cells[end == GROWS_ON]] = GROWS
+        labels.decision[cells[end == COURSE_DIVERGED]] = DIVERGES
+        labels.decision[cells[end == COURSE_GROWS]] = GROWS
         if point.at_rest is not None:
             rests = end <= RESTS
             point.at_rest[cells[rests]] = RESTS - end[rests]

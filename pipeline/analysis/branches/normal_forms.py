@@ -41,9 +41,6 @@ STEPS = 0.125 * 2.0 ** -np.arange(13.0)
 """Sizes of the steps in units of the system's scales. The largest fit smooth maps, the smallest maps that are
 strongly bent over one period."""
 
-SAME, NEARLY = 1e-5, 1e-3
-"""Least relative size of a quadratic coefficient at a transcritical point; largest, with its error, at a pitchfork."""
-
 
 @dataclass(frozen=True, eq=False)
 class Bend:
@@ -175,15 +172,17 @@ def _tell_branch_point(one: Bifurcation, square: tuple[float, float], cubic: tup
     """Call a branch point transcritical if its quadratic coefficient is not 0, a pitchfork if it is certainly small
     beside its bound `size`, and leave it open otherwise. Both coefficients come with their errors.
     """
+    # least relative size of the quadratic coefficient at a transcritical point; largest, with its error, at a pitchfork
+    same, nearly = 1e-5, 1e-3
     by_arms, one.criticality = one.criticality, ""
     if not np.isfinite(square[0] + size):
         return
     # from where the point was located to where it is: two branches cross, so the residual grows as its square
     away = max(Settings.bracket, float(np.sqrt(one.point.residual)))
     error = square[1] + 3.0 * float(np.nan_to_num(abs(cubic[0]))) * away
-    if abs(square[0]) > max(SAME * size, 3.0 * error):
+    if abs(square[0]) > max(same * size, 3.0 * error):
         one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square[0], error
-    elif abs(square[0]) + error <= NEARLY * size or by_arms:
+    elif abs(square[0]) + error <= nearly * size or by_arms:
         one.kind, one.criticality = PITCHFORK, by_arms
         one.coefficient, one.coefficient_error = cubic
         _judge_sign(one)

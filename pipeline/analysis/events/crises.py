@@ -44,7 +44,7 @@ OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flo
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
 
 
-GROWN = 0.1
+BEYOND_SET = 0.1
 """Distance from a set, as a share of its size, beyond which points are outside."""
 
 
@@ -151,7 +151,7 @@ class Crises:
         for k in range(len(places) - 1):
             size = float(geometry.distance(sets[k], sets[k][:1]).max())
             ways = [float(nearest_distances(sets[i], sets[j], geometry).max()) for i, j in ((k, k + 1), (k + 1, k))]
-            grows = max(ways) > GROWN * size and max(ways) > jump * min(ways)
+            grows = max(ways) > BEYOND_SET * size and max(ways) > jump * min(ways)
             if bands[k] != bands[k + 1] or grows:
                 found.append(places[k])
         return found
@@ -352,14 +352,14 @@ def _kind(
     new = paths[:, length // 2 :].reshape(-1, geometry.n_states)
     new = new[np.isfinite(new).all(axis=1)]
     after = count_bands(paths[int(np.isfinite(paths).all(axis=2).sum(axis=1).argmax())], geometry)
-    outside = new[nearest_distances(new, old, geometry) > GROWN * size]
+    outside = new[nearest_distances(new, old, geometry) > BEYOND_SET * size]
     if len(outside) <= stray * len(new):
         return (BANDS, -1, (m, after)) if after < m else ("", -1, (m, after))
     for number, points in others.items():
         here = along.paths(2.0 * contact.value - value, points[-effort.lanes :], effort.length)[:, SETTLE:]
         here = here.reshape(-1, geometry.n_states)
         here = here[np.isfinite(here).all(axis=1)]
-        same, joined = (nearest_distances(x, here, geometry) <= GROWN * size for x in (old, outside))
+        same, joined = (nearest_distances(x, here, geometry) <= BEYOND_SET * size for x in (old, outside))
         if same.mean() < joins <= joined.mean():
             return TWINS, number, (m, after)
     return INTERIOR, -1, (m, after)

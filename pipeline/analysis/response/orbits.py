@@ -15,7 +15,7 @@ from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
 from pipeline.results.tolerances import BRANCH_RTOL
 
-FEWEST, MOST = 512, 8192
+FEWEST_TIMES, MOST_TIMES = 512, 8192
 """Samples per drive period or return: at first, and at most."""
 
 
@@ -77,8 +77,8 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = F
     amplitude, mean, rms, dominant, error = np.full((5, *shape), np.nan)
     harmonics = np.full((*shape, n_harmonics), np.nan, np.complex128)
     found = Measures(amplitude, mean, rms, harmonics, dominant, error)
-    left, n = np.arange(len(orbits)), FEWEST
-    while len(left) and n <= MOST:
+    left, n = np.arange(len(orbits)), FEWEST_TIMES
+    while len(left) and n <= MOST_TIMES:
         for rows in _blocks(orbits, left, n):
             values = sampled([orbits[i] for i in rows], n)
             base = max(orbits[rows[0]].period, 1) if orbits[rows[0]].is_driven and not of_orbit else 1
@@ -182,6 +182,6 @@ def _drive_phase(orbit: Orbit) -> float:
     flow = of_flow(orbit.parameters)
     if not orbit.is_driven or flow.model.system.forcing_is_time:
         return 0.0
-    level = drive_level(np.arange(MOST) / (MOST * orbit.frequency_hz), flow, orbit.frequency_hz)
+    level = drive_level(np.arange(MOST_TIMES) / (MOST_TIMES * orbit.frequency_hz), flow, orbit.frequency_hz)
     first = np.fft.rfft(level)[1]
     return float(np.angle(first)) if abs(first) > 1e-9 * np.abs(level).sum() else 0.0

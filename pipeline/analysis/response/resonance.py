@@ -25,7 +25,7 @@ from pipeline.analysis.branches.bifurcations import multipliers_of
 from pipeline.analysis.branches.following import first_point, opposite
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import FREQUENCY, ONE_SIDED_STEP, Ends, Family, FamilyProblem, Rows, Value
-from pipeline.analysis.response.orbits import FEWEST, Orbit, harmonics_of, lags_of, sampled
+from pipeline.analysis.response.orbits import FEWEST_TIMES, Orbit, harmonics_of, lags_of, sampled
 
 RESONANCE = Settings(5e-3, 4e-2, 1e-5, max_points=1000, tolerance=1e-9, max_iterations=8)
 """Settings of phase resonance; the residual includes the cosine of the lag. A start further than 1 from the origin
@@ -75,7 +75,9 @@ class ResonanceProblem(FamilyProblem):
         if not _is_within(self.family.values(u), self.bounds):
             return np.full(1 + self.size, np.nan)
         orbits = [self.orbit(one) for one in _displaced(u)]
-        return np.asarray(np.cos(lags_of(orbits, harmonics_of(sampled(orbits, FEWEST), 1, 1)))[:, self.channel, 0])
+        return np.asarray(
+            np.cos(lags_of(orbits, harmonics_of(sampled(orbits, FEWEST_TIMES), 1, 1)))[:, self.channel, 0]
+        )
 
     def orbit(self, u: Array) -> Orbit:
         """Return the orbit at some unknowns; a displaced force stays within its bounds, which may be the model's."""

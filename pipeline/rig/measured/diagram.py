@@ -27,7 +27,7 @@ from pipeline.results.tabular import Row, Words, aligned, counted, number, value
 from pipeline.rig.edges import Edges, edges_of
 from pipeline.rig.measured.declaration import MAX_PERIOD, SweepOptions
 from pipeline.rig.measured.sections import find_sections, name_of, section_phase
-from pipeline.rig.measured.steps import LEAST, Stretch, cut
+from pipeline.rig.measured.steps import LEAST_STRETCH, Stretch, cut
 from pipeline.specification.problems import SpecError
 
 # ---- periods ---------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ def _steps(recording: xr.Dataset, number: int, options: SweepOptions, parameters
         own = slice(first, first + stretch.edges.rising.size)
         first = own.stop
         kept = np.flatnonzero(np.isfinite(section[own]).all(axis=1))
-        if kept.size < LEAST:
+        if kept.size < LEAST_STRETCH:
             continue
         inner = slice(own.start + int(kept[0]), own.start + int(kept[-1]) + 1)
         points = section[inner]
@@ -252,7 +252,7 @@ def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
         raise SpecError(
-            f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a "
+            f"{names}: no stretch of one frequency holds {LEAST_STRETCH} sections; choose longer recordings, a "
             "smaller transient, or a window of a slow sweep."
         )
     states = sorted({", ".join(s.state) for s in steps})

@@ -14,7 +14,7 @@ from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-WINDOW, LEAST = 40, 8
+SWEEP_WINDOW, LEAST_STRETCH = 40, 8
 """Default numbers of periods: in a window of a slow sweep; at least in a stretch."""
 _TRUE_JITTER = 1.5
 """Ratio of an edge's scatter to the error of measuring above which the drive itself jitters."""
@@ -56,26 +56,26 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
     problems = []
     if transient < 0:
         problems.append(f"transient = {transient}: must be at least 0.")
-    if window is not None and window != 0 and window < LEAST:
-        problems.append(f"window = {window}: must be 0 or at least {LEAST} periods.")
+    if window is not None and window != 0 and window < LEAST_STRETCH:
+        problems.append(f"window = {window}: must be 0 or at least {LEAST_STRETCH} periods.")
     if problems:
         raise SpecError(problems)
-    if edges.rising.size <= LEAST:
+    if edges.rising.size <= LEAST_STRETCH:
         raise SpecError(
-            f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST}: choose a longer "
+            f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST_STRETCH}: choose a longer "
             "recording, or look at the drive's channel."
         )
     if window:
         return _directed(_windows(edges, window))
     spans = constant_spans(edges)
-    kept = [(a, b) for a, b in spans if b - a >= transient + LEAST]
-    if window is None and edges.rising.size > WINDOW and _is_swept(edges, spans):
-        return _directed(_windows(edges, WINDOW))
+    kept = [(a, b) for a, b in spans if b - a >= transient + LEAST_STRETCH]
+    if window is None and edges.rising.size > SWEEP_WINDOW and _is_swept(edges, spans):
+        return _directed(_windows(edges, SWEEP_WINDOW))
     if not kept:
         longest = max(b - a for a, b in spans)
         raise SpecError(
             f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of "
-            f"transient and {LEAST} of sections are wanted: lower transient, or give window for a drive that "
+            f"transient and {LEAST_STRETCH} of sections are wanted: lower transient, or give window for a drive that "
             "is swept slowly."
         )
     return _directed([_constant(edges, a, b, transient) for a, b in kept])
@@ -84,9 +84,9 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
 def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
     """Return whether the frequency changes continuously: most stretches are short, or bend in one direction."""
     limit = 4.0  # curvature of a stretch, in standard errors, above which it is significant
-    if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
+    if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST_STRETCH:
         return True
-    bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST])
+    bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST_STRETCH])
     clear = np.sign(bends[np.abs(bends) > limit])
     return bool(clear.size >= 3 and clear.size > 0.5 * bends.size and abs(clear.sum()) > 0.9 * clear.size)
 

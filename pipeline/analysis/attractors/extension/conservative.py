@@ -17,7 +17,7 @@ from magpend_core.pointwise import evaluate
 from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, slopes_along
 from pipeline.analysis.attractors.extension.clouds import Cloud, group, members
-from pipeline.analysis.attractors.extension.courses import FAILED, GROWS, Course
+from pipeline.analysis.attractors.extension.courses import COURSE_GROWS, FAILED, Course
 from pipeline.analysis.attractors.extension.extending import sample_cells
 from pipeline.analysis.attractors.extension.growth import Escape, Growth, growth_of
 from pipeline.analysis.attractors.finding.points import Point
@@ -119,7 +119,7 @@ def _extended(point: Point, settings: Settings, n_sample: int) -> Work[tuple[lis
         yield from _advance(chosen, settings)
         for course in chosen:
             if course.goes_on and Escape.of(course.extension, settings.geometry) is not None:
-                course.end = GROWS
+                course.end = COURSE_GROWS
         courses += chosen
         growths += yield from _growths(chosen, point, settings)
         n_sample *= 2

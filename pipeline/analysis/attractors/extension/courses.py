@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-ON_SET, FAILED, DIVERGED, GROWS, AT_REST = -1, -2, -3, -4, -5
+ON_SET, FAILED, COURSE_DIVERGED, COURSE_GROWS, AT_REST = -1, -2, -3, -4, -5
 """Ends of extended cells other than orbits; `AT_REST` minus k is the equilibrium number k."""
 
 

@@ -29,7 +29,7 @@ from pipeline.analysis.attractors.extension.bounded_sets import (
     were_on,
 )
 from pipeline.analysis.attractors.extension.clouds import group, members
-from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, GROWS, Course
+from pipeline.analysis.attractors.extension.courses import AT_REST, COURSE_DIVERGED, COURSE_GROWS, FAILED, Course
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
@@ -280,7 +280,7 @@ class _Extension:
     def _fail(self, course: Course, status: int) -> None:
         course.periods = float(course.length)
         course.is_leaving = not course.length
-        course.end = DIVERGED if status == Status.DIVERGED else FAILED
+        course.end = COURSE_DIVERGED if status == Status.DIVERGED else FAILED
         if status == Status.NO_RETURN and self.point.can_rest:
             number = rest_near(self.point, course.state, self.geometry)
             if number is not None:
@@ -409,7 +409,7 @@ class _Extension:
         """Finish the trajectories that grow to the end of the extension."""
         growing = [course for course in self.courses if course.goes_on and self._grows(course)]
         for course in growing:
-            course.end, course.is_leaving = GROWS, True
+            course.end, course.is_leaving = COURSE_GROWS, True
         if growing and all(one.stability in (ATTRACTS, NEUTRAL) for one in self.sets):
             self.ran_out = False
 

@@ -8,7 +8,7 @@ import pytest
 from magpend_core.engine.vecmath import TWO_PI
 from pipeline.analysis.attractors.extension.bounded_sets import _is_in_family
 from pipeline.analysis.attractors.extension.conservative import _split, conservative_sets
-from pipeline.analysis.attractors.extension.courses import GROWS
+from pipeline.analysis.attractors.extension.courses import COURSE_GROWS
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.analysis.attractors.labelling import _preserves_volume
@@ -55,13 +55,13 @@ def test_extend__growth_without_recurrence_is_no_set():
     """An unstable focus: small distances grow, and so does the distance from where the cells began."""
     growing = settle(MapPoint(*linear(rotation(GOLDEN, 1.01)), np.array([[1.0, 0.0], [0.0, 0.5]])), budget=1.0)
     assert not growing.sets
-    assert [course.end for course in growing.courses] == [GROWS, GROWS]
+    assert [course.end for course in growing.courses] == [COURSE_GROWS, COURSE_GROWS]
     for course in growing.courses:
         assert Escape.of(course.extension, PLANE).rate == pytest.approx(np.log(1.01), rel=0.05)
     # it decays as slowly, or goes round: no growth
     for factor in (0.99, 1.0):
         found = settle(MapPoint(*linear(rotation(GOLDEN, factor)), np.array([[1.0, 0.0]])), budget=1.0)
-        assert all(course.end != GROWS for course in found.courses)
+        assert all(course.end != COURSE_GROWS for course in found.courses)
 
 
 @pytest.mark.parametrize("drift", [0.0, 1e-5, 1e-3])
@@ -82,10 +82,10 @@ def test_conservative_sets__resonance_without_damping_grows():
     """x'' = -x + cos(t) at its period: x stays, v grows by pi each time."""
     step = lambda x: x + [0.0, np.pi]  # noqa: E731
     sets, courses = neutral_sets(step, linear(np.eye(2))[1], [[0.0, 0.0], [1.0, -1.0]])
-    assert [course.end for course in courses] == [GROWS, GROWS]
+    assert [course.end for course in courses] == [COURSE_GROWS, COURSE_GROWS]
     # off resonance, x'' = -x + cos(2 t), the cells turn about a centre and stay
     sets, courses = neutral_sets(*linear(rotation(GOLDEN)), [[0.3, 0.0], [1.0, -1.0]])
-    assert not any(course.end == GROWS for course in courses)
+    assert not any(course.end == COURSE_GROWS for course in courses)
     assert [(one.kind, one.stability, one.cells.tolist()) for one in sets] == [(BOUNDED_SET, NEUTRAL, [0, 1])]
 
 
