@@ -116,9 +116,9 @@ def _path(
     """Return the sizes of the states along a trajectory (step, state), integrated with logarithms of some states; empty
     if a state is 0 or the trajectory takes too many steps.
     """
-    rtol = 1e-4  # of the logarithms: only the order of magnitude counts
     from scipy.integrate import LSODA
 
+    rtol = 1e-4  # of the logarithms: only the order of magnitude counts
     if not np.isfinite(start).all() or (start[logs] == 0.0).any() or not np.isfinite(seconds):
         return np.zeros((0, len(start)))
     sign = np.sign(start)

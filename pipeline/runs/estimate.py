@@ -179,9 +179,9 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
     The time is processor time, so that other programs do not count.
     """
-    never = 1e-300
     from pipeline.compute.integrate import integrate
 
+    never = 1e-300
     # a tolerance that no cell meets, since an integration without the test would need another kernel
     integration = spec.integration.model_copy(
         update={"n_transient": n_periods - 1, "n_keep": 1, "closure_tolerance": never}
@@ -201,9 +201,9 @@ def _periods_until_closed(plan: Plan, most: float, ratio: float) -> float:
 
     A first sample gives the number of cells for which there is time.
     """
-    closing_s = 0.8  # most time for measuring when cells close, by the rule of thumb [s]
     from pipeline.compute.integrate import integrate
 
+    closing_s = 0.8  # most time for measuring when cells close, by the rule of thumb [s]
     spec, rng, n_keep = plan.spec, np.random.default_rng(1), plan.spec.integration.n_keep
     found, n_branches, left = np.empty(0), BRANCHES, closing_s
     while left > 0:

@@ -55,7 +55,6 @@ def settle_branches(run: OpenRun, options: BranchOptions) -> BranchOptions:
 
 def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
-    least_period = 4  # least limit for the periods of followed branches, however short the orbits of the run are
     from pipeline.analysis.branches.arclength import Settings
     from pipeline.analysis.branches.asked import count_equilibria, counted_variables, given_starts
     from pipeline.analysis.branches.dataset import dataset_of
@@ -63,6 +62,7 @@ def branches(run: OpenRun, options: BranchOptions) -> xr.Dataset:
     from pipeline.analysis.branches.searching import places_of, searched_variables
     from pipeline.analysis.branches.starting_orbits import attracting, recurrent
 
+    least_period = 4  # least limit for the periods of followed branches, however short the orbits of the run are
     cube, parameter = run.cube(), axis_name(options.parameter)
     interval = low, high = interval_of(run, parameter, options.low, options.high)
     base = parameters_of(cube)

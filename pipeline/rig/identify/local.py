@@ -334,10 +334,10 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: tuple[int, fl
 
 def _least_squares(walk: _Search, x: Array, ending: tuple[int, float]) -> tuple[Array, bool, str]:
     """Run `scipy.optimize.least_squares`; return its final point, whether it converged, and its message."""
-    most_dense = 600  # columns above which the Jacobian is sparse and its steps are solved iteratively
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
 
+    most_dense = 600  # columns above which the Jacobian is sparse and its steps are solved iteratively
     sizes, problem = walk.sizes, walk.problem
     lower, upper = np.full(len(sizes), -np.inf), np.full(len(sizes), np.inf)
     lower[: walk.n_free], upper[: walk.n_free] = problem.lower, problem.upper

@@ -73,9 +73,9 @@ def sample_draws(
 
     Raise `SpecError` as `draw_posterior`, if emcee is missing, or if a specification is needed.
     """
-    least = 32
     from pipeline.rig.identify.mcmc import figures_of, log_posterior, require_emcee, sample_posterior
 
+    least = 32
     asked = sampling or Sampling()
     require_emcee()
     result = read_result(directory)

@@ -203,9 +203,10 @@ def section_phase(parameters: Parameters, frequency_hz: float) -> float:
 
     It is 0 for sections at the rising edge and without a drive, 0.25 at the maximum of a sine.
     """
+    from magpend_core.pointwise import drive_level
+
     n = 4096
     snap = 2e-3  # fraction of a period below which a phase counts as 0, since a flank is as wide
-    from magpend_core.pointwise import drive_level
 
     period = 1 / frequency_hz
     time = np.arange(2 * n) * period / n

@@ -112,10 +112,10 @@ def _dataset(
     frequency_hz: float,
     n_periods: int,
 ) -> xr.Dataset:
-    rtol = 1e-9
     from magpend_core import trajectory
     from pipeline.rig.recordings import smooth
 
+    rtol = 1e-9
     model = parameters.model
     chosen = (recording["time"].values >= begin) & (recording["time"].values <= begin + n_periods / frequency_hz)
     margin = (recording["time"].values > begin - 1) & (recording["time"].values < begin + n_periods / frequency_hz + 1)

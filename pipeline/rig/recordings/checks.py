@@ -173,9 +173,10 @@ def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
 
     An example is a wrap whose flank was sampled: it looks like a motion, and a turn is lost.
     """
+    from scipy.ndimage import median_filter
+
     least = 0.1  # deviation of a step from the steps around it above which it is no motion [turns]
     around = 9  # number of steps whose median is the usual step
-    from scipy.ndimage import median_filter
 
     step = np.diff(angle)
     step[signal.piece[1:] != signal.piece[:-1]] = np.nan

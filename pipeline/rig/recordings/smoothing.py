@@ -272,10 +272,10 @@ def _fit_middles(values: np.ndarray, parts: np.ndarray, width: int, order: int, 
 
 
 def _convolved(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    long = 63  # length above which windows are convolved by Fourier transforms [samples]
     from scipy.ndimage import correlate1d
     from scipy.signal import oaconvolve
 
+    long = 63  # length above which windows are convolved by Fourier transforms [samples]
     if len(weights) <= long:
         return np.asarray(correlate1d(y, weights, mode="constant"))
     return np.asarray(oaconvolve(y, weights[::-1], mode="same"))
