@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from magpend_core.models.drift.ramps import Ramp, RampOfCells, motion_of
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
 from pipeline.motion.steady import Inputs
+from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.spec import Spec
 from pipeline.specification.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
 from pipeline.specification.tables import FREQUENCY, Range
@@ -288,12 +289,27 @@ def at_section(parameter: str) -> str:
     return f"{parameter}_at_section"
 
 
-def moving_coordinates(spec: Spec) -> list[Coordinate]:
-    """Return for each moving parameter its values at the stored sections, as a coordinate of the cube.
-
-    Its dims are the axes on which the parameter's motion depends, and the sections.
+def further_coordinates(spec: Spec) -> list[Coordinate]:
+    """Return the coordinates of the cube that follow from others: labels of states and products, and the values of
+    moving parameters at the stored sections, on the axes on which a parameter's motion depends.
     """
-    return [_coordinate(spec, ramp) for ramp in spec.ramps]
+    model = spec.model
+    found = [
+        Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
+        Coordinate("state_units", ("state",), _values(model.state_units), {"long_name": "unit of the component"}),
+    ]
+    if model.angles:
+        dim = model.angle_dim
+        found.append(Coordinate(dim, (dim,), _values(model.angles), {"long_name": "by its angle"}))
+    for name, options in spec.products.items():
+        for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
+            found.append(Coordinate(dim, (dim,), _values(values)))
+    return [*found, *(_coordinate(spec, ramp) for ramp in spec.ramps)]
+
+
+def _values(labels: Iterable[Any]) -> np.ndarray:
+    values = list(labels)
+    return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 
 
 def motion_over(spec: Spec, ramp: Ramp) -> tuple[tuple[ParameterAxis, ...], RampOfCells, np.ndarray]:

@@ -13,13 +13,11 @@ import numpy as np
 import zarr
 from zarr.storage import MemoryStore
 
-from pipeline.layout.cells import Coordinate, coordinates, moving_coordinates
+from pipeline.layout.cells import Coordinate, coordinates, further_coordinates
 from pipeline.layout.conventions import CONVENTIONS, Described, conventional_attributes
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.specification.spec import Spec
 from pipeline.store.arrays import METADATA, consolidated_metadata, create_array, disagreements, write_whole
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files, compared, entry_of
@@ -43,7 +41,7 @@ def skeleton_files(plan: Plan, identity: Mapping[str, Any], *, described: bool =
         "spec": plan.text,
         "digest": digest_of(identity),
     }
-    found = [*coordinates(plan.spec), *_labels(plan.spec)]
+    found = [*coordinates(plan.spec), *further_coordinates(plan.spec)]
     data: dict[str, Any] = {}
     store = MemoryStore(data)
     names = " ".join(sorted(c.name for c in found if c.dims != (c.name,)))
@@ -82,35 +80,16 @@ def lacking(info: RunInfo) -> list[str]:
     """Return the keys of files of variables and coordinates that ``run.json`` should name, and does not."""
     spec = info.plan.spec
     found = [f"{v.name}/{METADATA}" for v in info.plan.variables]
-    for coordinate in (*coordinates(spec), _labels(spec)[0]):
+    for coordinate in (*coordinates(spec), further_coordinates(spec)[0]):
         found += [f"{coordinate.name}/{end}" for end in (METADATA, ".".join(["c", *["0"] * len(coordinate.dims)]))]
     return [key for key in found if key not in info.skeleton]
 
 
 def skeleton_keys(plan: Plan) -> list[str]:
     """Return the keys of the metadata files of all variables and coordinates of the result cube."""
-    names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(plan.spec), *_labels(plan.spec))]
+    found = (*coordinates(plan.spec), *further_coordinates(plan.spec))
+    names = [v.name for v in plan.variables] + [c.name for c in found]
     return [f"{name}/{METADATA}" for name in names]
-
-
-def _labels(spec: Spec) -> list[Coordinate]:
-    model = spec.model
-    found = [
-        Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
-        Coordinate("state_units", ("state",), _values(model.state_units), {"long_name": "unit of the component"}),
-    ]
-    if model.angles:
-        dim = model.angle_dim
-        found.append(Coordinate(dim, (dim,), _values(model.angles), {"long_name": "by its angle"}))
-    for name, options in spec.products.items():
-        for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
-            found.append(Coordinate(dim, (dim,), _values(values)))
-    return [*found, *moving_coordinates(spec)]
-
-
-def _values(labels: Iterable[Any]) -> np.ndarray:
-    values = list(labels)
-    return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 
 
 def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
