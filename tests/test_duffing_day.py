@@ -89,15 +89,15 @@ ANALYSES = {
     "dimension": f"sweep {POINT} --n-max 2000",
     "spectrum": f"sweep {POINT} --averages 3",
     "series": f"sweep {POINT} --attractor E --periods 60 --samples 16",
-    "branches": "walk --period 1",
+    "branches": "walk",
     "manifolds": f"{SWEPT} --length 0.5 --chord 0.1",
     "tangency": f"{SWEPT} --parameter amplitude --from 0.3 --to 0.31 --length 0.5",
     "tongues": f"sweep {LINE} --second damping --second-from 0.2 --second-to 0.3 --denominator 1",
-    "events": "walk --period 1",
-    "response": "walk --period 1",
+    "events": "walk",
+    "response": "walk",
     "backbone": "walk --undamped damping=0 --undamped amplitude=0",
-    "sensitivities": "walk --period 1 --deviation damping=0.01",
-    "curves": "walk --period 1 --second amplitude --second-from 0.25 --second-to 0.35",
+    "sensitivities": "walk --deviation damping=0.01",
+    "curves": "walk --second amplitude --second-from 0.25 --second-to 0.35",
     "orbits": f"sweep {POINT} --period 1 --starts 40",
     "resilience": f"sweep {LINE} --directions 8 --confirmations 8 --phases 2 --timed 8",
     "tipping": "ramp --settle 60 --width 0.1",
@@ -122,8 +122,8 @@ FIGURES_OF = {
     "waterfall": f"sweep {LINE} --averages 3 --segment 16",
     "lyapunov": f"sweep {LINE}",
     "convergence": f"sweep {POINT}",
-    "multipliers": "walk --period 1",
-    "genealogy": "walk --period 1",
+    "multipliers": "walk",
+    "genealogy": "walk",
     "transfer": "noisy --at noise_v=0.2 --bins 8 --resamples 3",
     "drift": "ramp",
     "section": f"sweep {POINT}",
@@ -162,6 +162,8 @@ def runs(call, day):
             if name in words and not (day / name).exists():
                 out, _ = call("run", f"{name}.toml", "--out", name, "--workers", "0")
                 assert f"cube: {name}/cube.zarr" in out
+                if name == "walk":
+                    call("analyse", "branches", name, "--period", "1")
         return call(*words)
 
     return after
