@@ -13,7 +13,9 @@ from pipeline.results.draws import LEVELS, stretches
 from pipeline.runs.derive import derive, shown_table, stored
 from pipeline.runs.drawing import figure
 from pipeline.specification.problems import SpecError
+from pipeline.store.run import open_run
 from tests.pipeline.bautin import SWEEP
+from tests.pipeline.declared import complaints
 
 pytestmark = pytest.mark.usefixtures("long_steps_of_a_file")
 
@@ -59,6 +61,7 @@ def test_bands__bifurcations_are_those_of_the_closed_form(bench):
         expected = np.quantile(np.sqrt((1 + root) / (2 * g)), LEVELS)
         np.testing.assert_allclose(found["section_level"].sel(state="x").values[:, k, 0], expected, atol=1e-6)
     assert {bool(s) for s in is_stable[everywhere]} == {True, False}
+    assert not list(complaints(found, "bands", open_run(bench[1])))
     # left of the fold of half of the draws there is no band
     for _, _, chosen in stretches(found):
         assert found["parameter_value"].values[chosen].min() > np.median(h - 1 / (4 * g)) - 0.5 / (GRID - 1)
