@@ -208,7 +208,7 @@ class PartFolder:
 
 @contextlib.contextmanager
 def made_once(path: str) -> Iterator[None]:
-    """Let other processes that want to make the same cache file wait while this context is open, unless it is there.
+    """Make other processes that need the same cache file wait while this context is open, if the file is missing.
 
     A process that is killed holds no lock. Where files cannot be locked, each process makes its own.
     """
@@ -219,6 +219,7 @@ def made_once(path: str) -> Iterator[None]:
         if lock is not None:
             with contextlib.suppress(OSError):
                 os.unlink(f"{path}.lock")
+            fcntl.flock(lock, fcntl.LOCK_UN)  # a process forked meanwhile shares the file, and would hold the lock
             os.close(lock)
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Clock:
-    """How a model counts time: its period, the time from one section point to the next.
+    """The counting of time in a model; its period is the time from one section point to the next.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the interactive page adds to other rooms."""
+"""List the commands that the interactive page adds."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ PLUGINS = ("pipeline.rig.plugin", "pipeline.explorer.plugin")
 
 @dataclass(frozen=True)
 class Plugin:
-    """What a plug-in adds: places ``module:object`` by name. They are imported when they are used."""
+    """The additions of a plug-in: a place ``module:object`` for each name, imported when it is used."""
 
     commands: Mapping[str, str] = field(default_factory=dict)  # functions, or groups of them, of the command line
     functions: Mapping[str, str] = field(default_factory=dict)  # those that an option of another room's command calls
@@ -26,6 +26,6 @@ class Plugin:
 
 
 def added(what: str) -> dict[str, Any]:
-    """Return what all plug-ins add of one kind, by name."""
+    """Return the objects that plug-ins add under one field of `Plugin`, by name."""
     plugins = [resolve_name(f"{module}:PLUGIN") for module in PLUGINS]
     return {name: resolve_name(place) for plugin in plugins for name, place in getattr(plugin, what).items()}

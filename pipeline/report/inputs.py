@@ -1,4 +1,4 @@
-"""Kinds of input of a study beside its runs; a plug-in defines each."""
+"""Define what a kind of input of a study is; plug-ins add the kinds other than runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the analysis of a test rig adds to other rooms."""
+"""List the commands, inputs, pictures, measures and tables that the analysis of a test rig adds."""
 
 from __future__ import annotations
 

@@ -25,8 +25,7 @@ def _parts(name: str) -> set[str]:
 
 
 def current(run: RunDirectory, name: str, options: Mapping[str, Any]) -> dict[str, str]:
-    """Return the attributes of those results of an analysis that hold for the present cells, attractors and branches of
-    a run.
+    """Return the attributes that a result must have to be valid for the present cells, attractors and branches.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ EXPONENTS = {FOLD: -0.5, TORUS: -1.0, DOUBLING: -1.0}
 
 
 class Effort(NamedTuple):
-    """How many trajectories are followed near a bifurcation, how long, and how many laminar phases the fit needs."""
+    """Number and length of the trajectories near a bifurcation, and the least number of laminar phases for the fit."""
 
     n_values: int  # distances, each half of the one before
     many: int  # trajectories at each

@@ -42,7 +42,7 @@ Rates = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Escape:
-    """How a trajectory grows that recurs nowhere."""
+    """Growth of a trajectory that never returns near an earlier point."""
 
     factor: float  # its distance from where it began, in its last window over that in its first
     rate: float  # relative growth of this distance at the end [per section]
