@@ -17,6 +17,7 @@ SCIPY = ["--scipy-trajectories", "1", "--scipy-periods", "1"]
 TINY = {
     "analysis_scaling": ["--cells", "200"],
     "basins": ["--size", "4", "--bands", "2", "--transient", "300", *SCIPY],
+    "conclusions": ["map", "--tiny"],
     "costs": SMALL,
     "coverage": ["--rigs", "1", "--draws", "10"],
     "kernel": [*SMALL, "--tolerances", "1e-4", "--part", "here"],
