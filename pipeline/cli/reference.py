@@ -338,6 +338,21 @@ def results() -> str:
     return "\n\n".join(parts)
 
 
+def divisions() -> str:
+    """Return the Markdown table of how analyses are divided for threads, processes and clusters."""
+    from pipeline.products.registry import ANALYSES
+
+    by_point = ", ".join(f"`{name}`" for name in ANALYSES.listed if ANALYSES[name].by_point)
+    rows = [(f"the search for attractors, {by_point}", "in blocks of parameter points")]
+    for name in ANALYSES.listed:
+        one = ANALYSES[name]
+        if one.parts:
+            rows.append((f"`{name}`", f"in blocks of rows, along `{one.rows}`"))
+        elif one.whole:
+            rows.append((f"`{name}`", f"in one process: {one.whole}"))
+    return table(("analysis", "is computed"), rows)
+
+
 def event_kinds() -> str:
     """Return the Markdown table of the kinds of events."""
     from pipeline.analysis.events.kinds import EVENTS
@@ -390,6 +405,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "measures": measures,
     "variables": variables,
     "results": results,
+    "divisions": divisions,
     "events": event_kinds,
     "conventions": conventions,
     "statuses": statuses,

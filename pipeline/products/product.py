@@ -310,9 +310,19 @@ class Analysis:
     by_point : bool
         Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
         results `pipeline.results.ragged.joined` joins.
+    parts : str
+        ``"module:function"`` or empty: ``parts(run, options)`` returns a list of parts that are computed independently
+        of each other, such as curves, in the order of the rows of the result. They are plain values. It derives the
+        results of other analyses that `compute` needs. ``compute(run, options, parts)`` gets any neighbouring ones.
+    rows : str
+        Dim along which the results of parts are joined.
+    together : int
+        Fewest parts that are computed together, if they share calls of the engine or take less than a second each.
+    whole : str
+        Reason for an analysis with neither `by_point` nor `parts`, which is computed in one process.
     finish : str
-        ``"module:function"`` or empty: ``finish(ds, options)`` completes the result of all parameter points by what
-        needs them all.
+        ``"module:function"`` or empty: ``finish(run, ds, options)`` completes the result of all blocks by what needs
+        them all.
     version : int
         Number of its results: raised when they change on purpose, see `magpend_core.versions`.
     """
@@ -331,6 +341,10 @@ class Analysis:
     motions: tuple[Motion, ...] = ("steady",)
     follows_motion: bool = False
     by_point: bool = False
+    parts: str = ""
+    rows: str = ""
+    together: int = 1
+    whole: str = ""
     finish: str = ""
     version: int = 1
 

@@ -147,6 +147,29 @@ def joined(parts: Sequence[xr.Dataset], blocks: Sequence[Mapping[str, slice]], s
     return xr.Dataset(variables, coords, attrs)
 
 
+def stacked(parts: Sequence[xr.Dataset], dim: str) -> xr.Dataset:
+    """Join results along the dim of their rows; pad them along other dims with NaN to the longest.
+
+    What has no rows is taken from the first.
+    """
+    first = parts[0]
+    longest = {str(d): max(part.sizes[d] for part in parts) for d in first.dims if d != dim}
+    variables: dict[str, xr.Variable] = {}
+    for name, variable in first.variables.items():
+        if dim in variable.dims:
+            own = [_padded_to(part.variables[name], longest) for part in parts]
+            values = np.concatenate(own, axis=variable.dims.index(dim))
+            variables[str(name)] = xr.Variable(variable.dims, values, variable.attrs)
+        else:
+            variables[str(name)] = variable
+    return xr.Dataset(variables, attrs=first.attrs).set_coords([str(name) for name in first.coords])
+
+
+def _padded_to(variable: xr.Variable, sizes: Mapping[str, int]) -> np.ndarray:
+    more = [(0, sizes.get(str(d), n) - n) for d, n in variable.sizes.items()]
+    return np.pad(variable.values, more, constant_values=np.nan) if any(n for _, n in more) else variable.values
+
+
 def dense(ds: xr.Dataset, names: Collection[str] = (), *, points: bool = False) -> xr.Dataset:
     """Return a result with its rows on the parameter dims and the dim ``attractor``, over all ids of the run.
 

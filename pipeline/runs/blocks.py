@@ -1,7 +1,8 @@
-"""Compute an analysis in blocks of parameter points, on the same threads, processes and dask workers as a run.
+"""Compute an analysis in blocks, on the same threads, processes and dask workers as a run.
 
-Each block is stored as it ends, in ``derived/NAME-KEY.blocks/``, until the whole result is. So an analysis that was
-stopped goes on. Blocks follow from the specification alone, and the result does not depend on them.
+A block is a block of parameter points, or some of the parts that an analysis declares as independent of each other
+(curves, motions). Each block is stored as it ends, in ``derived/NAME-KEY.blocks/``, until the whole result is. So an
+analysis that was stopped goes on. Blocks do not depend on workers, and the result does not depend on blocks.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -29,7 +31,7 @@ from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import report
-from pipeline.results.ragged import isel, joined
+from pipeline.results.ragged import isel, joined, stacked
 from pipeline.results.run import OpenRun
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.versions import current, key_of
@@ -41,7 +43,11 @@ from pipeline.store.products import BLOCKS, read_block, write_block
 WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 8192
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
 
-Block = Mapping[str, slice]
+WORTH_PROCESSES = 8.0
+"""Time of the work that is left from which processes are started for it [s]; a start costs each about 2 s."""
+
+Block = Any
+"""Slices of parameter points by dim, or a list of parts."""
 PlacedRun = Any
 """Run with the place of its computation: `pipeline.runs.derive.AnalysedRun`."""
 
@@ -51,7 +57,7 @@ class Part:
     """A run of which only a block of parameter points is analysed, see `pipeline.results.run.OpenRun`."""
 
     run: OpenRun
-    block: Block
+    block: Mapping[str, slice]
     known: dict[str, xr.Dataset] = field(default_factory=dict)
 
     @property
@@ -80,8 +86,28 @@ class Part:
             self.known[key] = self.run.derive(name, **options)
         return isel(self.known[key], self.block)
 
+    def branch_options(self, parameter: str) -> Any:
+        """Return the options of the run's branches along a parameter."""
+        return self.run.branch_options(parameter)
 
-def blocks_of(run: PlacedRun) -> list[Block]:
+
+def computed_at_once(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Dataset:
+    """Compute the whole result of an analysis in the calling thread."""
+    given = [function_of(analysis.parts)(run, options)] if analysis.parts else []
+    result: xr.Dataset = function_of(analysis.compute)(run, options, *given)
+    return result
+
+
+def divided(run: PlacedRun, analysis: Analysis, options: Options) -> list[Block]:
+    """Divide the parameter points of an analysis, or its parts, into blocks."""
+    if not analysis.parts:
+        return blocks_of(run)
+    parts = function_of(analysis.parts)(run, options)
+    n = max(analysis.together, -(-len(parts) // WANTED))
+    return [parts[first : first + n] for first in range(0, len(parts), n)]
+
+
+def blocks_of(run: PlacedRun) -> list[Mapping[str, slice]]:
     """Divide the parameter points of a run into blocks, in the C order of the points; align them with the tasks."""
     cells = run.cube()["status"]
     dims, starts = split_dims(cells)
@@ -106,7 +132,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
     run
         The run, with the workers and the scheduler.
     analysis, options
-        Analysis with `by_point`, and its complete options.
+        Analysis with `by_point` or `parts`, and its complete options.
 
     Raises
     ------
@@ -115,32 +141,48 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
     InterruptedRunError
         After Ctrl-C, SIGTERM or SIGHUP. Blocks that have ended stay.
     """
-    blocks = blocks_of(run)
+    blocks = divided(run, analysis, options)
     n = len(blocks)
-    if n == 1:
-        result: xr.Dataset = function_of(analysis.compute)(run, options)
-        return result
-    for other in analysis.builds_on:  # once, before workers ask for it
+    if n <= 1:
+        return computed_at_once(run, analysis, options)
+    for other in analysis.builds_on if analysis.by_point else ():  # once, before workers ask for it
         run.derive(other)
-    where = replace(_in_processes(run.where or Where()), place=run.info.files.place)
+    chosen = run.where or Where()
+    where = replace(_in_processes(chosen), place=run.info.files.place)
     clients.reach(where)
     key = key_of(current(run, analysis.name, options.plain()), analysis, options)
     task = partial(
         compute_block, type(run).of, run.info.files.place, run.digest, options, key, blocks, origin=origin(run.model)
     )
     missing = [k for k in range(n) if not _is_there(run.info.files, key, k)]
-    done, what = n - len(missing), f"{analysis.name}, blocks of parameter points"
+    done, what = n - len(missing), f"{analysis.name}, blocks{' of parameter points' if analysis.by_point else ''}"
     if done:
         run.echo(f"{analysis.name}: {done} of {n} blocks done before")
+    report(what, done, n)
     with stoppable(run.name):
+        if analysis.parts and where.scheduler != chosen.scheduler:  # no place was chosen
+            missing = _begun_here(task, missing, what, n)
         results = execute.run_tasks(task, missing, workers=run.workers, scheduler=where, echo=run.echo)
         with contextlib.closing(results):
-            report(what, done, n)
-            for k, _ in enumerate(results, done + 1):
+            for k, _ in enumerate(results, n - len(missing) + 1):
                 report(what, k, n)
+    found = [read_block(run.info.files, _name(key, k)) for k in range(n)]
+    if analysis.parts:
+        return stacked(found, analysis.rows)
     cells = run.cube()["status"]
-    sizes = {d: cells.sizes[d] for d in split_dims(cells)[0]}
-    return joined([read_block(run.info.files, _name(key, k)) for k in range(n)], blocks, sizes)
+    return joined(found, blocks, {d: cells.sizes[d] for d in split_dims(cells)[0]})
+
+
+def _begun_here(task: Callable[[int], Any], missing: list[int], what: str, n: int) -> list[int]:
+    """Compute blocks in the calling thread, and return those that are left once they are worth processes."""
+    while missing:
+        started = time.monotonic()
+        task(missing[0])
+        missing = missing[1:]
+        report(what, n - len(missing), n)
+        if (time.monotonic() - started) * len(missing) > WORTH_PROCESSES:
+            break
+    return missing
 
 
 def _in_processes(where: Where) -> Where:
@@ -160,7 +202,7 @@ def compute_block(
     *,
     origin: tuple[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Compute and store one block of parameter points; a task of `pipeline.compute.execute.run_tasks`."""
+    """Compute and store one block; a task of `pipeline.compute.execute.run_tasks`."""
     if origin is not None:
         import_model(*origin)
     run, known = _opened(opened, directory, digest)
@@ -170,8 +212,11 @@ def compute_block(
             f"{directory}: this worker's magpend would not compute the same {analysis.name}; install the same version "
             "everywhere."
         )
+    given = (
+        (Part(run, {}, known), options, blocks[index]) if analysis.parts else (Part(run, blocks[index], known), options)
+    )
     with using_threads(1), Precision.of(run.cube().attrs).used():
-        result: xr.Dataset = function_of(analysis.compute)(Part(run, blocks[index], known), options)
+        result: xr.Dataset = function_of(analysis.compute)(*given)
     with writing_results():
         write_block(run.info.files, _name(key, index), result.assign_attrs(key))
     return {"block": index}

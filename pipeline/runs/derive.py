@@ -74,8 +74,8 @@ class AnalysedRun(RunDirectory):
     """An opened run for analyses; an analysis gets from it the results of other analyses."""
 
     echo: Echo = silent  # function that prints a line
-    # number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`; of
-    # threads of the engine for an analysis without blocks
+    # number of threads or processes for blocks, see `pipeline.compute.execute.run_tasks`; of threads of the engine for
+    # an analysis without blocks
     workers: int | None = None
     where: Where | None = None  # place of the computation of blocks
 
@@ -136,7 +136,7 @@ def derive(
         Number of threads or processes, see `pipeline.compute.execute.run_tasks`; of threads for an analysis that is
         not computed in blocks.
     scheduler
-        Where blocks of parameter points are computed.
+        Where blocks are computed.
 
     Returns
     -------
@@ -349,22 +349,20 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 
 def _compute(run: AnalysedRun, analysis: Analysis, options: Options, *, can_keep: bool) -> xr.Dataset:
-    """Compute a result, in blocks if they can be kept, otherwise on threads of the engine."""
+    """Compute a result, in blocks if it has any and they can be kept, otherwise on threads of the engine."""
     from threadpoolctl import threadpool_limits
 
     from magpend_core.engine.threads import using_threads
-    from pipeline.runs.blocks import in_blocks
+    from pipeline.runs.blocks import computed_at_once, in_blocks
 
     started = time.perf_counter()
     threads = contextlib.nullcontext() if run.workers is None else using_threads(max(run.workers, 1))
     # matrices are so small that threads of linear algebra would wait for each other
     with refused(run.name), threads, threadpool_limits(1), Precision.of(run.cube().attrs).used():
-        if analysis.by_point and can_keep and not getattr(options, "at", None):
-            result = in_blocks(run, analysis, options)
-        else:
-            result = function_of(analysis.compute)(run, options)
+        is_divided = bool(analysis.parts) or (analysis.by_point and not getattr(options, "at", None))
+        result = (in_blocks if is_divided and can_keep else computed_at_once)(run, analysis, options)
         if analysis.finish:
-            result = function_of(analysis.finish)(result, options)
+            result = function_of(analysis.finish)(run, result, options)
         result = described(result, analysis.columns, run.model)
     run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
     return result

@@ -7,7 +7,7 @@ draw by Newton's method (`carrying`). An orbit that is lost on the way counts as
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -171,7 +171,30 @@ def _path(posterior: str) -> Path:
     return path / DRAWS_FILE if path.is_dir() else path
 
 
-def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
+def drawn_parameters(run: OpenRun, options: BandOptions) -> list[list[float]]:
+    """Return the packed parameters of each draw.
+
+    Raises
+    ------
+    SpecError
+        If the draws are of another model or do not differ along the branches.
+    """
+    drawn = _drawn(run, options)
+    if not moving_of(drawn, options.parameter):
+        raise SpecError(
+            f"--posterior {options.posterior}: {options.parameter} alone was identified, and the branches run along "
+            "it: nothing differs between the draws. Give --parameter another one."
+        )
+    run.derive("branches", parameter=options.parameter)
+    packed: list[list[float]] = _packed(parameters_of(run.cube()), drawn, options.parameter).tolist()
+    return packed
+
+
+def _drawn(run: OpenRun, options: BandOptions) -> xr.Dataset:
+    return draws_of(run, options.posterior).isel(draw=slice(options.draws or None))
+
+
+def bands(run: OpenRun, options: BandOptions, packed: Sequence[Sequence[float]]) -> xr.Dataset:
     """Carry draws of the parameters through the branches of a run.
 
     Returns
@@ -179,21 +202,14 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     Dataset
         Over ``draw`` and ``bifurcation``: ``bifurcation_value`` [SI], NaN where a draw has none; with ``kind``,
         ``value`` (of the run), ``orbit_period``, ``bifurcation_section`` and ``is_border`` (whether a stable orbit
-        begins or ends there). Over ``level`` (`LEVELS`) and ``orbit``: ``section_level`` (phase, state), quantiles of
-        the section points of each orbit, with the variables of `place_variables`.
+        begins or ends there). Over ``draw`` and ``orbit``: ``section`` (phase, state), the section points of each
+        orbit, which `with_levels` replaces by their quantiles; over ``orbit`` the variables of `place_variables`.
 
     Raises
     ------
     SpecError
-        If the draws are of another model or do not differ along the branches, or the run sweeps more than one
-        parameter.
+        If the run sweeps more than one parameter.
     """
-    drawn = draws_of(run, options.posterior).isel(draw=slice(options.draws or None))
-    if not moving_of(drawn, options.parameter):
-        raise SpecError(
-            f"--posterior {options.posterior}: {options.parameter} alone was identified, and the branches run along "
-            "it: nothing differs between the draws. Give --parameter another one."
-        )
     located = run.derive("branches", parameter=options.parameter)
     base = parameters_of(run.cube())
     along = _along(options, interval_along(run, options.parameter), base, located)
@@ -203,22 +219,33 @@ def bands(run: OpenRun, options: BandOptions) -> xr.Dataset:
     n_states = located.sizes["state"]
     guess = np.array([*states, *guesses]).reshape(len(data), n_states + 1)
     start, solved = solvable(OrbitData(along, "", tuple(data), Solution(base.pack(), guess, np.zeros_like(guess))))
-    run.echo(f"bands: {len(solved)} orbits and bifurcations for each of {drawn.sizes['draw']} draws")
-    values, sections = _carry(start, _packed(base, drawn, options.parameter), located.sizes["phase"])
+    values, sections = _carry(start, np.array(packed), located.sizes["phase"])
     is_orbit = np.array([d.kind == ORBIT for d in start.data], bool)
     own = [solved[k] - len(points) for k in np.flatnonzero(is_orbit)]
     of_points = [chosen[solved[k]] for k in np.flatnonzero(~is_orbit)]
     found = _bifurcations(located, of_points, values[:, ~is_orbit])
-    share = np.isfinite(sections[:, is_orbit, 0, 0]).mean(axis=0)
-    levels = _levels(sections[:, is_orbit], np.asarray(along.model.system.is_angle, bool))
-    found = found.assign(place_variables([orbits[k] for k in own], [places[k] for k in own], share))
-    found["section_level"] = (("level", "orbit", "phase", "state"), levels, dict(located["section"].attrs))
-    return found.assign_coords(level=list(LEVELS), state=located["state"]).assign_attrs(
-        parameter=located.attrs["parameter"],
-        parameter_units=located.attrs["parameter_units"],
-        **{k: v for k, v in located.attrs.items() if k == "model"},
-        n_draws=drawn.sizes["draw"],
-        identified=" ".join(moving_of(drawn, options.parameter)),
+    found = found.assign(place_variables([orbits[k] for k in own], [places[k] for k in own], np.ones(len(own))))
+    found["section"] = (("draw", "orbit", "phase", "state"), sections[:, is_orbit], dict(located["section"].attrs))
+    kept = {k: located.attrs[k] for k in ("parameter", "parameter_units", "model") if k in located.attrs}
+    return found.assign_coords(state=located["state"]).assign_attrs(kept)
+
+
+def with_levels(run: OpenRun, found: xr.Dataset, options: BandOptions) -> xr.Dataset:
+    """Replace the section points of all draws by ``section_level``, their quantiles over ``level`` (`LEVELS`), and add
+    the share of draws that have each orbit.
+    """
+    section = found["section"]
+    levels = _levels(section.values, np.asarray(run.model.system.is_angle, bool))
+    return (
+        found.drop_vars("section")
+        .assign(
+            section_level=(("level", "orbit", "phase", "state"), levels, section.attrs),
+            share=("orbit", np.isfinite(section.values[:, :, 0, 0]).mean(axis=0)),
+        )
+        .assign_coords(level=list(LEVELS))
+        .assign_attrs(
+            n_draws=found.sizes["draw"], identified=" ".join(moving_of(_drawn(run, options), options.parameter))
+        )
     )
 
 

@@ -34,6 +34,7 @@ from pipeline.analysis.branches.following import Branch, Limit, grows_without_bo
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
 from pipeline.layout.own_words import place_in_words
+from pipeline.products.reporting import track
 from pipeline.results.tolerances import BRANCH_RTOL
 from pipeline.specification.tables import FREQUENCY
 
@@ -68,7 +69,7 @@ def towards(branch: Branch, end: int) -> list[Point]:
 
 def settle_limits(branches: Sequence[Branch]) -> None:
     """Name the ends of branches, stuck or with too many points, at which the period grows without bound by a law."""
-    for branch in branches:
+    for branch in track(branches, "naming ends of branches"):
         for end in (0, 1):
             if branch.ends[end] in ("stuck", "max_points") and has_cycles(branch):
                 found = limit_of(branch, towards(branch, end))

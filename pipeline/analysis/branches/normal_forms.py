@@ -36,6 +36,7 @@ from pipeline.analysis.branches.critical_motion import Critical, mean_squares
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
 from pipeline.analysis.branches.lockstep import integrated
 from pipeline.analysis.branches.problems import Ends, Family, Rows, Value
+from pipeline.products.reporting import track
 
 STEPS = 0.125 * 2.0 ** -np.arange(13.0)
 """Sizes of the steps in units of the system's scales. The largest fit smooth maps, the smallest maps that are
@@ -109,7 +110,8 @@ def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
             _judge_rest(family, one)
     ones = [(family, one) for family, one in bifurcations if family.period]
     cases = [Case(family, one.kind, one.point.u, one.point.value.monodromy) for family, one in ones]
-    for (_, one), case, matrices in zip(ones, cases, _matrices(cases), strict=True):
+    told = track(list(zip(ones, cases, _matrices(cases), strict=True)), "computing normal forms")
+    for (_, one), case, matrices in told:
         if one.kind == BRANCHING:
             forms = (settled(case.coefficients(form, matrices)) for form in (_quadratic, _cubic, _size))
             (square, error, _), (cubic, cubic_error, _), (size, *_) = forms

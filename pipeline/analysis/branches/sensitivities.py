@@ -233,8 +233,13 @@ def settle_sensitivities(run: OpenRun, options: SensitivityOptions) -> Sensitivi
     return options.model_copy(update={"digest": digest})
 
 
-def sensitivities(run: OpenRun, options: SensitivityOptions) -> xr.Dataset:
-    """Compute how each bifurcation on the branches of a run moves with each parameter.
+def numbered_bifurcations(run: OpenRun, options: SensitivityOptions) -> list[int]:
+    """Return the numbers of the bifurcations on the branches of a run."""
+    return list(range(run.derive("branches", parameter=options.parameter).sizes["bifurcation"]))
+
+
+def sensitivities(run: OpenRun, options: SensitivityOptions, wanted: Sequence[int]) -> xr.Dataset:
+    """Compute how some bifurcations on the branches of a run move with each parameter.
 
     Returns
     -------
@@ -243,12 +248,16 @@ def sensitivities(run: OpenRun, options: SensitivityOptions) -> xr.Dataset:
         ``derivative`` of the bifurcation's value, with ``derivative_error`` [units of the continued parameter per unit
         of the parameter]; ``elasticity``, the relative change of the value over that of the parameter (NaN if one of
         them is 0), with ``elasticity_error``; ``status`` (`STATUSES`); ``parameter_value``. Over ``bifurcation``:
-        ``kind``, ``value``, ``orbit_period``, ``of_branch`` and ``deviation``, the standard deviation to first order,
-        NaN without deviations of parameters. Over ``parameter``: ``unit`` and ``parameter_deviation``.
+        ``kind``, ``value``, ``orbit_period`` and ``of_branch``. Over ``parameter``: ``unit``. `with_deviations` adds
+        ``deviation`` and ``parameter_deviation``.
     """
-    branches, base = run.derive("branches", parameter=options.parameter), parameters_of(run.cube())
+    branches = run.derive("branches", parameter=options.parameter)
+    return sensitivities_of(branches.isel(bifurcation=list(wanted)), parameters_of(run.cube()))
+
+
+def with_deviations(run: OpenRun, found: xr.Dataset, options: SensitivityOptions) -> xr.Dataset:
+    """Add the standard deviations of parameters, and of each bifurcation to first order, NaN without those."""
     names = _moving(run.model, axis_name(options.parameter))
-    found = sensitivities_of(branches, base)
     covariance = _covariance(run, options, names)
     there = np.flatnonzero(np.diag(covariance) > 0.0)
     part = found["derivative"].values[:, there]
@@ -261,7 +270,7 @@ def sensitivities(run: OpenRun, options: SensitivityOptions) -> xr.Dataset:
 
 
 def sensitivities_of(branches: xr.Dataset, base: Parameters) -> xr.Dataset:
-    """Return the result of `sensitivities` without deviations, for computed branches of a run with given parameters."""
+    """Return the result of `sensitivities` for computed branches of a run with given parameters."""
     first, model = str(branches.attrs["parameter"]), base.model
     located = located_in(branches, base)
     found = [sensitivity_of(one) for one in track(located, "sensitivities")]

@@ -7,7 +7,7 @@ sign that it has before, changes its sign at the tangency, which is located by B
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from itertools import product
 
 import numpy as np
@@ -45,34 +45,50 @@ FINE = Resolution(chord=0.01, length=6.0)
 """Resolution at which splines through the points are accurate to 1e-8 of the scales."""
 
 
-def manifolds(run: OpenRun, options: ManifoldOptions) -> xr.Dataset:
-    """Grow the manifolds of the saddle orbits that the analysis ``orbits`` finds."""
-    base, found = parameters_of(run.cube()), run.derive("orbits", **options.part(OrbitOptions))
-    resolution = Resolution(options.chord, options.length, options.most)
-    asked = [
-        (number, saddle, side, stable)
-        for number, saddle in _saddles(found, *parameters_at(point_of(run.cube(), options), base), base)
+Side = tuple[int, bool, float]
+"""A manifold's side: the number of its orbit, whether it is the stable one, and its direction."""
+
+
+def sides(run: OpenRun, options: ManifoldOptions) -> list[Side]:
+    """Return the sides that are curves of the manifolds of the saddle orbits that the analysis ``orbits`` finds."""
+    return [
+        (number, stable, side)
+        for number, saddle in _saddles(run, options).items()
         for stable in (False, True)
         if _is_curve(saddle, stable)
         for side in SIDES
     ]
+
+
+def manifolds(run: OpenRun, options: ManifoldOptions, asked: Sequence[Side]) -> xr.Dataset:
+    """Grow sides of the manifolds of saddle orbits."""
+    saddles = _saddles(run, options, {number for number, *_ in asked})
+    resolution = Resolution(options.chord, options.length, options.most)
     curves = [
-        (number, saddle, side, (stable_manifold if stable else unstable_manifold)(saddle, side, resolution))
-        for number, saddle, side, stable in track(asked, "growing manifolds")
+        (
+            number,
+            saddles[number],
+            side,
+            (stable_manifold if stable else unstable_manifold)(saddles[number], side, resolution),
+        )
+        for number, stable, side in track(asked, "growing manifolds")
     ]
-    return _dataset(curves, base)
+    return _dataset(curves, parameters_of(run.cube()))
 
 
-def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: Parameters) -> list[tuple[int, Saddle]]:
-    saddles = []
-    for number in range(found.sizes["orbit"]):
+def _saddles(run: OpenRun, options: OrbitOptions, wanted: Collection[int] | None = None) -> dict[int, Saddle]:
+    """Refine the saddle orbits that the analysis ``orbits`` finds, all or those with the wanted numbers."""
+    base, found = parameters_of(run.cube()), run.derive("orbits", **options.part(OrbitOptions))
+    frequency_hz, packed = parameters_at(point_of(run.cube(), options), base)
+    saddles = {}
+    for number in range(found.sizes["orbit"]) if wanted is None else sorted(wanted):
         one = found.isel(orbit=number)
         multipliers = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
         if not (multipliers > 1.0).any() or not ((multipliers < 1.0) & (multipliers > 0.0)).any():
             continue
         saddle = _saddle(base, frequency_hz, packed, one["section"].values[0], int(one["orbit_period"]))
         if saddle is not None:
-            saddles.append((number, saddle))
+            saddles[number] = saddle
     return saddles
 
 
@@ -156,26 +172,29 @@ def needs_tangency(run: OpenRun, options: TangencyOptions) -> None:
         raise ValueError(f"{base.model.name} has {n_states} states; tangencies are located for two.")
 
 
-def tangency(run: OpenRun, options: TangencyOptions) -> xr.Dataset:
-    """Locate the parameter value at which each unstable manifold of a saddle orbit first touches a stable one of it,
-    for all pairs.
-    """
-    cube = run.cube()
-    base, found = parameters_of(cube), run.derive("orbits", **options.part(OrbitOptions))
-    frequency, packed = parameters_at(point_of(cube, options), base)
+Pair = tuple[int, float, float]
+"""Number of a saddle orbit, with the sides of its unstable and of its stable manifold."""
+
+
+def pairs_of_sides(run: OpenRun, options: TangencyOptions) -> list[Pair]:
+    """Return all pairs of sides of the manifolds of saddle orbits of which both are curves."""
+    saddles = _saddles(run, options)
+    whole = [number for number, one in saddles.items() if _is_curve(one, True) and _is_curve(one, False)]
+    return list(product(whole, SIDES, SIDES))
+
+
+def tangency(run: OpenRun, options: TangencyOptions, pairs: Sequence[Pair]) -> xr.Dataset:
+    """Locate the parameter value at which each unstable manifold of a saddle orbit first touches a stable one of it."""
+    base, saddles = parameters_of(run.cube()), _saddles(run, options, {number for number, *_ in pairs})
     resolution = Resolution(options.chord, options.length)
     rows = []
-    pairs = list(product(_saddles(found, frequency, packed, base), SIDES, SIDES))
-    for (number, saddle), one, other in track(pairs, "locating tangencies"):
-        if not (_is_curve(saddle, True) and _is_curve(saddle, False)):
-            continue
-        at = _followed(saddle, base, axis_name(options.parameter), options)
+    for number, one, other in track(pairs, "locating tangencies"):
+        at = _followed(saddles[number], base, axis_name(options.parameter), options)
         try:
-            value = first_tangency(at, options.low, options.high, (one, other), resolution)
+            value, why = first_tangency(at, options.low, options.high, (one, other), resolution), ""
         except ValueError as problem:
-            rows.append((number, saddle.period, one, other, np.nan, str(problem)))
-        else:
-            rows.append((number, saddle.period, one, other, value, ""))
+            value, why = np.nan, str(problem)
+        rows.append((number, saddles[number].period, one, other, value, why))
     names = ("orbit", "orbit_period", "unstable_side", "stable_side", "value", "why_not")
     columns = zip(*rows, strict=True) if rows else ([] for _ in names)
     return xr.Dataset(

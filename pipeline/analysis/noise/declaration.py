@@ -109,6 +109,7 @@ DENSITY = Analysis(
     Over an axis this is a stochastic bifurcation diagram.""",
     DensityOptions,
     compute=f"{_ROOM}.density:density",
+    whole="it counts stored section points, and integrates nothing",
     columns=DENSITY_COLUMNS,
     table=f"{_ROOM}.density:density_table",
     figure="density",

@@ -101,7 +101,7 @@ def escapes(run: OpenRun, options: EscapeOptions) -> xr.Dataset:
     return ds.assign_attrs({**_attrs(cube), "confidence": options.confidence})
 
 
-def finish_escapes(ds: xr.Dataset, options: EscapeOptions) -> xr.Dataset:
+def finish_escapes(run: OpenRun, ds: xr.Dataset, options: EscapeOptions) -> xr.Dataset:
     """Drop the sets in which no cell of the run begins, and fit Kramers' law over all parameter points."""
     dims = [str(d) for d in ds["rate"].dims if d != "set"]
     begun = ds["n_cells"].sum(dims).values > 0

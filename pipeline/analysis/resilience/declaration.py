@@ -150,6 +150,7 @@ EDGE = Analysis(
     equilibrium, Newton's method refines it.""",
     EdgeOptions,
     compute="pipeline.analysis.resilience.edge:edge",
+    whole="all pairs advance in step",
     columns=EDGE_COLUMNS,
     table="pipeline.analysis.resilience.edge:edge_table",
     needs="pipeline.analysis.resilience.edge:needs_pair",

@@ -36,6 +36,7 @@ from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import place_in_words
 from pipeline.layout.vocabulary import model_attribute, parameter_name, parameters_of, section_attributes
 from pipeline.products.product import Table
+from pipeline.products.reporting import track
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, Words, aligned, counted, plain, words_of
 from pipeline.results.tolerances import SAME_EQUILIBRIUM
@@ -172,7 +173,7 @@ def _follow_resonance(run: OpenRun, options: BackboneOptions, curves: list[Curve
     run.echo(f"backbone: {counted(len(starts), 'point')} of phase resonance on the response")
     if not starts:
         left_out.append(f"phase resonance: {options.channel} is on no branch of period 1 in quadrature")
-    for problem, guess in starts:
+    for problem, guess in track(starts, "following phase resonance"):
         own = [c for c in curves if c.problem.base == problem.base and c.kind == "phase_resonance"]
         found = run_alone(phase_resonance(problem, guess))
         if found is None:

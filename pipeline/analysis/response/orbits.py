@@ -13,6 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import drive_level, evaluate
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
+from pipeline.products.reporting import report
 from pipeline.results.tolerances import BRANCH_RTOL
 
 FEWEST_TIMES, MOST_TIMES = 512, 8192
@@ -85,6 +86,7 @@ def measures_of(orbits: Sequence[Orbit], n_harmonics: int, *, of_orbit: bool = F
             _measure(found, rows, values, base, n_harmonics)
         scale = np.abs(found.mean[left]) + found.amplitude[left]
         left, n = left[(found.error[left] > settled * scale).any(axis=1)], 2 * n
+        report("measuring orbits", len(orbits) - len(left), len(orbits))
     return found
 
 

@@ -59,6 +59,7 @@ SERIES = Analysis(
     SeriesOptions,
     version=2,
     compute=f"{_SERIES}:series",
+    whole="it is of one motion",
     columns=SERIES_COLUMNS,
     table=f"{_SERIES}:series_table",
     needs=f"{_MOTIONS}:needs_motion",

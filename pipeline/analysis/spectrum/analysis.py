@@ -37,6 +37,7 @@ from pipeline.layout.conventions import code_flags
 from pipeline.layout.own_words import RATE, dims_in_own_words
 from pipeline.layout.vocabulary import EQUILIBRIUM, KINDS, PERIODIC_ORBIT, STABILITIES, TORUS, split_dims, told_by
 from pipeline.products.product import Table
+from pipeline.products.reporting import track
 from pipeline.results.run import OpenRun
 from pipeline.results.selection import select_points
 from pipeline.results.tabular import Row, Words, aligned, number, plain, words_of
@@ -77,8 +78,15 @@ def needs_axis(run: OpenRun, options: SpectrumFigureOptions | WaterfallOptions) 
         select_points(run.cube(), options.at, purpose="spectra are drawn of one parameter point or one cell")
 
 
-def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
-    """Measure the spectra of the sets of a run, or of the motion of a cell.
+def numbered_motions(run: OpenRun, options: SpectrumOptions) -> list[int]:
+    """Return the numbers of the motions whose spectra are measured."""
+    numbers = list(range(len(motions_of(run, options))))
+    run.echo(f"spectrum: {len(numbers)} motions")
+    return numbers
+
+
+def spectrum(run: OpenRun, options: SpectrumOptions, wanted: Sequence[int]) -> xr.Dataset:
+    """Measure the spectra of some motions: sets of a run, or the motion of a cell.
 
     Returns
     -------
@@ -91,8 +99,7 @@ def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
         ``error``; of a torus ``first_hz``, ``second_hz`` (NaN if undecided) and ``explained``, the share of its power
         at their combinations.
     """
-    motions = motions_of(run, options)
-    run.echo(f"spectrum: {len(motions)} motions")
+    motions = motions_of(run, options, set(wanted))
     place = [v.name for v in channels_of(run.model)].index(options.channel)
     rows: list[dict[str, Any]] = [{"estimate": NONE} for _ in motions]
     closed = [i for i, m in enumerate(motions) if m.kind in (PERIODIC_ORBIT, EQUILIBRIUM)]
@@ -100,7 +107,7 @@ def spectrum(run: OpenRun, options: SpectrumOptions) -> xr.Dataset:
         own = [i for i in closed if motions[i].period == period]
         for i, row in zip(own, _lines([motions[i] for i in own], place, options), strict=True):
             rows[i] = row
-    for i in sorted(set(range(len(motions))) - set(closed)):
+    for i in track(sorted(set(range(len(motions))) - set(closed)), "averaging periodograms"):
         rows[i] = _average(motions[i], place, options)
     return _dataset(run, options, motions, rows)
 

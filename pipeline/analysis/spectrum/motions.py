@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -71,8 +71,8 @@ def settle_motion(run: OpenRun, options: Chosen) -> Chosen:
     return options.model_copy(update={"channel": options.channel or run.model.state_names[0], "attractor": chosen})
 
 
-def motions_of(run: OpenRun, options: CellOptions) -> list[Motion]:
-    """Return the motions of the chosen sets, or of a cell."""
+def motions_of(run: OpenRun, options: CellOptions, wanted: Container[int] | None = None) -> list[Motion]:
+    """Return the motions of the chosen sets, or of a cell; all, or those with the wanted numbers."""
     found = run.derive("attractors")
     dims, _ = split_dims(found["attractor_id"])
     chosen, where, attractor = run.cube(), dict(options.at), options.attractor
@@ -89,14 +89,15 @@ def motions_of(run: OpenRun, options: CellOptions) -> list[Motion]:
     here = select_points(found, where)
     axes = dict(zip(dims, places_of_rows(here, dims_of(here)), strict=True))
     points = points_of_rows(here)
+    rows = [i for i, number in enumerate(here["attractor"].values.tolist()) if attractor in ("", letter(number))]
     motions = []
-    for i, number in enumerate(here["attractor"].values.tolist()):
-        if not attractor or letter(number) == attractor:
-            at = {d: float(values[i]) for d, values in axes.items()}
+    for k, i in enumerate(rows):
+        if wanted is None or k in wanted:
+            number, at = int(here["attractor"].values[i]), {d: float(values[i]) for d, values in axes.items()}
             columns = ("kind", "stability", "orbit_period", "period_s", "share")
             told = (here[name].values[i].item() for name in columns)
             motions.append(Motion._make((at, number, *told, points[i][0], *_parameters(found, at))))
-    if not motions:
+    if not rows:
         there = ", ".join(letter(i) for i in sorted(set(here["attractor"].values.tolist()))) or "none"
         raise ValueError(f"no set {attractor} is there; it has {there} (magpend analyse attractors).")
     return motions

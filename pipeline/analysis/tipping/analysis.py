@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -305,11 +306,13 @@ class Bisection:
         """Return the brackets, halved until they are narrow enough or cannot be decided."""
         most_steps = 60  # most bisections; float64 has 53 binary digits
         found = list(brackets)
+        widest = max((one.high - one.low for one in found), default=0.0)
+        needed = min(most_steps, math.ceil(math.log2(max(widest / self.width, 1.0)))) if self.width else most_steps
         for step in range(most_steps):
             open_ = [i for i, b in enumerate(found) if self._is_open(b)]
             if not open_:
                 break
-            report("bisecting", step, most_steps)
+            report("bisecting", step, needed)
             for i, outcome in zip(open_, self._outcomes([found[i] for i in open_]).tolist(), strict=True):
                 found[i] = found[i].halved(outcome)
         return found

@@ -16,6 +16,7 @@ from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.tipping.declaration import TippingOptions
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute
 from pipeline.motion.steady import Inputs, Steady
+from pipeline.products.reporting import track
 from pipeline.results.outcomes import DIVERGED, outcomes
 from pipeline.results.ragged import dense
 from pipeline.results.run import OpenRun
@@ -78,7 +79,7 @@ def endings(
     Finals, last sections (cell, n_states) and codes of `Status` are those of the cells.
     """
     keys = [final.key for final in finals]
-    for key in dict.fromkeys(keys):
+    for key in track([*dict.fromkeys(keys)], "final parameters"):
         cells = np.flatnonzero([k == key for k in keys])
         final = finals[cells[0]]
         going = cells[np.isin(status[cells], GOOD)]

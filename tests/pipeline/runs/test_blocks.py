@@ -1,21 +1,28 @@
-"""Analyses in blocks of parameter points: the same bytes whatever the blocks and workers, stopped or not."""
+"""Analyses in blocks of parameter points or parts: the same bytes whatever the blocks and workers, stopped or not."""
 
 from __future__ import annotations
 
 import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 import pytest
+import xarray as xr
+from distributed import LocalCluster
 
 from magpend_core.engine.threads import number_of_threads
 from pipeline.analysis.attractors import analysis
 from pipeline.compute import execute
-from pipeline.products.registry import ANALYSES
+from pipeline.products.registry import ANALYSES, OWN
+from pipeline.results.ragged import stacked
 from pipeline.runs import blocks
 from pipeline.runs.derive import AnalysedRun, derive, prune
 from pipeline.runs.stopping import InterruptedRunError
-from tests.pipeline.factories import WELL, contents
+from tests.pipeline.factories import LOOPBACK, WELL, contents
 
 MAP = """
 kind = "sweep"
@@ -117,6 +124,9 @@ CHAOTIC = f"""{FEWER.replace("twin-well-periodic", "twin-well").replace("n_keep 
 [products]
 lyapunov = {{ n_transient = 20, n_periods = 64 }}
 """
+CHAOTIC_ROW = CHAOTIC.replace("frequency_hz = { start = 0.12, stop = 0.2, num = 3 }\n", "").replace(
+    'preset = "twin-well"\n', 'preset = "twin-well"\nfrequency_hz = 0.12\n'
+)
 NOISY = (
     WELL.replace("stop = 199", "stop = 19")
     .replace("n_keep = 1000", "n_keep = 200")
@@ -159,6 +169,117 @@ def test_in_blocks__every_analysis_of_points(name, options, pairs, sizes):
     assert len(blocks.blocks_of(other)) > 2
     derive(other, name, options, scheduler="none")
     assert files_of(other, name) == files_of(one, name)
+
+
+def test_analyses__are_divided_or_say_why_not():
+    for name in {*OWN, "identified"} & set(ANALYSES):
+        one = ANALYSES[name]
+        assert [one.by_point, bool(one.parts), bool(one.whole)].count(True) == 1, name
+        assert bool(one.parts) == bool(one.rows), name
+
+
+def test_stacked__pads_to_the_longest():
+    values = np.arange(12.0).reshape(4, 3)
+    values[[0, 3], 2] = np.nan
+    whole = xr.Dataset(
+        {
+            "point": (("row", "bin"), values, {"units": "m"}),
+            "n": ("row", np.array([2, 3, 3, 2], np.int8)),
+            "of": ("state", [7.0]),
+        },
+        coords={"where": ("row", ["a", "bcd", "e", "f"])},
+        attrs={"title": "rows"},
+    )
+    parts = [whole.isel(row=[0], bin=slice(2)), whole.isel(row=[1, 2]), whole.isel(row=[3], bin=slice(2))]
+    xr.testing.assert_identical(stacked(parts, "row"), whole)
+
+
+AT = {"at": {"frequency_hz": 0.12, "amplitude": 0.3}}
+PARTS = {
+    "spectrum": {"averages": 3, "segment": 16},
+    "manifolds": {**AT, "length": 0.5, "chord": 0.1, "starts": 60},
+    "tangency": {**AT, "length": 0.5, "starts": 60, "parameter": "amplitude", "low": 0.3, "high": 0.31},
+    "sensitivities": {"parameter": "amplitude", "deviation": {"damping": 0.01}},
+    "bands": {"parameter": "amplitude", "posterior": "posterior.nc"},
+}
+
+
+def test_divided__parts_are_in_blocks_of_some(copy, monkeypatch):
+    run = copy("run")
+    monkeypatch.setattr(blocks, "function_of", lambda name: lambda run, options: list(range(200)))
+    for together, sizes in ((1, [4] * 50), (16, [16] * 12 + [8])):
+        analysis = replace(ANALYSES["manifolds"], together=together)
+        assert [len(part) for part in blocks.divided(run, analysis, None)] == sizes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, one in ANALYSES.items() if one.parts])
+def test_in_blocks__every_analysis_of_parts(name, pairs, monkeypatch, tmp_path):
+    one, other = pairs(CHAOTIC_ROW if name == "bands" else CHAOTIC)
+    monkeypatch.chdir(tmp_path)
+    draws = xr.Dataset({"value": (("draw", "parameter"), [[0.099], [0.1], [0.101]])}, {"parameter": ["damping"]})
+    draws.assign_attrs(identified="damping").to_netcdf("posterior.nc", engine="scipy")
+    monkeypatch.setattr(blocks, "WANTED", 1)
+    derive(one, name, PARTS[name], workers=0)
+    divided = blocks.divided
+
+    def singly(run, analysis, options):
+        found = divided(run, analysis, options)
+        return [[part] for block in found for part in block] if analysis.parts else found
+
+    monkeypatch.setattr(blocks, "divided", singly)
+    found, real = [], blocks.compute_block
+    monkeypatch.setattr(blocks, "compute_block", lambda *a, **o: found.append(a[-1]) or real(*a, **o))
+    derive(other, name, PARTS[name], workers=0)
+    assert len(found) > 2
+    assert files_of(other, name) == files_of(one, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["none", "threads", "processes", "dask"])
+def test_in_blocks__parts_anywhere(copy, whole, monkeypatch, where):
+    monkeypatch.setattr(blocks, "WORTH_PROCESSES", 0.0)
+    derive(whole, "manifolds", PARTS["manifolds"], workers=0)
+    run, lines = copy(where), []
+    places, real = [], execute.run_tasks
+    monkeypatch.setattr(execute, "run_tasks", lambda *a, **o: places.append(o["scheduler"]) or real(*a, **o))
+    if where == "dask":
+        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **LOOPBACK) as cluster:
+            derive(run, "manifolds", PARTS["manifolds"], scheduler=cluster.scheduler_address, echo=lines.append)
+    else:
+        place = None if where == "processes" else where
+        derive(run, "manifolds", PARTS["manifolds"], workers=2, scheduler=place, echo=lines.append)
+        assert places[-1].resolved() == where
+    assert files_of(run, "manifolds") == files_of(whole, "manifolds")
+
+
+KILLED = """
+import os, signal, sys
+from pipeline.runs import blocks
+from pipeline.runs.derive import derive
+real, written = blocks.write_block, []
+def write(*given):
+    real(*given)
+    written.append(given[1])
+    if len(written) == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+blocks.write_block = write
+derive(sys.argv[1], "manifolds", OPTIONS, scheduler="none")
+"""
+
+
+@pytest.mark.slow
+def test_in_blocks__parts_after_a_kill(copy, whole):
+    derive(whole, "manifolds", PARTS["manifolds"], workers=0)
+    run, lines = copy("killed"), []
+    script = KILLED.replace("OPTIONS", repr(PARTS["manifolds"]))
+    assert subprocess.run([sys.executable, "-c", script, run.directory], check=False).returncode == -signal.SIGKILL
+    (folder,) = (run.directory / "derived").glob("manifolds-*.blocks")
+    assert len(list(folder.iterdir())) == 2
+    derive(run, "manifolds", PARTS["manifolds"], workers=0, echo=lines.append)
+    assert any(line.startswith("manifolds: 2 of ") for line in lines)
+    assert files_of(run, "manifolds") == files_of(whole, "manifolds")
+    assert not folder.exists()
 
 
 @pytest.mark.slow

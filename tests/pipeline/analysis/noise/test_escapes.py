@@ -89,7 +89,7 @@ def test_escapes__a_record_that_only_begins_to_leave_is_not_constant() -> None:
     ds = escapes(run_of(cube_of(x)), EscapeOptions())
     # of the 60 * 30 + 140 * 39 intervals at risk 200 * 19 are in the first half
     assert ds["constant_p"].isel(set=1).item() == pytest.approx((3460 / 7260) ** 60)
-    table = escapes_table(finish_escapes(ds, EscapeOptions()))
+    table = escapes_table(finish_escapes(None, ds, EscapeOptions()))
     assert any("differs from that late in it" in line for line in table.lines)
 
 
@@ -122,7 +122,8 @@ def test_finish_escapes__fits_kramers_law_over_strengths() -> None:
     rates = [k * np.exp(-b / s**2) if s else 0.0 for s in strengths]
     x = leaving([-np.expm1(-r / 2.0) or 1e-300 for r in rates], n=6000)
     x[0] = -1.0
-    ds = finish_escapes(escapes(run_of(cube_of(x, strengths=strengths)), EscapeOptions()), EscapeOptions())
+    run = run_of(cube_of(x, strengths=strengths))
+    ds = finish_escapes(run, escapes(run, EscapeOptions()), EscapeOptions())
     assert ds["set"].values.tolist() == [1]  # no cell begins on the right
     one = ds.isel(set=0)
     assert float(one["barrier_low"]) < b < float(one["barrier_high"])
