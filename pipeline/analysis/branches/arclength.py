@@ -48,6 +48,7 @@ class Settings:
     amplitudes: tuple[float, ...] = (0.02, 0.05, 0.1)
     # step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step
     across: float = 100.0
+    longest_at_rest: float = 0.05  # `longest_step` of equilibria, on whose branches tests see two zeros within a step
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ TESTS: dict[str, Test] = {
     DOUBLING: _of_orbits(doubling_test),
     TORUS: lambda point: 1.0 if point.value.is_rest else torus_product(point.value.multipliers),
     BRANCHING: _branching_test,
-    HOPF: lambda point: hopf_test(point.value.monodromy) if point.value.is_rest else 1.0,
+    HOPF: lambda point: hopf_test(point.value.multipliers) if point.value.is_rest else 1.0,
 }
 """Functions of a point that change their sign at a bifurcation.
 
@@ -149,7 +149,7 @@ class Watch:
             return False
         if long and turns_twice(a, b):
             return False
-        if step > short and BRANCHING not in kinds and self._turned_back(a, b, step):
+        if step > short and any(self._turned_back(kind, a, b, step) for kind in (BRANCHING, HOPF) if kind not in kinds):
             return False
         located = []
         for kind in kinds:
@@ -166,14 +166,15 @@ class Watch:
         self._last = a
         return True
 
-    def _turned_back(self, a: Point, b: Point, step: float) -> bool:
-        """Return whether the test function of branch points goes to 0 at a point, and away from it at the next.
+    def _turned_back(self, kind: str, a: Point, b: Point, step: float) -> bool:
+        """Return whether a test function goes to 0 at a point, and away from it at the next.
 
-        Then the step may have left a branch that turns at a pitchfork for the one that passes straight through.
+        Then the step may have passed two Hopf points, or have left a branch that turns at a pitchfork for the one that
+        passes straight through.
         """
         if self._last is None:
             return False
-        before, here, there = (_branching_test(point) for point in (self._last, a, b))
+        before, here, there = (TESTS[kind](point) for point in (self._last, a, b))
         ahead = here + (here - before) * step / float(np.linalg.norm(a.u - self._last.u))
         return here * ahead < 0.0 < here * there
 

@@ -68,11 +68,11 @@ class Rest:
 
 
 def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve linear equations; NaN if the matrix is singular."""
+    """Solve linear equations, of one matrix or of several; NaN if a matrix is singular."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
-        return np.full(len(right), np.nan)
+        return np.full(matrix.shape[:-1], np.nan)
 
 
 def null_vectors(matrix: np.ndarray, value: complex = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ from functools import partial
 
 import numpy as np
 
-from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.plain_rates import plain_rates
 from pipeline.analysis.branches import center_manifold
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.center_manifold import Rest, lyapunov, null_vectors, solved
@@ -89,7 +89,7 @@ class EquilibriumCurve(FamilyProblem):
             return np.concatenate([u[:n], u[-2:]])
         extra = 0.0
         if self.kind == HOPF:
-            _, jacobian = self._rates(u)
+            jacobian = self._rates(u[None])[1][0]
             values = np.linalg.eigvals(jacobian)
             upper = values[values.imag > 0.0]
             if omega is None and len(upper):
@@ -105,29 +105,27 @@ class EquilibriumCurve(FamilyProblem):
         """Compute the scaled rates and the conditions of the bifurcation, and their derivatives by central
         differences.
         """
-        n, (rates, jacobian) = self.family.system.n_states, self._rates(u)
-        if not (np.isfinite(rates).all() and np.isfinite(jacobian).all()):
-            nothing = np.full((self.size - 1, self.size), np.nan)
-            return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobian, is_rest=True)
-        vectors = null_vectors(self.family.scaled(jacobian) * self._unit_of(jacobian))
-        # of either sign where the singular value is 0 but for rounding, which would turn the imperfection's
-        right, left = (v * np.copysign(1.0, v[np.argmax(np.abs(v))]) for v in vectors)
-        steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (self.size - n))
-        places = (u, *(u + np.diag(steps)), *(u - np.diag(steps)))
-        found = np.array([self._equations(one, right, left) for one in places])
-        derivative = (found[1 : 1 + self.size] - found[1 + self.size :]).T / (2.0 * steps)
-        derivative[:n, :n] = self.family.scaled(jacobian) * self.unit
+        n, size = self.family.system.n_states, self.size
+        steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * (size - n))
+        places = np.concatenate([u[None], u + np.diag(steps), u - np.diag(steps)])
+        rates, jacobians = self._rates(places)
+        if not (np.isfinite(rates[0]).all() and np.isfinite(jacobians[0]).all()):
+            nothing = np.full((size - 1, size), np.nan)
+            return Value(nothing[:, 0], nothing, self.family.state(u)[None], jacobians[0], is_rest=True)
+        matrices = self.family.scaled(jacobians) * self._unit_of(jacobians[0])
+        found = self._equations(places, rates * self.unit, matrices)
+        derivative = (found[1 : 1 + size] - found[1 + size :]).T / (2.0 * steps)
+        derivative[:n, :n] = matrices[0]
         seconds = np.nan
         if self.kind == HOPF and u[n] > 0.0:
             seconds = float(2.0 * np.pi * self.unit / np.sqrt(u[n]))
-        images = self.family.rows(u[None]).states
-        return Value(found[0], derivative, images, jacobian, seconds, is_rest=True)
+        return Value(found[0], derivative, self.family.rows(u[None]).states, jacobians[0], seconds, is_rest=True)
 
-    def _rates(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the scaled rates [1/s] and the Jacobian [1/s], not scaled."""
-        rows, system = self.family.rows(u[None]), self.family.system
-        rates = rates_at(system, rows.states, rows.parameters[0])[0] / np.asarray(system.scales)
-        return rates, jacobian_at(system, rows.states, rows.parameters[0])[0]
+    def _rates(self, many: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the scaled rates [1/s] and the Jacobians [1/s], not scaled, at several vectors of unknowns."""
+        rows, system = self.family.rows(many), self.family.system
+        rates, jacobians = plain_rates(system, rows.states, rows.parameters)
+        return rates / np.asarray(system.scales), jacobians
 
     def _unit_of(self, jacobian: np.ndarray) -> float:
         """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
@@ -137,25 +135,28 @@ class EquilibriumCurve(FamilyProblem):
             self.unit = 1.0 / (float(np.linalg.norm(self.family.scaled(jacobian))) or 1.0)
         return self.unit
 
-    def _equations(self, u: np.ndarray, right: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Return the dimensionless equations at some unknowns, with given singular vectors."""
+    def _equations(self, places: np.ndarray, rates: np.ndarray, matrices: np.ndarray) -> np.ndarray:
+        """Return the dimensionless equations at several vectors of unknowns, with the singular vectors of the first."""
         # step of the differences by the first parameter inside of the equations of a branch point, of fourth order
         inner = 1e-3
-        n, (rates, jacobian) = self.family.system.n_states, self._rates(u)
-        rates, matrix = rates * self.unit, self.family.scaled(jacobian) * self.unit
+        n = self.family.system.n_states
         if self.kind == HOPF:
-            total, product = pair_near(matrix, u[n])
-            return np.concatenate([rates, [total, product - u[n]]])
-        bordered = np.block([[matrix, left[:, None]], [right[None], np.zeros((1, 1))]])
-        solution = solved(bordered, np.append(np.zeros(n), 1.0))
+            pairs = np.array([pair_near(matrix, u[n]) for matrix, u in zip(matrices, places, strict=True)])
+            return np.column_stack([rates, pairs[:, 0], pairs[:, 1] - places[:, n]])
+        # of either sign where the singular value is 0 but for rounding, which would turn the imperfection's
+        right, left = (v * np.copysign(1.0, v[np.argmax(np.abs(v))]) for v in null_vectors(matrices[0]))
+        bordered, last = np.zeros((len(places), n + 1, n + 1)), np.append(np.zeros(n), 1.0)
+        bordered[:, :n, :n], bordered[:, :n, n], bordered[:, n, :n] = matrices, left, right
+        singular = solved(bordered, last)[:, -1:]
         if self.kind == FOLD:
-            return np.append(rates, solution[-1])
-        step = np.zeros(self.size)
-        step[n + 1] = inner
-        far, near, after, beyond = (self._rates(u + k * step)[0] * self.unit for k in (-2, -1, 1, 2))
-        slope = (far - 8.0 * near + 8.0 * after - beyond) / (12.0 * inner)
-        adjoint = solved(bordered.T, np.append(np.zeros(n), 1.0))[:-1]
-        return np.concatenate([rates + u[n] * left, [solution[-1], adjoint @ slope]])
+            return np.hstack([rates, singular])
+        shifts = np.zeros((4, self.size))
+        shifts[:, n + 1] = inner * np.array([-2.0, -1.0, 1.0, 2.0])
+        beside = self._rates((places[:, None] + shifts).reshape(-1, self.size))[0].reshape(len(places), 4, n)
+        slopes = np.einsum("kfn,f->kn", beside * self.unit, [1.0, -8.0, 8.0, -1.0]) / (12.0 * inner)
+        adjoint = solved(bordered.transpose(0, 2, 1), last)[:, :n]
+        along = np.einsum("kn,kn->k", adjoint, slopes)
+        return np.hstack([rates + places[:, n : n + 1] * left, singular, along[:, None]])
 
 
 def pair_near(matrix: np.ndarray, kappa: float) -> tuple[float, float]:
@@ -272,7 +273,7 @@ def _nearest_pair(upper: np.ndarray) -> float:
 
 
 def _pairs(values: np.ndarray) -> float:
-    return hopf_test(np.diag(values)) if len(values) > 1 else 1.0
+    return hopf_test(values) if len(values) > 1 else 1.0
 
 
 def kind_of_zero(family: Family, u: np.ndarray, value: Value) -> str:

@@ -192,6 +192,8 @@ def half_branch(
     """Follow a branch from a point in one direction to its end. If the last point is beyond a parameter bound, move it
     onto the bound.
     """
+    if not family.period:
+        settings = replace(settings, longest_step=settings.longest_at_rest)
     problem = problem_of(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
     stop = _Stop(family, low, high, settings.beyond)

@@ -18,7 +18,7 @@ import numpy as np
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model
 from magpend_core.orbits import wrap_angles
-from magpend_core.pointwise import jacobian_at, rates_at
+from magpend_core.plain_rates import plain_rates
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 
 FREQUENCY = FREQUENCY_DIM
@@ -420,11 +420,12 @@ class EquilibriumProblem(FamilyProblem):
         """Compute the scaled rates at a state, and their derivatives with respect to the state and the parameter."""
         step = np.zeros(self.size)
         step[-1] = PARAMETER_STEP
-        rows, scales = self.family.rows(np.stack([u, u + step, u - step])), np.asarray(self.system.scales)
-        rates = [rates_at(self.system, rows.states[:1], p)[0] / scales for p in rows.parameters]
-        jacobian = jacobian_at(self.system, rows.states[:1], rows.parameters[0])[0]
-        slope = (rates[1] - rates[2]) / (2.0 * PARAMETER_STEP)
+        rows = self.family.rows(np.stack([u, u + step, u - step]))
+        rates, (jacobian, *_) = plain_rates(self.system, rows.states, rows.parameters)
+        rates /= np.asarray(self.system.scales)
         unit = self._unit_of(jacobian)
+        # the places differ in the parameter alone
+        slope = (rates[1] - rates[2]) / (2.0 * PARAMETER_STEP)
         derivative = np.column_stack([self.family.scaled(jacobian), slope]) * unit
         return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
 
@@ -450,9 +451,8 @@ OneParameter = OrbitProblem | EquilibriumProblem
 """The problems with one free parameter, whose solutions are branches."""
 
 
-def hopf_test(jacobian: np.ndarray) -> float:
+def hopf_test(values: np.ndarray) -> float:
     """Compute the product of the normalised sums of all pairs of eigenvalues; it is zero at a Hopf point."""
-    values = np.linalg.eigvals(jacobian)
     i, j = np.triu_indices(len(values), 1)
     sums, sizes = values[i] + values[j], np.abs(values[i]) + np.abs(values[j])
     return float(np.prod(sums / np.where(sizes > 0.0, sizes, 1.0)).real)

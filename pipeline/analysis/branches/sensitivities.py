@@ -88,7 +88,7 @@ class Located:
         inner = 1e-3  # step of the differences by the continued parameter inside of the test function of a branch point
         gaps, matrices = self.closure(many)
         if self.kind == HOPF:
-            return np.column_stack([gaps, [_test(hopf_test, m) for m in matrices]])
+            return np.column_stack([gaps, [_test(lambda m: hopf_test(np.linalg.eigvals(m)), m) for m in matrices]])
         if self.kind not in (FOLD, *BRANCH_POINTS):
             return np.column_stack([gaps, [_test(TESTS[self.kind], m) for m in matrices]])
         right = np.zeros((len(many), self.n_states + 1, 2))
