@@ -1,4 +1,4 @@
-"""Evaluate the rates of an autonomous system and their Jacobian in numpy, at states that each have their own parameters.
+"""Evaluate the rates of an autonomous system and their Jacobian in numpy, at states with parameters of their own each.
 
 Nothing is compiled: the functions of the system run as plain Python, on arrays. For a few dozen states this costs less
 than a call of compiled code for each vector of parameters.
