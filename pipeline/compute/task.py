@@ -24,10 +24,10 @@ from pipeline.layout.identity import differences, numbered
 from pipeline.layout.plan import Plan
 from pipeline.motion.steady import Inputs
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.reading import read_cells
 from pipeline.store.runfile import RunInfo, read_run
+from pipeline.store.tasks import write_task
 
 _PREPARING = threading.Lock()
 """Lock for reading a run and those that it copies from: the first of its threads reads them for all."""

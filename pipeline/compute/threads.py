@@ -18,8 +18,6 @@ from multiprocessing.pool import ThreadPool
 from queue import SimpleQueue
 from typing import Any
 
-from dask.threaded import get
-
 from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
 
@@ -124,6 +122,8 @@ def in_threads(
         return not reason
 
     def compute(chosen: Collection[int]) -> None:
+        from dask.threaded import get
+
         graph = {}
         for index in chosen:
             before = after(index) if after else None

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from magpend_core.models.model import Model
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name
 from pipeline.specification.tables import FREQUENCY, RATES, Rate, word_named
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from pipeline.products.column import Column
 
 RATE = "drive_rate"
@@ -172,6 +173,8 @@ def hertz_of(ds: xr.Dataset) -> xr.DataArray | None:
 
 def arguments_in_own_words(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a figure with datasets, arrays over their cells and ``at`` in the word of the first."""
+    import xarray as xr
+
     first = next((value for value in given.values() if isinstance(value, xr.Dataset)), None)
     if first is None or RATE not in first.attrs:
         return {name: with_plain_names(value) for name, value in given.items() if isinstance(value, xr.Dataset)}

@@ -11,16 +11,19 @@ than `MOST_PERIODS` after the last section. States that stay small (a population
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
+from magpend_core.models.model import Parameters
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of
 from magpend_core.status import Status
-from pipeline.layout.vocabulary import frequency_of, model_of, parameters_of, split_dims
+from pipeline.layout.vocabulary import frequency_of, split_dims
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 DRAWN = 8
 """Most parameter points of which a cell is integrated, and drawn states at which rates are evaluated."""
@@ -29,17 +32,19 @@ MOST_PERIODS, MOST_RATES = 4, 20_000
 """Returns or drive periods for which a cell is integrated, and most evaluations of its rates."""
 
 
-def small_states(ds: xr.Dataset) -> list[str]:
-    """Return a warning for each state of a run's cube that falls below the run's `atol` and comes back."""
-    if "atol" not in ds.attrs or "section" not in ds:
-        return []
-    model = model_of(ds)
+def small_states(parameters: Parameters, cube: Callable[[], xr.Dataset]) -> list[str]:
+    """Return a warning for each state of a run that falls below the run's `atol` and comes back.
+
+    The cube is opened only where the model has a state that can.
+    """
+    model = parameters.model
     whole = model.flow
     if not isinstance(whole, TextModel) or not whole.clock.is_continuous or model.disturbance is not None:
         return []
-    values = dict(parameters_of(ds).items())
+    values = dict(parameters.items())
     logs = one_sided(whole, values)
-    if not logs.any():
+    ds = cube() if logs.any() else None
+    if ds is None or "atol" not in ds.attrs or "section" not in ds:
         return []
     atol = float(ds.attrs["atol"]) * np.array([state.size for state in whole.states])
     dims, starts = split_dims(ds["status"])

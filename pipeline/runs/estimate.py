@@ -80,9 +80,9 @@ def writing_seconds(plan: Plan) -> float:
     float
         Time of a task's files and its commit record [s].
     """
-    from pipeline.store.commits import write_task
     from pipeline.store.keys import keys_of
     from pipeline.store.setup import create
+    from pipeline.store.tasks import write_task
 
     n_files = len(keys_of(plan, 0)) + 1
     if plan.n_cells > MOST_WRITTEN_CELLS or plan.n_bytes / plan.n_tasks > MOST_WRITTEN_BYTES:
@@ -160,15 +160,15 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
     """Measure how long sampled cells take, relative to a rule of thumb.
 
     Two stretches are measured: one from the initial states, and one from the end of the first, which
-    represents the rest of the cell.
+    represents the rest of the cell. A few periods before them tell how many fit into the time.
     """
-    speed_s = 0.25  # time of each of the two stretches in which the speed is measured, by the rule of thumb [s]
-    by_rule = float(spec.motion.seconds_per_period(inputs.frequency_hz).sum())
-    n_periods = int(min(max(speed_s / by_rule, LEAST_PERIODS), most))
-    ends, first, seconds = _stretch(spec, inputs, n_periods)
-    if seconds > 4 * speed_s:  # far slower than the rule: one stretch must suffice
-        return first, n_periods, seconds
-    _, first, first_s = _stretch(spec, inputs, n_periods)
+    stretch_s = 0.1  # time of each of the two stretches in which the speed is measured [s]
+    few = int(min(LEAST_PERIODS, most))
+    _, first, seconds = _stretch(spec, inputs, few)
+    if seconds > 5 * stretch_s:  # so slow that these must suffice
+        return first, few, seconds
+    n_periods = int(min(max(few * stretch_s / seconds, few), most)) if seconds else few
+    ends, first, first_s = _stretch(spec, inputs, n_periods)
     _, later, later_s = _stretch(spec, replace(inputs, initial_states=ends), n_periods)
     share = n_periods / most
     return share * first + (1 - share) * later, 2 * n_periods, first_s + later_s

@@ -13,7 +13,6 @@ from magpend_core.status import Status
 from pipeline.layout.own_words import dims_in_own_words, in_own_words
 from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import DIVERGED, FAILED, PENDING, parameter_name, split_dims
-from pipeline.runs.preview import figure_command
 from pipeline.store.files import Files
 from pipeline.store.run import RunDirectory
 
@@ -56,12 +55,10 @@ def describe_state(found: State) -> list[str]:
         f"{len(found.commits)} of {plan.n_tasks} tasks",
     ]
     lines += _status_lines(found.cells, plan.n_cells - found.n_committed)
-    return lines + (small_states(found.cube()) if found.complete else [])
+    return lines + (small_states(found.parameters, found.cube) if found.complete else [])
 
 
 def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:
-    from magpend_core.status import Status
-
     numbers = {**cells, "pending": pending}
     return [
         f"  {s.name.lower():15s} {numbers[s.name.lower()]:>10d}  {s.sentence}"
@@ -131,8 +128,10 @@ def _outcome(status: xr.DataArray, code: Status) -> Outcome:
 
 def summary(run: RunDirectory) -> list[str]:
     """Return the text lines that ``magpend run`` prints at its end: cells by status, and suggested commands."""
+    from pipeline.runs.preview import figure_command
+
     found = outcomes_of(run)
-    lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found), *small_states(run.cube())]
+    lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found), *small_states(run.parameters, run.cube)]
     lines.append(f"plot it with: {figure_command(run)}")
     lost = lost_cells(found)
     if lost:

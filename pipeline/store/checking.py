@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 from pipeline.products.reporting import report
 from pipeline.store.commits import absent_objects, leftover_keys, scan, sweep, withdraw
 from pipeline.store.errors import DamagedError, IncompleteError
-from pipeline.store.files import COMMITS, CUBE, DERIVED, Files, problems_of
+from pipeline.store.files import COMMITS, CUBE, DERIVED, VERIFY, Files, checks_chunks, problems_of
 from pipeline.store.products import products_in, read_product_attrs
 from pipeline.store.record_copy import copy_problem, write_copy
 from pipeline.store.records import Records, marker_key
 from pipeline.store.runfile import RunInfo
 from pipeline.store.skeleton import skeleton_problems
-from pipeline.store.view import VERIFY, checks_chunks
 
 Echo = Callable[[str], None]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -21,6 +22,9 @@ DERIVED, FIGURES, EXTENDED, ASIDE = "derived", "figures", "extended.json", "asid
 RECORD_COPY = "records.jsonl"
 OWN_FILES = (RUN_FILE, HOLDER, TIMINGS, EXTENDED, RECORD_COPY)
 OWN_NAMES = frozenset({*OWN_FILES, CUBE, COMMITS, LOCK, DERIVED, FIGURES, ASIDE})
+
+VERIFY = "MAGPEND_VERIFY"
+"""Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 # one letter before the colon is a Windows drive; pathlib turns two slashes into one
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
@@ -159,6 +163,11 @@ def local_path(path: str | Path) -> Path:
 def is_temporary(name: str) -> bool:
     """Return whether a file name is that of a temporary file, which an interrupted writer has left."""
     return name.startswith(".") and name.endswith(TEMPORARY)
+
+
+def checks_chunks() -> bool:
+    """Return whether chunks are compared with their records when read; MAGPEND_VERIFY=0 turns it off."""
+    return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
 def entry_of(data: bytes) -> dict[str, Any]:

@@ -15,14 +15,14 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
-
-from zarr.abc.store import Store
-from zarr.storage import LocalStore
+from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.writing import open_plain, sync_folder, write_atomically, writing
 from pipeline.store.errors import LockedError, RefusedError, UnreadableError
 from pipeline.store.files import ASIDE, COMMITS, CUBE, HOLDER, LOCK, OWN_FILES, OWN_NAMES, RUN_FILE
+
+if TYPE_CHECKING:
+    from zarr.abc.store import Store
 
 
 @dataclass(frozen=True)
@@ -160,6 +160,8 @@ class LocalFiles:
 
     def zarr(self, *, read_only: bool) -> Store:
         """Return the folder as a zarr store."""
+        from zarr.storage import LocalStore
+
         return LocalStore(self.root, read_only=read_only)
 
     def lock(self) -> AbstractContextManager[bool]:

@@ -19,13 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
-from zarr.core.buffer import cpu
-from zarr.storage import MemoryStore
 
 from pipeline.layout.conventions import netcdf_safe
 from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, writing
-from pipeline.store.arrays import create_array, disagreements, product_problem
+from pipeline.store.declared import disagreements, product_problem
 from pipeline.store.errors import DamagedError, UnreadableError
 from pipeline.store.files import Files
 from pipeline.store.local import files_below, refuse_links, remove_tree, sync
@@ -99,26 +96,57 @@ def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
     import xarray as xr
 
     files = open_files(place)
-    store: Any
-    if files.local is None:
-        # checking the seal reads every file, so each is read only once
-        contents = dict(files.read_each(files.everything()))
-        _sealed_attrs(files, contents.get(_GROUP), _digests_of(contents.items()))
-        _refuse_declared(files, contents.items())
-        whole = ((key, value) for key, value in contents.items() if isinstance(value, bytes))
-        store = MemoryStore({key: cpu.Buffer.from_bytes(value) for key, value in whole})
-    else:
+    is_local = files.local is not None
+    contents: dict[str, bytes] = {}
+    if lazy and is_local:
         read_product_attrs(files)
-        store = files.zarr(read_only=True)
+    else:
+        contents = _read_whole(files)
     try:
-        ds = xr.open_zarr(store, consolidated=False, chunks=None)
-        with contextlib.nullcontext() if lazy else contextlib.closing(ds):
-            loaded = (ds if lazy else ds.load()).assign(with_words(ds))
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, OSError) as error:
-        # of zarr and xarray: metadata from a stranger may have any type
+        # zarr takes longer to import than such a result to read
+        ds = (
+            _decoded(contents)
+            if contents
+            else xr.open_zarr(files.zarr(read_only=True), consolidated=False, chunks=None)
+        )
+        loaded = ds.assign(with_words(ds))
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, OSError, RuntimeError) as error:
+        # of zarr, blosc and xarray: metadata from a stranger may have any type
         raise DamagedError(f"{files.name}: {error}") from None
     variables = {name: loaded.variables[name] for name in sorted(map(str, loaded.data_vars))}
     return netcdf_safe(xr.Dataset(variables, loaded.coords, _own(loaded.attrs)))
+
+
+def _decoded(contents: Mapping[str, bytes]) -> xr.Dataset:
+    """Return the dataset in the files of a product by key, whose sizes and codecs `product_problem` has accepted."""
+    import xarray as xr
+
+    arrays = {
+        key.partition("/")[0]: json.loads(contents[key]) for key in sorted(contents) if key.endswith(f"/{_GROUP}")
+    }
+    variables = {
+        name: xr.Variable(about.get("dimension_names", ()), _array(name, about, contents), about["attributes"])
+        for name, about in arrays.items()
+    }
+    attrs = json.loads(contents[_GROUP])["attributes"]
+    names = attrs.pop("coordinates", "").split()
+    return xr.Dataset(variables, attrs=attrs).set_coords(names)
+
+
+def _array(name: str, about: Mapping[str, Any], contents: Mapping[str, bytes]) -> np.ndarray:
+    """Return the array of a product that zarr's metadata `about` describe, from its chunks."""
+    from numcodecs import blosc
+
+    shape, chunk = about["shape"], about["chunk_grid"]["configuration"]["chunk_shape"]
+    found = np.empty(shape, about["data_type"])
+    stored = found.dtype.newbyteorder("<")
+    for place in np.ndindex(*(-(-n // size) for n, size in zip(shape, chunk, strict=True))):
+        # each chunk ends with the four bytes of its crc32c
+        content = blosc.decompress(contents["/".join([name, ".".join(map(str, ("c", *place)))])][:-4])
+        region = tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in zip(place, chunk, shape, strict=True))
+        inside = tuple(slice(s.stop - s.start) for s in region)
+        found[region] = np.frombuffer(content, stored).reshape(chunk)[inside]
+    return found
 
 
 def read_product_attrs(place: Place) -> dict[str, Any]:
@@ -127,20 +155,39 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
     Raise `FileNotFoundError` if there is none, and `DamagedError` if its content has changed since it was written.
     """
     files = open_files(place)
-    if (path := files.local) is not None:
-        if path.is_symlink() or path.parent.is_symlink():
-            raise DamagedError(f"{path}: is, or lies behind, a link")
-        if not path.exists():
-            raise FileNotFoundError(path)
-        try:
+    if files.local is not None:
+        with _reading(files):
             attrs = _sealed_attrs(files, files.read(_GROUP), _digests(files))
             _refuse_declared(files, files.read_each(files.everything()))
             return attrs
-        except (OSError, UnreadableError) as error:
-            raise DamagedError(f"{path}: {error!r}") from None
     keys = files.everything()
     group = dict(files.read_each([_GROUP] if keys else []))
     return _sealed_attrs(files, group.get(_GROUP), _digests(files))
+
+
+def _read_whole(files: Files) -> dict[str, bytes]:
+    """Read all files of a product, each once, and compare them as `read_product_attrs` does."""
+    with _reading(files):
+        contents = dict(files.read_each(files.everything()))
+        _sealed_attrs(files, contents.get(_GROUP), _digests_of(contents.items()))
+        _refuse_declared(files, contents.items())
+    return {key: value for key, value in contents.items() if isinstance(value, bytes)}
+
+
+@contextlib.contextmanager
+def _reading(files: Files) -> Iterator[None]:
+    """Raise `FileNotFoundError` if a product is not there, and `DamagedError` if it cannot be read."""
+    path = files.local
+    if path is not None and (path.is_symlink() or path.parent.is_symlink()):
+        raise DamagedError(f"{path}: is, or lies behind, a link")
+    if path is not None and not path.exists():
+        raise FileNotFoundError(path)
+    try:
+        yield
+    except (OSError, UnreadableError) as error:
+        if path is None:
+            raise
+        raise DamagedError(f"{path}: {error!r}") from None
 
 
 def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
@@ -240,6 +287,11 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
 
 def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Return the files of a product by key, with attributes and digest; and the attributes without it."""
+    import zarr
+    from zarr.storage import MemoryStore
+
+    from pipeline.store.arrays import create_array
+
     data: dict[str, Any] = {}
     store = MemoryStore(data)
     group = zarr.create_group(store, zarr_format=3)
@@ -257,7 +309,7 @@ def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
     digests = [(key, _sha256(value.to_bytes())) for key, value in data.items() if key != _GROUP]
     group.update_attributes({**stored, SEAL: _seal(stored, digests)})
     with warnings.catch_warnings():
-        # readers over a network then ask once for the metadata of all arrays; see `pipeline.store.skeleton`
+        # readers over a network then ask once for the metadata of all arrays; see `pipeline.store.empty_cube`
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(store)
     return {key: value.to_bytes() for key, value in data.items()}, stored

@@ -25,8 +25,8 @@ from pipeline.layout.vocabulary import (
     overrides_attribute,
     section_attributes,
 )
-from pipeline.store.arrays import METADATA, consolidated_metadata
 from pipeline.store.commits import read_commit
+from pipeline.store.declared import METADATA, consolidated_metadata
 from pipeline.store.errors import IncompleteError
 from pipeline.store.records import Commit
 from pipeline.store.runfile import RunInfo

@@ -14,7 +14,6 @@ from pipeline.specification.spec import Spec
 from pipeline.store.commits import cube_digest, read_commits
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RUN_FILE, Files
-from pipeline.store.reading import cube_of
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo, read_run, remade
 from pipeline.store.skeleton import check_skeleton, lacking
@@ -148,6 +147,8 @@ class RunDirectory:
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
         """Open the run's result cube as an xarray dataset; see `pipeline.open_run`."""
+        from pipeline.store.reading import cube_of
+
         return cube_of(self.info, self.commits, self.known, chunks=chunks, check=check)
 
 

@@ -9,22 +9,15 @@ from typing import Any
 
 from pipeline.layout.identity import differences, digest_of, numbered
 from pipeline.layout.plan import Plan
-from pipeline.store.arrays import METADATA
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.commits import withdraw
+from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
 from pipeline.store.local import is_note, run_around
 from pipeline.store.objects import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
-from pipeline.store.skeleton import (
-    entries_of,
-    lacking,
-    skeleton_files,
-    skeleton_keys,
-    skeleton_problems,
-    write_skeleton,
-)
+from pipeline.store.skeleton import entries_of, lacking, skeleton_keys, skeleton_problems, write_skeleton
 from pipeline.store.stored_json import fits
 
 Echo = Callable[[str], None]
@@ -177,6 +170,8 @@ def create(place: str | Path | Files, plan: Plan, identity: Mapping[str, Any] | 
 
     Call `check` first: files with the same names are replaced. An `identity` that an earlier version wrote is kept.
     """
+    from pipeline.store.empty_cube import skeleton_files
+
     files, identity = open_files(place), identity or plan.identity
     contents = skeleton_files(plan, identity)
     files.prepare(COMMITS)
@@ -232,6 +227,8 @@ def rebuild_skeleton(info: RunInfo) -> list[str]:
     A file is written only if its digest is the one in ``run.json``. Another version of zarr or of magpend may
     write other bytes.
     """
+    from pipeline.store.empty_cube import skeleton_files
+
     problems = skeleton_problems(info)
     if not problems:
         return []

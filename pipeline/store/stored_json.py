@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from magpend_core.models.parameters import has_controls
 from pipeline.products.product import STRICT
 from pipeline.specification.problems import problems_of
-from pipeline.store.arrays import METADATA
+from pipeline.store.declared import METADATA
 
 # ---- checksums -------------------------------------------------------------------------------------
 

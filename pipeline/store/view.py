@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import os
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
 from typing import Any
 
@@ -19,24 +18,16 @@ from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Sto
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
-from pipeline.store.arrays import Declared
 from pipeline.store.commits import remedy
+from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import CUBE, Files
+from pipeline.store.files import CUBE, Files, checks_chunks
 from pipeline.store.keys import Owners
 from pipeline.store.records import Commit
 from pipeline.store.runfile import RunInfo
 
-VERIFY = "MAGPEND_VERIFY"
-"""Environment variable; ``0`` reads chunks without comparing them with their records."""
-
 SMALL = 200_000
 """Largest size in bytes of a chunk that `pipeline.store.reading` reads; zarr reads larger ones."""
-
-
-def checks_chunks() -> bool:
-    """Return whether chunks are compared with their records when read; MAGPEND_VERIFY=0 turns it off."""
-    return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
 class Shown:

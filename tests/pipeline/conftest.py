@@ -119,8 +119,8 @@ def made(tmp_path, write_spec, sweep_text):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
     from pipeline.layout.plan import make_plan
     from pipeline.specification.spec import Spec
-    from pipeline.store.commits import write_task
     from pipeline.store.setup import create
+    from pipeline.store.tasks import write_task
 
     path = write_spec(sweep_text)
     spec = Spec.read(path)

@@ -65,7 +65,7 @@ def attractors(run: OpenRun, options: AttractorOptions) -> xr.Dataset:
 
     found = run.derive("identified", **options.part(IdentifyOptions))
     found = match(found, threshold=options.threshold, look_back=options.look_back, connect=options.connect)
-    return found.assign_attrs({WITHOUT_DIGITS: "\n".join(small_states(run.cube()))})
+    return found.assign_attrs({WITHOUT_DIGITS: "\n".join(small_states(run.spec.values, run.cube))})
 
 
 def attractors_table(ds: xr.Dataset) -> Table:

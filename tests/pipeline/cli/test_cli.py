@@ -22,13 +22,37 @@ from pipeline.runs.preview import figure_command
 from pipeline.specification import files
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import RunDirectory
+from tests.pipeline.conftest import WALK
+
+LARGE = ("numpy", "pydantic", "xarray", "zarr", "pandas", "dask", "distributed", "scipy", "numba", "matplotlib")
+"""Packages that take long to import."""
+
+
+def loaded(code):
+    """Run code in a fresh process; return the large packages among the modules that it has imported."""
+    told = f"import sys\n{code}\nprint(*sorted(set({LARGE}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
 
 
 def test_start__loads_nothing_large():
     """Each command imports what it needs when it is called, also those of plug-ins."""
-    code = "import sys, pipeline.cli.main; print(sorted({'numpy', 'pydantic', 'xarray', 'numba'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert loaded("import pipeline.cli.main") == set()
+
+
+def loaded_by(*words):
+    return loaded(f"import pipeline.cli.main as command\nsys.argv = ['magpend', *{words}]\ncommand.main()")
+
+
+@pytest.mark.slow
+def test_commands__load_what_they_need_alone(walk, write_spec):
+    assert loaded_by("status", str(walk)) == {"numpy", "pydantic"}
+    # cells are integrated, and tasks written, to tell how long that takes; numba imports scipy
+    dry = loaded_by("run", str(write_spec(WALK)), "--dry-run")
+    assert dry == {"numpy", "pydantic", "numba", "scipy", "zarr"}
+    derive(walk, "attractors")
+    # xarray imports pandas, and dask's arrays, which import scipy
+    assert loaded_by("analyse", "attractors", str(walk)) == {"numpy", "pydantic", "xarray", "pandas", "dask", "scipy"}
 
 
 @pytest.mark.slow

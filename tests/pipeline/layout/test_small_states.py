@@ -17,8 +17,8 @@ PREY = table("rosenzweig", {"x": "x*(1 - x/K) - x*y/(1 + x)", "y": "y*(.8*x/(1 +
 DECAY = table("decay", {"x": "-x", "v": "v - v**3 + 0*x"}, {"K": 1.0})
 
 
-def cube(text, start, **changes):
-    """One cell that has closed on an orbit of about 100 s, with its last section."""
+def found_in(text, start, *, atol=1e-8, **changes):
+    """Small states of one cell that has closed on an orbit of about 100 s, with its last section."""
     parameters = load_model(text).load(**changes)
     found = {
         "section": (("initial_condition", "period_index", "state"), np.array(start)[None, None]),
@@ -26,8 +26,9 @@ def cube(text, start, **changes):
         "orbit_period": ("initial_condition", [1]),
         "return_time": (("initial_condition", "period_index"), [[100.0]]),
     }
-    own = {**attributes_of(parameters), "model": json.dumps(parameters.model.reference), "atol": 1e-8}
-    return xr.Dataset(found, coords={"state": list(parameters.model.state_names)}, attrs=own)
+    own = {**attributes_of(parameters), "model": json.dumps(parameters.model.reference), "atol": atol}
+    ds = xr.Dataset(found, coords={"state": list(parameters.model.state_names)}, attrs=own)
+    return small_states(parameters, lambda: ds)
 
 
 def test_one_sided__states_whose_rate_vanishes_with_them():
@@ -40,15 +41,24 @@ def test_one_sided__states_whose_rate_vanishes_with_them():
 
 @pytest.mark.parametrize(("capacity", "start", "least"), [(15.0, 3.016e-5, 4.3e-15), (25.0, 6.018e-9, 9.3e-25)])
 def test_small_states__a_population_that_almost_dies_out(capacity, start, least):
-    found = small_states(cube(PREY, [0.6, start], K=capacity))
+    found = found_in(PREY, [0.6, start], K=capacity)
     assert found[0].startswith("warning: x falls to ")
     assert float(found[0].split()[4].rstrip(",")) == pytest.approx(least, rel=0.2)
     assert "give an atol below" in found[0]
     assert "log(x)" in found[0]
-    assert small_states(cube(PREY, [0.6, start], K=capacity).assign_attrs(atol=1e-30)) == []
+    assert found_in(PREY, [0.6, start], K=capacity, atol=1e-30) == []
 
 
 def test_small_states__nothing_to_say():
     # at K = 5 the prey stays above 8e-4; a state that dies out does not come back
-    assert small_states(cube(PREY, [0.6, 0.07926], K=5.0)) == []
-    assert small_states(cube(DECAY, [1.0, 0.5])) == []
+    assert found_in(PREY, [0.6, 0.07926], K=5.0) == []
+    assert found_in(DECAY, [1.0, 0.5]) == []
+
+
+def test_small_states__opens_no_cube_where_no_state_keeps_its_sign():
+    def closed():
+        raise AssertionError("the cube is opened")
+
+    pushed = table("pushed", {"x": "x*(1 - x) + m*cos(phase)"}, {"m": 0.1})
+    assert small_states(load_model(pushed).load(), closed) == []
+    assert small_states(load_model("double-pendulum").load(), closed) == []

@@ -21,7 +21,7 @@ from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
 from pipeline.runs.progress import LINE_EVERY_S, Progress
 from pipeline.runs.status import outcomes_of
 from pipeline.specification.spec import Spec
-from pipeline.store import commits
+from pipeline.store import tasks
 from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import duffing
 
@@ -74,8 +74,8 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
 @pytest.mark.slow
 def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_text, tmp_path, monkeypatch):
     plan = read(sweep_text)
-    original = commits.write_task
-    monkeypatch.setattr(commits, "write_task", lambda *given: (time.sleep(0.2), original(*given)))
+    original = tasks.write_task
+    monkeypatch.setattr(tasks, "write_task", lambda *given: (time.sleep(0.2), original(*given)))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     assert writing_seconds(plan) >= 0.2
     assert list(tmp_path.iterdir()) == []

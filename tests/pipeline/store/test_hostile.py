@@ -14,8 +14,8 @@ import pytest
 
 from pipeline.runs.derive import derive
 from pipeline.store import products
-from pipeline.store.arrays import Declared
 from pipeline.store.commits import read_commits
+from pipeline.store.declared import Declared
 from pipeline.store.errors import DamagedError
 from pipeline.store.objects import open_files
 from pipeline.store.run import RunDirectory

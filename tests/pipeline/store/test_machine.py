@@ -27,10 +27,11 @@ from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
 from pipeline.store import commits, records
 from pipeline.store.checking import sound_commits
-from pipeline.store.commits import Packer, pack_block, read_commits, write_task
+from pipeline.store.commits import Packer, pack_block, read_commits
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
+from pipeline.store.tasks import write_task
 from tests.pipeline.factories import RESULT, duffing, finished, result_of, silent
 from tests.pipeline.store.test_damage import delete, flip, truncate, zero
 

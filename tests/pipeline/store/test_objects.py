@@ -20,8 +20,8 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.runs.zoom import read_source
-from pipeline.store import local, objects
-from pipeline.store.commits import read_commits, sweep, write_task
+from pipeline.store import local, objects, run_store
+from pipeline.store.commits import read_commits, sweep
 from pipeline.store.errors import DamagedError, LockedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.objects import open_files
@@ -29,6 +29,7 @@ from pipeline.store.products import open_product, products_in, remove_product, w
 from pipeline.store.record_copy import write_copy
 from pipeline.store.run import RunDirectory
 from pipeline.store.setup import create, establish
+from pipeline.store.tasks import write_task
 from tests.pipeline.factories import SQUARE, duffing, quietly, silent
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server, in_turn, once
 
@@ -202,7 +203,7 @@ def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeyp
         made.commit(index)
         if index:
             remote.commit(index)
-    real, left = objects.RunStore.set, [0]
+    real, left = run_store.RunStore.set, [0]
 
     async def put(self, key, value):
         if not left[0]:
@@ -216,7 +217,7 @@ def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeyp
     for n in range(len(made.plan.variables) + 1):
         left[0] = n
         with monkeypatch.context() as patch:
-            patch.setattr(objects.RunStore, "set", put)
+            patch.setattr(run_store.RunStore, "set", put)
             patch.setattr(objects.ObjectFiles, "write_once", never)
             with pytest.raises(CrashError):
                 remote.commit(0)

@@ -19,7 +19,7 @@ from pipeline.compute import execute, task
 from pipeline.runs.derive import prune
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
-from pipeline.store import commits, local, records
+from pipeline.store import commits, local, records, tasks
 from pipeline.store.commits import marker_key, pack_block, read_commits, sweep
 from pipeline.store.errors import IncompleteError, LockedError, RefusedError, StoreError, UnreadableError
 from pipeline.store.files import RECORD_COPY
@@ -313,7 +313,7 @@ def test_commands__name_what_could_not_be_written(place, main, monkeypatch, comm
 @pytest.mark.parametrize("moment", ["before writing", "while writing"])
 def test_run__removed_while_it_goes_on_ends_and_can_be_made_again(sound, tmp_path, monkeypatch, bytes_of, moment):
     shutil.copy(sound / "spec.toml", tmp_path)
-    write_task, write_block, done = task.write_task, commits.write_block, []
+    write_task, write_block, done = task.write_task, tasks.write_block, []
 
     def writing_task(info, index, *rest):
         done.append(index)
@@ -330,7 +330,7 @@ def test_run__removed_while_it_goes_on_ends_and_can_be_made_again(sound, tmp_pat
 
     with monkeypatch.context() as patch:
         patch.setattr(task, "write_task", writing_task)
-        patch.setattr(commits, "write_block", writing_block)
+        patch.setattr(tasks, "write_block", writing_block)
         with pytest.raises(Exception, match=r"removed|gone|missing|damaged|not found|No such|fail"):
             quietly(tmp_path / "spec.toml", tmp_path / "run")
     assert quietly(tmp_path / "spec.toml", tmp_path / "run").complete

@@ -24,10 +24,11 @@ from pipeline.layout.schema import base_variables
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.spec import Spec
-from pipeline.store import commits, consolidate, products, reading, records
-from pipeline.store.arrays import METADATA
+from pipeline.store import commits, consolidate, products, reading, records, tasks
 from pipeline.store.checking import sound_commits
-from pipeline.store.commits import Packer, marker_key, pack_block, read_commits, scan, withdraw, write_task
+from pipeline.store.commits import Packer, marker_key, pack_block, read_commits, scan, withdraw
+from pipeline.store.declared import METADATA
+from pipeline.store.empty_cube import skeleton_files
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.keys import keys_of
@@ -35,8 +36,9 @@ from pipeline.store.record_copy import copied_records, write_copy
 from pipeline.store.run import RunDirectory
 from pipeline.store.runfile import read_run, write_run
 from pipeline.store.setup import create
-from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
+from pipeline.store.skeleton import entries_of, write_skeleton
 from pipeline.store.stored_json import seal, unseal
+from pipeline.store.tasks import write_task
 from pipeline.store.view import CommittedStore
 from tests.pipeline.factories import contents, silent
 
@@ -99,8 +101,8 @@ def test_write_task__refuses_wrong_shapes_cut_chunks_and_damaged_metadata(made):
         write_task(made.info, 0, values, {})
     for cut in (slice(1, 4), slice(0, 3)):
         with pytest.raises(ValueError, match="cuts chunks"):
-            commits.chunk_keys("x", (cut,), (4,), (8,))
-    assert commits.chunk_keys("x", (slice(4, 7),), (4,), (7,)) == ["x/c.1"]
+            tasks.chunk_keys("x", (cut,), (4,), (8,))
+    assert tasks.chunk_keys("x", (slice(4, 7),), (4,), (7,)) == ["x/c.1"]
     path = made.info.directory / "cube.zarr/section/zarr.json"
     path.write_text(path.read_text().replace('"little"', '"big"'))
     with pytest.raises(DamagedError, match=r"section/zarr\.json: its content has changed"):
