@@ -6,9 +6,10 @@ component. Results do not depend on the order of rows, and the work is not quadr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from magpend_core.ordering import SAME_DIGITS, canonical_order
+from magpend_core.ordering import SAME_DIGITS, canonical_order, order_of_columns
 
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
@@ -102,13 +103,16 @@ class Geometry:
                 boxes[..., i] = np.floor(scaled[..., i] / side)
         return boxes
 
-    def box_pairs(self, boxes: np.ndarray, side: float) -> np.ndarray:
-        """Return which boxes touch each other (also at corners), as pairs of row numbers (n, 2)."""
+    def box_pairs(self, boxes: np.ndarray, side: float, numbers: np.ndarray) -> np.ndarray:
+        """Return which boxes touch each other (also at corners), as pairs of row numbers (n, 2). Boxes that differ in
+        their `numbers` (box, number) do not touch.
+        """
         if len(boxes) < 2:
             return np.empty((0, 2), np.int64)
         # lengths in boxes: a circle is as long as its number of boxes
         lengths = [float(self._n_boxes(x, side)) if x > 0.0 else 0.0 for x in self.circumference]
-        tree = cKDTree(boxes.astype(np.float64), boxsize=np.array(lengths))
+        rows = np.concatenate([2 * numbers, boxes], axis=1).astype(np.float64)
+        tree = cKDTree(rows, boxsize=np.array([0.0] * numbers.shape[1] + lengths))
         return np.asarray(tree.query_pairs(1.5, p=np.inf, output_type="ndarray"), np.int64)
 
     @staticmethod
@@ -182,21 +186,28 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
     return float(max(there.mean(), back.mean()))
 
 
-def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
-    """Return a canonical order of sets, by the least point of each; see `canonical_order`.
+def order_by_points(points: list[np.ndarray], geometry: Geometry, owner: np.ndarray | None = None) -> list[int]:
+    """Return a canonical order of sets, by the least point of each; see `canonical_order`. Those of one `owner` follow
+    each other.
 
     In a tie the shorter set comes first; then all points decide, from the least one on.
     """
     if len(points) < 2:
         return list(range(len(points)))
-    # a set as a row: its least point, its length, its other points
-    longest = max(map(len, points))
-    rows = np.full((len(points), longest * geometry.n_states + 1), np.inf)
-    for row, own in zip(rows, points, strict=True):
-        ordered = centred(own, geometry)[order_of_points(own, geometry)].ravel()
-        values = np.concatenate([ordered[: geometry.n_states], [len(own)], ordered[geometry.n_states :]])
-        row[: len(values)] = values
-    return [int(i) for i in canonical_order(rows)]
+    sizes = np.array([len(own) for own in points])
+    states, first = centred(np.concatenate(points), geometry), np.cumsum(sizes) - sizes
+    states = states[order_of_columns(chain([np.repeat(np.arange(len(points)), sizes)], states.T), len(states))]
+
+    def columns() -> Iterator[np.ndarray]:
+        yield np.zeros(len(points)) if owner is None else owner
+        yield from states[first].T
+        yield sizes
+        for k in range(1, int(sizes.max())):
+            row = np.full((len(points), geometry.n_states), np.inf)
+            row[sizes > k] = states[first[sizes > k] + k]
+            yield from row.T
+
+    return [int(i) for i in order_of_columns(columns(), len(points))]
 
 
 def order_of_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:

@@ -64,7 +64,7 @@ from pipeline.analysis.attractors.features import ENERGY, Features
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
 from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
 from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
-from pipeline.analysis.attractors.finding.requests import Settings, answer_all
+from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.analysis.attractors.finding.searching import Search
 from pipeline.analysis.attractors.labelling import Found, analyse, follow
 from pipeline.analysis.attractors.matching import match
@@ -143,8 +143,7 @@ def identify(
                 tell_rest(points.values(), tolerance, dynamics.geometry)
             if dynamics.can_rest and not dynamics.has_returns and options.polish:
                 tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
-            works = {index: analyse(point, search) for index, point in points.items()}
-            own = answer_all(works, points, settings)
+            own = analyse(points, search)
             follow(own, points, search)
             found |= own
     return _with_exponents(_dataset(ds, found, search), ds)

@@ -28,6 +28,7 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
+from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
 from pipeline.analysis.flown import flown
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
@@ -44,7 +45,6 @@ class Cells:
     """Statistics of the trajectories (cells) on one attractor, collected from one block of cells after another."""
 
     n_points: int
-    n: int = 0  # cells
     # (state,): range of the kept sections
     low: np.ndarray = field(default_factory=lambda: np.full(1, np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(1, -np.inf))
@@ -52,26 +52,22 @@ class Cells:
     rotations: list[np.ndarray] = field(default_factory=list)
     # list of ndarray, (cell, angle): full turns of the cells over their sections
     turns: list[np.ndarray] = field(default_factory=list)
-    sides: dict[int, int] = field(default_factory=dict)  # cells by the classifier's code
+    sides: set[int] = field(default_factory=set)  # codes of the classifier
     points: np.ndarray | None = None  # (m, state): section points of least hash
     # list of ndarray, (cell,): mean time between two sections of the cells [s]
     seconds: list[np.ndarray] = field(default_factory=list)
 
-    def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Add some cells of a block to the statistics; `labels` has the class of motion (a code) of every cell of the
-        block.
-        """
-        section = block.section[cells]
-        self.n += len(cells)
+    def add(self, block: Block, point: Point, geometry: Geometry) -> None:
+        """Add the cells of a block to the statistics."""
+        section = block.section
         flat = section.reshape(-1, section.shape[-1])
         self.low = np.minimum(self.low, flat.min(axis=0))
         self.high = np.maximum(self.high, flat.max(axis=0))
-        self.rotations.append(mean_rotation(section, block.turns[cells], geometry))
-        self.turns.append(np.abs(block.turns[cells]))
-        for code, count in zip(*np.unique(labels[cells], return_counts=True), strict=True):
-            self.sides[int(code)] = self.sides.get(int(code), 0) + int(count)
+        self.rotations.append(mean_rotation(section, block.turns, geometry))
+        self.turns.append(np.abs(block.turns))
+        self.sides.update(sides_of(section, block.turns, point.frequency, point.parameters).tolist())
         if block.seconds is not None:
-            self.seconds.append(block.seconds[cells].mean(axis=1))
+            self.seconds.append(block.seconds.mean(axis=1))
         both = flat if self.points is None else np.concatenate([self.points, flat])
         least = np.unique(hashes(both), return_index=True)[1][: self.n_points]
         self.points = both[least]
@@ -86,18 +82,18 @@ class Cells:
         """Mean time between two successive section points of the cells [s]; NaN if no times are known."""
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
-    def side(self, parameters: Parameters, frequency: float) -> int:
+    def side(self, point: Point) -> int:
         """Return the attractor's class of motion (a code): the class of all its cells or, if they differ, of their
         pooled points.
 
         The pooled points are classified with the median of the cells' turns.
         """
-        known = [code for code in self.sides if code != UNKNOWN]
+        known = [code for code in self.sides if code != UNKNOWN] if point.parameters is not None else []
         if len(known) <= 1:
             return known[0] if known else UNKNOWN
         assert self.points is not None
         turns = np.median(np.concatenate(self.turns), axis=0).astype(np.int64)
-        return int(sides_of(self.points[None], turns[None], frequency, parameters)[0])
+        return int(sides_of(self.points[None], turns[None], point.frequency, point.parameters)[0])
 
 
 @dataclass

@@ -1,31 +1,34 @@
-"""Assign the cells (trajectories) of one parameter point to attractors and other sets, and describe these sets."""
+"""Assign the cells (trajectories) of parameter points to attractors and other sets, and describe these sets.
+
+`analyse` does for all points together what most of them need. Only points with cells on no known orbit, or with
+degenerate orbits, go on one by one: each is a generator (`Work`), and all of them advance in step.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from magpend_core.orbits import orbit_exponents
+from magpend_core.orbits import crossed_state, orbit_exponents
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
 from pipeline.analysis.attractors.extension.conservative import conservative_sets
 from pipeline.analysis.attractors.extension.courses import AT_REST as RESTS
 from pipeline.analysis.attractors.extension.courses import COURSE_DIVERGED, COURSE_GROWS, ON_SET, Course, rest_number
-from pipeline.analysis.attractors.extension.extending import Outcome, extend
+from pipeline.analysis.attractors.extension.extending import extend
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.features import Cells, Features
 from pipeline.analysis.attractors.finding import stability
-from pipeline.analysis.attractors.finding.assigning import decide
-from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
+from pipeline.analysis.attractors.finding.cell_blocks import Block, first_of_each
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, raw_orbit
 from pipeline.analysis.attractors.finding.equilibria import put_at_rest
 from pipeline.analysis.attractors.finding.limit_cycles import number_among
-from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.points import Point, Slab
 from pipeline.analysis.attractors.finding.probing import is_approaching, probe_equilibrium, probe_orbit
-from pipeline.analysis.attractors.finding.requests import Slopes, Work
+from pipeline.analysis.attractors.finding.requests import Work, answer_all, map_slopes
 from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.finding.spirals import keys_of
 from pipeline.layout.vocabulary import (
@@ -44,7 +47,7 @@ from pipeline.layout.vocabulary import (
     UNDECIDED,
 )
 from pipeline.results.intervals import lifetime_interval
-from pipeline.results.sets import Geometry, looked_up, order_by_points, rows_by_number
+from pipeline.results.sets import Geometry, hashes, looked_up, order_by_points, rows_by_number
 from pipeline.results.sides import UNKNOWN
 from pipeline.results.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 
@@ -69,54 +72,65 @@ class Found:
 
 
 @dataclass
-class _Labels:
-    """Number of the set on which each cell of one parameter point ends, and the evidence for this assignment
-    (`decision`).
+class _Ends:
+    """Sets on which the cells of one parameter point end. They are numbered: orbits, other sets, equilibria, limit
+    cycles.
     """
 
-    label: np.ndarray
-    decision: np.ndarray
+    label: np.ndarray  # (cell,): number of the set on which each cell ends, -1 for none
+    decision: np.ndarray  # (cell,): evidence for this assignment
+    group: np.ndarray  # (cell,): group of a closed (periodic) cell on no known orbit, -1 for all other cells
+    orbits: list[Orbit]
+    sets: list[BoundedSet] = field(default_factory=list)
+    courses: list[Course] = field(default_factory=list)  # cells that were integrated further
+    ran_out: bool = False
 
-    @classmethod
-    def of(cls, n_cells: int) -> _Labels:
-        return cls(np.full(n_cells, -1, np.int64), np.zeros(n_cells, np.int8))
+    @property
+    def neutral(self) -> list[int]:
+        """Numbers of the polished orbits whose stability the multipliers do not decide."""
+        return [i for i, one in enumerate(self.orbits) if one.is_polished and one.stability == NEUTRAL]
 
     def put(self, cells: np.ndarray, number: int | np.ndarray, decision: int) -> None:
         self.label[cells], self.decision[cells] = number, decision
 
 
-def analyse(point: Point, search: Search) -> Work[Found]:
-    """Find the sets on which the cells of a parameter point end, with their kind, stability and evidence."""
-    labels = _Labels.of(point.n_cells)
-    if search.options.polish and (yield from _preserves_volume(point, search)):
-        return (yield from _conservative(point, labels, search))
-    state = yield from search_orbits(point, search)
-    groups = _label_orbits(point, state, labels, search)
-    if search.options.polish:
-        yield from _probe(point, state, labels, search)
+def analyse(slab: Slab, search: Search) -> dict[tuple[int, ...], Found]:
+    """Find the sets on which the cells of parameter points end, with their kind, stability and evidence."""
+    keeps = _preserve_volume(slab, search) if search.options.polish else np.zeros(len(slab), bool)
+    ends: dict[tuple[int, ...], _Ends] = {}
+    works: dict[tuple[int, ...], Work[None]] = {}
+    rest = slab.only(~keeps)
+    if rest:
+        state = search_orbits(rest, search)
+        known, is_open = _label_orbits(rest, state, search)
+        ends = dict(zip(rest, known, strict=True))
+        works = {i: _settle(rest[i], ends[i], state, search) for i, own in zip(rest, is_open, strict=True) if own}
+    for index, point in slab.items():
+        if index not in ends:
+            none = np.full(point.n_cells, -1)
+            ends[index] = _Ends(none, np.zeros(point.n_cells, np.int8), none.copy(), [])
+            works[index] = _conservative(point, ends[index], search)
+    answer_all(works, slab, search.settings)
+    return _describe(slab, {index: ends[index] for index in slab}, search)
+
+
+def _settle(point: Point, ends: _Ends, state: State, search: Search) -> Work[None]:
+    """Find the sets on which the cells of a parameter point end that are on no known orbit."""
     options = search.options
+    if options.polish:
+        yield from _probe(point, ends, search)
     budget = options.budget if options.extend and options.polish else 0.0
-    in_family = _in_families(point, state.orbits, labels)
-    loose = np.where(_is_elsewhere(point), 0, np.where(in_family, -1, labels.label))
-    found = yield from extend(point, state.orbits, loose, search.settings, budget, options.n_sample)
-    state.orbits = found.orbits
-    found.sets = _with_families(found.sets, in_family, labels)
-    _label_courses(point, found, labels, groups, search)
-    raw = _label_raw(point, state, groups, labels, search)
-    _label_sets(point, len(state.orbits) + len(raw), found.sets, labels, groups, search)
-    result = _describe(point, [*state.orbits, *raw], found.sets, labels, search)
-    result.ran_out = found.ran_out
-    _fill_growth(result, found.courses, point, search)
-    return result
-
-
-def _is_elsewhere(point: Point) -> np.ndarray:
-    """Return which cells are at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
-    found = np.zeros(point.n_cells, bool)
-    for told in (point.at_rest, point.on_cycle):
-        if told is not None:
-            found |= told >= 0
-    return found
+    # cells on a neutral orbit of an autonomous flow, around which there may be a torus
+    in_family = np.isin(ends.label, ends.neutral) & point.can_rest
+    loose = np.where(point.is_elsewhere, 0, np.where(in_family, -1, ends.label))
+    found = yield from extend(point, ends.orbits, loose, search.settings, budget, options.n_sample)
+    ends.orbits, ends.courses, ends.ran_out = found.orbits, found.courses, found.ran_out
+    ends.sets = _with_families(found.sets, in_family, ends)
+    _label_courses(point, ends, search)
+    raw = _label_raw(point, ends, state, search)
+    ends.orbits = [*ends.orbits, *raw]
+    _label_sets(point, ends, search)
+    _assert_distinct(point, ends.orbits, search.geometry)
 
 
 def follow(found: Mapping[tuple[int, ...], Found], points: Mapping[tuple[int, ...], Point], search: Search) -> None:
@@ -142,45 +156,58 @@ def follow(found: Mapping[tuple[int, ...], Found], points: Mapping[tuple[int, ..
 # ---- conservative systems ----------------------------------------------------------------------
 
 
-def _preserves_volume(point: Point, search: Search) -> Work[bool]:
-    """Return whether the flow (or its section map) preserves volumes, tested at a sample of points."""
-    if point.can_rest and point.n_states == 1:
-        return False  # a flow that returns to its only state's level: all starts are on one orbit, no volume beside it
-    points = _some_points(point)
-    # the first point alone shows most systems that do not
-    for before in (points[:1], points[1:]):
-        if not len(before):
-            return bool(len(points))
+def _preserve_volume(slab: Slab, search: Search) -> np.ndarray:
+    """Return for each parameter point whether the flow (or its section map) preserves volumes, tested at a sample of
+    section points.
+    """
+    points, keeps = slab.points, np.zeros(len(slab), bool)
+    if search.dynamics.can_rest and search.geometry.n_states == 1:
+        return keeps  # a flow that returns to its only state's level: all starts are on one orbit, no volume beside it
+    states, owner = _some_states(slab, search.geometry)
+    is_first = np.append(True, np.diff(owner) > 0)[: len(owner)]
+    keeps[owner] = True
+    # the first state alone shows most points that do not
+    for which in (is_first, ~is_first):
+        rows = np.flatnonzero(which & keeps[owner])
         # integrate anew: the run's own next section has the error of the run's tolerance
-        after, derivatives = yield Slopes(before, VOLUME_RTOL)
-        if not np.isfinite(derivatives).all():
-            return False
-        if not (np.abs(point.volumes(derivatives, before, after)) <= PRESERVED_VOLUME).all():
-            return False
-    return True
+        after, derivatives = map_slopes(states[rows], owner[rows], points, search.settings, VOLUME_RTOL)
+        finite = np.isfinite(derivatives).all(axis=(1, 2))
+        keeps[owner[rows[~finite]]] = False
+        by_point = rows_by_number(np.where(finite, owner[rows], -1))
+        if crossed_state(search.dynamics.integrates) is None:  # without the rates at the points' parameters
+            by_point = {0: np.flatnonzero(finite)}
+        for k, own in by_point.items():
+            volumes = points[k].volumes(derivatives[own], states[rows[own]], after[own])
+            keeps[owner[rows[own[np.abs(volumes) > PRESERVED_VOLUME]]]] = False
+    return keeps
 
 
-def _some_points(point: Point, n: int = 16) -> np.ndarray:
-    """Return the last section points of `n` cells, shape (n, state); the choice of cells is reproducible."""
-    found = np.zeros((0, 1, point.n_states))
-    for block in point.blocks():
-        more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
-        found = more[np.unique(marks_of(more), return_index=True)[1][:n]]
-    return found[:, 0]
+def _some_states(slab: Slab, geometry: Geometry, n: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last section points (n, state) of `n` cells of each parameter point, and the number of the point of
+    each; the choice of cells is reproducible.
+    """
+    states, owner = np.zeros((0, geometry.n_states)), np.zeros(0, np.int64)
+    for block in slab.blocks():
+        own = block.is_closed | block.is_bounded
+        states = np.concatenate([states, block.section[own, -1]])
+        owner = np.concatenate([owner, block.owner[own]])
+        marks = hashes(states)
+        order = np.lexsort((marks, owner))
+        new = np.append(True, (np.diff(marks[order]) != 0) | (np.diff(owner[order]) != 0))[: len(order)]
+        least = first_of_each(order[new], owner, n)
+        states, owner = states[least], owner[least]
+    return states, owner
 
 
-def _conservative(point: Point, labels: _Labels, search: Search) -> Work[Found]:
+def _conservative(point: Point, ends: _Ends, search: Search) -> Work[None]:
     options = search.options
     budget = options.budget if options.extend else 0.0
-    sets, courses = yield from conservative_sets(point, search.settings, budget, options.n_sample)
-    for i, one in enumerate(sets):
-        labels.put(one.cells, i, SAME_SET)
-    for course in courses:
+    ends.sets, ends.courses = yield from conservative_sets(point, search.settings, budget, options.n_sample)
+    for i, one in enumerate(ends.sets):
+        ends.put(one.cells, i, SAME_SET)
+    for course in ends.courses:
         if course.end == COURSE_GROWS:
-            labels.put(np.array([course.cell]), -1, GROWS)
-    result = _describe(point, [], sets, labels, search)
-    _fill_growth(result, courses, point, search)
-    return result
+            ends.put(np.array([course.cell]), -1, GROWS)
 
 
 def _fill_growth(result: Found, courses: Sequence[Course], point: Point, search: Search) -> None:
@@ -200,92 +227,93 @@ def _fill_growth(result: Found, courses: Sequence[Course], point: Point, search:
 # ---- labels ------------------------------------------------------------------------------------
 
 
-def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
-    """Label the cells on known orbits. Return the group number of each other cell that has closed on a periodic orbit,
-    and -1 for the rest.
+def _label_orbits(slab: Slab, state: State, search: Search) -> tuple[list[_Ends], np.ndarray]:
+    """Label the cells on known orbits. Return the labels of each parameter point, and whether there are cells on no
+    known orbit, or orbits or equilibria of undecided stability.
     """
-    groups = np.full(point.n_cells, -1, np.int64)
-    for block in point.blocks():
-        own = block.cells
-        labels.label[own], labels.decision[own] = decide(block, state.orbits, search.tolerance, search.geometry)
+    n, points = slab.n_cells, slab.points
+    label, decision, group = np.full(n, -1), np.zeros(n, np.int8), np.full(n, -1)
+    is_open = np.zeros(len(points), bool)
+    for block in slab.blocks():
+        label[block.cells], decision[block.cells] = state.decide(block, search)
         if search.is_loose:
-            _label_ends(block, state.ends, labels.label, labels.decision)
-            continue
-        group = state.closed.group_of(block, state.keys, state.group)
-        groups[own] = np.where(labels.label[own] >= 0, -1, group)
-    return groups
+            _label_ends(block, state.ends, label[block.cells], decision[block.cells])
+        left = np.flatnonzero((block.is_closed | block.is_bounded) & (label[block.cells] < 0))
+        is_open[block.owner[left]] = True
+        if not search.is_loose:
+            group[left + block.cells.start] = state.closed.group_of(block.take(left), state.keys, state.group)
+    labels, decisions, groups = (np.split(x, len(points)) for x in (label, decision, group))
+    ends = [_Ends(*own) for own in zip(labels, decisions, groups, state.orbits, strict=True)]
+    degenerate = [bool(one.neutral or _degenerate(point)) for one, point in zip(ends, points, strict=True)]
+    return ends, is_open | np.array(degenerate)
 
 
-def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
+def _degenerate(point: Point) -> list[int]:
+    return [k for k, one in enumerate(point.equilibria) if one.stability == NEUTRAL]
+
+
+def _probe(point: Point, ends: _Ends, search: Search) -> Work[None]:
     most = 8  # degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories
-    neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
-    for i in neutral[:most]:
-        within = yield from probe_orbit(state.orbits[i], search.geometry)
+    for i in ends.neutral[:most]:
+        within = yield from probe_orbit(ends.orbits[i], search.geometry)
         if within:
-            state.orbits[i] = replace(state.orbits[i], approached_within=within)
+            ends.orbits[i] = replace(ends.orbits[i], approached_within=within)
             for block in point.blocks():
-                rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
-                near = is_approaching(block.section[rows], state.orbits[i], search.geometry)
-                labels.put(rows[near] + block.cells.start, i, APPROACHING)
-    degenerate = [k for k, one in enumerate(point.equilibria) if one.stability == NEUTRAL]
-    for k in degenerate[:most]:
+                rows = np.flatnonzero((block.is_closed | block.is_bounded) & (ends.label[block.cells] < 0))
+                near = is_approaching(block.section[rows], ends.orbits[i], search.geometry)
+                ends.put(rows[near] + block.cells.start, i, APPROACHING)
+    for k in _degenerate(point)[:most]:
         point.equilibria[k] = yield from probe_equilibrium(point.equilibria[k], search.geometry)
     if any(one.approached_within for one in point.equilibria):
         put_at_rest(point, search.geometry)
 
 
-def _in_families(point: Point, orbits: Sequence[Orbit], labels: _Labels) -> np.ndarray:
-    """Return which cells lie on a neutral orbit of an autonomous flow, around which there may be a torus."""
-    neutral = [i for i, orbit in enumerate(orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
-    return np.isin(labels.label, neutral) & point.can_rest
-
-
-def _with_families(sets: Sequence[BoundedSet], in_family: np.ndarray, labels: _Labels) -> list[BoundedSet]:
+def _with_families(sets: Sequence[BoundedSet], in_family: np.ndarray, ends: _Ends) -> list[BoundedSet]:
     """Give the cells on neutral orbits to the tori on which these orbits lie; drop all other sets around the orbits."""
     found = []
     for one in sets:
         own = in_family[one.cells]
         is_torus = one.dimension > 0 and one.stability == ATTRACTS
         if own.any() and is_torus:
-            cells = np.flatnonzero(np.isin(labels.label, labels.label[one.cells[own]]))
+            cells = np.flatnonzero(np.isin(ends.label, ends.label[one.cells[own]]))
             one = replace(one, cells=np.union1d(one.cells, cells))
-            labels.put(cells, -1, UNDECIDED)
+            ends.put(cells, -1, UNDECIDED)
         if is_torus or not len(own) or not own.all():
             found.append(one)
     return found
 
 
-def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
+def _label_courses(point: Point, ends: _Ends, search: Search) -> None:
     """Label cells by the end of a similar cell that was integrated further. Cells are similar if they share a box or a
     group of section points.
     """
-    ended = [course for course in found.courses if not course.goes_on and not course.is_neighbour]
+    ended = [course for course in ends.courses if not course.goes_on and not course.is_neighbour]
     if not ended:
         return
-    ends = {course.key: course.end for course in ended}
-    by_group = {int(groups[course.cell]): course.end for course in ended if groups[course.cell] >= 0}
-    elsewhere = _is_elsewhere(point)
+    by_key = {course.key: course.end for course in ended}
+    by_group = {int(ends.group[course.cell]): course.end for course in ended if ends.group[course.cell] >= 0}
+    elsewhere = point.is_elsewhere
     for block in point.blocks():
-        rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
+        rows = np.flatnonzero((block.is_closed | block.is_bounded) & (ends.label[block.cells] < 0))
         cells = rows + block.cells.start
         rows, cells = rows[~elsewhere[cells]], cells[~elsewhere[cells]]
         keys = keys_of(block.section[rows], search.settings.closure, search.geometry)
-        end = looked_up(ends, keys, looked_up(by_group, groups[cells], ON_SET))
-        labels.put(cells[end >= 0], end[end >= 0], EXTENDED)
-        labels.decision[cells[end == COURSE_DIVERGED]] = DIVERGES
-        labels.decision[cells[end == COURSE_GROWS]] = GROWS
+        end = looked_up(by_key, keys, looked_up(by_group, ends.group[cells], ON_SET))
+        ends.put(cells[end >= 0], end[end >= 0], EXTENDED)
+        ends.decision[cells[end == COURSE_DIVERGED]] = DIVERGES
+        ends.decision[cells[end == COURSE_GROWS]] = GROWS
         if point.at_rest is not None:
             rests = end <= RESTS
             point.at_rest[cells[rests]] = RESTS - end[rests]
 
 
-def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
+def _label_raw(point: Point, ends: _Ends, state: State, search: Search) -> list[Orbit]:
     """Label the closed (periodic) cells that are on no refined orbit, and return an unrefined orbit for each group of
     them.
 
     After a search by Newton's method there may be no orbit: beside the ghost of a fold, cells move too slowly to see.
     """
-    left = np.where((labels.label < 0) & ~np.isin(labels.decision, ENDLESS) & ~_is_elsewhere(point), groups, -1)
+    left = np.where((ends.label < 0) & ~np.isin(ends.decision, ENDLESS) & ~point.is_elsewhere, ends.group, -1)
     if left.max(initial=-1) < 0:
         return []
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -293,43 +321,40 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
         _representatives(block, left[block.cells], best, search.geometry)
     rows = rows_by_number(left)
     for i, g in enumerate(sorted(best)):
-        labels.put(rows[g], len(state.orbits) + i, SAME_SET if search.options.polish else CLOSED)
-    return [raw_orbit(best[g][2], search.geometry, _failure(point, state, g)) for g in sorted(best)]
+        ends.put(rows[g], len(ends.orbits) + i, SAME_SET if search.options.polish else CLOSED)
+    return [raw_orbit(best[g][2], search.geometry, _failure(state, g)) for g in sorted(best)]
 
 
-def _failure(point: Point, state: State, group: int) -> int:
+def _failure(state: State, group: int) -> int:
     """Return the `Status` with which Newton's method ended for the boxes of a group; 0 if it was not tried there."""
-    ended = [point.unpolished.get(key, 0) for key in state.keys[state.group == group].tolist()]
+    ended = [state.unpolished.get(key, 0) for key in state.keys[state.group == group].tolist()]
     return max(ended, default=0)
 
 
-def _label_sets(
-    point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
-) -> None:
+def _label_sets(point: Point, ends: _Ends, search: Search) -> None:
     """Label the cells on each non-periodic set: the sampled cells by which it was found, and all cells whose section
     points lie on it.
     """
-    for i, one in enumerate(sets):
-        own = one.cells[labels.label[one.cells] < 0]
-        labels.put(own, first + i, SAME_SET)
-    if not sets:
+    first = len(ends.orbits)
+    for i, one in enumerate(ends.sets):
+        ends.put(one.cells[ends.label[one.cells] < 0], first + i, SAME_SET)
+    if not ends.sets:
         return
-    clouds, elsewhere = [one.cloud for one in sets if one.cloud is not None], _is_elsewhere(point)
+    clouds, elsewhere = [one.cloud for one in ends.sets if one.cloud is not None], point.is_elsewhere
     for block in point.blocks():
-        free = (labels.label[block.cells] < 0) & ~np.isin(labels.decision[block.cells], ENDLESS)
+        free = (ends.label[block.cells] < 0) & ~np.isin(ends.decision[block.cells], ENDLESS)
         rows = np.flatnonzero(block.is_bounded & free & ~elsewhere[block.cells])
         own = members(block.section[rows], clouds)
-        labels.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
+        ends.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
 
 
-def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
+def _label_ends(block: Block, ends: Sequence[Mapping[int, int]], label: np.ndarray, decision: np.ndarray) -> None:
     """Label each closed (periodic) cell whose orbit was found by a longer integration; change `label` and `decision` in
     place.
     """
-    rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
-    end = looked_up(ends, block.marks[rest], -1)
-    own = rest[end >= 0] + block.cells.start
-    label[own], decision[own] = end[end >= 0], EXTENDED
+    for k, rest in rows_by_number(np.where(block.is_closed & (label < 0), block.owner, -1)).items():
+        end = looked_up(ends[k], block.marks[rest], -1)
+        label[rest[end >= 0]], decision[rest[end >= 0]] = end[end >= 0], EXTENDED
 
 
 def _representatives(
@@ -353,34 +378,36 @@ def _representatives(
 # ---- description -------------------------------------------------------------------------------
 
 
-def _describe(
-    point: Point, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], labels: _Labels, search: Search
-) -> Found:
-    """Compute the features of all sets that have cells, and renumber the sets in canonical order."""
-    resting = len(orbits) + len(sets)
-    _assert_distinct(point, orbits, search.geometry)
-    _label_elsewhere(point, resting, labels)
-    cells: dict[int, Cells] = {}
-    for block in point.blocks():
-        own = labels.label[block.cells]
-        sides = feature.sides_of(block.section, block.turns, point.frequency, point.parameters)
-        for number, rows in rows_by_number(own).items():
-            found = cells.setdefault(number, Cells(search.options.n_points))
-            found.add(block, rows, sides, search.geometry)
-    features = {n: _features_of(n, found, orbits, sets, point, search) for n, found in cells.items()}
-    numbers = list(features)
-    order = [numbers[i] for i in order_by_points([features[n].points for n in numbers], search.geometry)]
-    ranked = [features[n] for n in order]
-    table = np.full(max(numbers, default=0) + 2, -1, np.int32)
+def _describe(slab: Slab, ends: Mapping[tuple[int, ...], _Ends], search: Search) -> dict[tuple[int, ...], Found]:
+    """Compute the features of all sets that have cells, and renumber the sets of each parameter point in canonical
+    order.
+    """
+    features: dict[tuple[int, ...], dict[int, Features]] = {}
+    for index, one in ends.items():
+        _label_elsewhere(slab[index], one)
+        features[index] = _features_of(slab[index], one, search)
+    sets = [(index, number) for index, own in features.items() for number in own]
+    points = [features[index][number].points for index, number in sets]
+    owner = np.repeat(range(len(ends)), [len(own) for own in features.values()])
+    ranked: dict[tuple[int, ...], dict[int, Features]] = {index: {} for index in ends}
+    for k in order_by_points(points, search.geometry, owner):
+        index, number = sets[k]
+        ranked[index][number] = features[index][number]
+    return {index: _renumbered(slab[index], one, ranked[index], search) for index, one in ends.items()}
+
+
+def _renumbered(point: Point, ends: _Ends, features: Mapping[int, Features], search: Search) -> Found:
+    """Return the sets of a parameter point in the order of `features`, which has the features of each set by number."""
+    order = list(features)
+    table = np.full(max(order, default=0) + 2, -1, np.int32)
     table[order] = np.arange(len(order))
-    _number_ends(ranked, order, sets, len(orbits), resting, table)
-    decided = (labels.label >= 0) | np.isin(labels.decision, ENDLESS)
-    return Found(
-        table[labels.label],
-        np.where(decided, labels.decision, UNDECIDED).astype(np.int8),
-        ranked,
-        [cells[n].n for n in order],
-    )
+    _number_ends(features, ends, table)
+    decided = (ends.label >= 0) | np.isin(ends.decision, ENDLESS)
+    decision = np.where(decided, ends.decision, UNDECIDED).astype(np.int8)
+    counts = np.bincount(ends.label + 1, minlength=len(table))[1:]
+    result = Found(table[ends.label], decision, list(features.values()), counts[order].tolist(), ends.ran_out)
+    _fill_growth(result, ends.courses, point, search)
+    return result
 
 
 def _assert_distinct(point: Point, orbits: Sequence[Orbit], geometry: Geometry) -> None:
@@ -393,58 +420,68 @@ def _assert_distinct(point: Point, orbits: Sequence[Orbit], geometry: Geometry) 
         assert number_among(cycle, later, point, geometry) == len(later), "two ids of one limit cycle"
 
 
-def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
+def _label_elsewhere(point: Point, ends: _Ends) -> None:
+    first = len(ends.orbits) + len(ends.sets)
     for told, known, code in ((point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED)):
         if told is not None:
             own = told >= 0
-            labels.put(own, first + told[own], code)
+            ends.put(own, first + told[own], code)
         first += len(known)
 
 
-def _number_ends(
-    ranked: Sequence[Features],
-    order: Sequence[int],
-    sets: Sequence[BoundedSet],
-    first: int,
-    resting: int,
-    table: np.ndarray,
-) -> None:
+def _number_ends(features: Mapping[int, Features], ends: _Ends, table: np.ndarray) -> None:
     """Count where the trajectories that left each transient set ended; store the counts in the set's feature `n_to`."""
-    for features, number in zip(ranked, order, strict=True):
-        if first <= number < resting:
-            ended = np.zeros(len(order), np.int64)
-            for end, n in sets[number - first].ended.items():
-                rest = rest_number(end)
-                at = end if end >= 0 else -1 if rest is None else resting + rest
-                if 0 <= at < len(table) and table[at] >= 0:
-                    ended[table[at]] += n
-            features.n_to = ended
+    for k, one in enumerate(ends.sets, len(ends.orbits)):
+        if k not in features:
+            continue
+        ended = np.zeros(len(features), np.int64)
+        for end, n in one.ended.items():
+            rest = rest_number(end)
+            at = end if end >= 0 else -1 if rest is None else len(ends.orbits) + len(ends.sets) + rest
+            if 0 <= at < len(table) and table[at] >= 0:
+                ended[table[at]] += n
+        features[k].n_to = ended
 
 
-def _features_of(
-    number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
-) -> Features:
-    resting = len(orbits) + len(sets)
-    if number < len(orbits):
-        return _of_orbit(cells, orbits[number], point, search)
-    if number < resting:
-        return _of_set(cells, sets[number - len(orbits)], point, search)
-    told = number - resting
-    if told < len(point.equilibria):
-        return feature.of_equilibrium(point.equilibria[told], point.parameters, point.n_angles)
-    found = _of_points(cells, BOUNDED_SET, 0, point, search)
-    feature.fill_cycle(found, point.cycles[told - len(point.equilibria)])
+def _features_of(point: Point, ends: _Ends, search: Search) -> dict[int, Features]:
+    """Return the features of all sets with cells by number."""
+    found: dict[int, Features] = {}
+    orbits, resting = len(ends.orbits), len(ends.orbits) + len(ends.sets)
+    cycles = resting + len(point.equilibria)
+    numbers = np.unique(ends.label[ends.label >= 0]).tolist()
+    # `follow` integrates polished orbits, and equilibria are no sections: both need no statistics of cells
+    followed = [n for n in numbers if n < orbits and ends.orbits[n].is_polished and point.parameters is not None]
+    rests = [n for n in numbers if resting <= n < cycles]
+    cells = _statistics(point, ends.label, np.setdiff1d(numbers, [*followed, *rests]), search)
+    for n in numbers:
+        if n < orbits:
+            found[n] = _of_orbit(cells.get(n), ends.orbits[n], point, search)
+        elif n < resting:
+            found[n] = _of_set(cells[n], ends.sets[n - orbits], point, search)
+        elif n < cycles:
+            found[n] = feature.of_equilibrium(point.equilibria[n - resting], point.parameters, point.n_angles)
+        else:
+            found[n] = _of_points(cells[n], BOUNDED_SET, 0, point, search)
+            feature.fill_cycle(found[n], point.cycles[n - cycles])
+    return found
+
+
+def _statistics(point: Point, label: np.ndarray, numbers: np.ndarray, search: Search) -> dict[int, Cells]:
+    """Return the statistics of the cells on some sets by number."""
+    found = {n: Cells(search.options.n_points) for n in numbers.tolist()}
+    for block in point.blocks() if found else ():
+        own = label[block.cells]
+        for number, rows in rows_by_number(np.where(np.isin(own, numbers), own, -1)).items():
+            found[number].add(block.take(rows), point, search.geometry)
     return found
 
 
 def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
     assert cells.points is not None
     points = feature.sorted_points(cells.points, search.geometry)
-    found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)
-    if point.parameters is not None:
-        found.side = cells.side(point.parameters, point.frequency)
-        if search.options.polish:
-            feature.follow_points(found, point.parameters, point.frequency)
+    found = Features(points, kind, period, cells.mean_rotation, cells.side(point), cells.low, cells.high)
+    if point.parameters is not None and search.options.polish:
+        feature.follow_points(found, point.parameters, point.frequency)
     return found
 
 
@@ -467,26 +504,23 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
     return found
 
 
-def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Features:
+def _of_orbit(cells: Cells | None, orbit: Orbit, point: Point, search: Search) -> Features:
     is_shown = orbit.is_polished or not search.options.polish
+    n_states, nothing = search.geometry.n_states, np.full(point.n_angles, np.nan)
     found = Features(
         orbit.points,
         PERIODIC_ORBIT if is_shown else BOUNDED_SET,
         orbit.period if is_shown else 0,
-        cells.mean_rotation,
-        UNKNOWN,
-        cells.low,
-        cells.high,
+        nothing if cells is None else cells.mean_rotation,
+        UNKNOWN if cells is None else cells.side(point),
+        np.full(n_states, np.nan) if cells is None else cells.low,
+        np.full(n_states, np.nan) if cells is None else cells.high,
         stability=orbit.stability,
         evidence=stability.by_failure(orbit.failed),
     )
-    if point.parameters is not None:
-        found.side = cells.side(point.parameters, point.frequency)
     if orbit.is_polished:
         _fill_orbit(found, orbit, search.dynamics.has_returns)
-    if point.parameters is None or not search.options.polish:
-        return found
-    if not found.is_polished:
+    elif point.parameters is not None and search.options.polish:
         feature.follow_points(found, point.parameters, point.frequency)
     return found
 

@@ -47,7 +47,7 @@ class MapPoint:
             state = step(state)
             self.section[:, i] = state
         self.n_cells, self.n_periods, self.n_states = len(starts), seen * len(starts), starts.shape[1]
-        self.rtols = []
+        self.rtols, self.is_elsewhere = [], np.zeros(len(starts), bool)
 
     def blocks(self):
         n = self.n_cells

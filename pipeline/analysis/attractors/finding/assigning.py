@@ -13,54 +13,57 @@ from scipy.linalg import solve_discrete_lyapunov
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
-from pipeline.results.sets import Geometry
+from pipeline.results.sets import Geometry, rows_by_number
 from pipeline.results.tolerances import LOOSE_SHARE, REACH, STRICT
 
 
 @dataclass(frozen=True)
-class _Metric:
-    """Norm of scaled states in which the linearised return map of an orbit contracts: ``|x| = sqrt(x' S x)``."""
+class _Metrics:
+    """Norms of scaled states in which the linearised return maps of orbits contract: ``|x| = sqrt(x' S x)``."""
 
-    root: np.ndarray
-    matrix: np.ndarray
-    contraction: float
-
-    @classmethod
-    def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric | None:
-        """Return a norm in which the return map of an orbit contracts; None if the orbit does not attract, or too
-        weakly.
-        """
-        return cls._of_matrix(scaled_derivative(orbit, geometry).tobytes(), float(np.abs(orbit.multipliers).max()))
+    root: np.ndarray  # (orbit, state, state)
+    matrix: np.ndarray  # (orbit, state, state)
+    contraction: np.ndarray  # (orbit,): NaN for an orbit that does not attract, or too weakly
 
     @classmethod
-    @lru_cache(maxsize=4096)
-    def _of_matrix(cls, entries: bytes, largest: float) -> _Metric | None:
-        """Return the norm for a monodromy matrix with this largest modulus of its eigenvalues; each is asked for
-        often.
-        """
-        flat = np.frombuffer(entries)
-        matrix, slow = flat.reshape(math.isqrt(len(flat)), -1), 0.5 * (1.0 + largest)
-        try:
-            weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(matrix)))
-            root = np.linalg.cholesky(0.5 * (weight + weight.T)).T
-        except np.linalg.LinAlgError:
-            return None
-        moved = np.linalg.norm(root @ matrix @ np.linalg.inv(root), 2)
-        return cls(root, matrix, float(moved))
+    def of(cls, orbits: Sequence[Orbit], geometry: Geometry) -> _Metrics:
+        """Return a norm for each orbit in which its return map contracts."""
+        matrices = [scaled_derivative(orbit, geometry).tobytes() for orbit in orbits]
+        found = [_metric(x, float(np.abs(one.multipliers).max())) for x, one in zip(matrices, orbits, strict=True)]
+        root, matrix, contraction = zip(*found, strict=True)
+        return cls(np.stack(root), np.stack(matrix), np.array(contraction))
+
+    def take(self, rows: np.ndarray) -> _Metrics:
+        return _Metrics(self.root[rows], self.matrix[rows], self.contraction[rows])
 
     def norm(self, difference: np.ndarray) -> np.ndarray:
-        return np.asarray(np.linalg.norm(difference @ self.root.T, axis=-1))
+        """Return the norm of differences (orbit, section, state)."""
+        return np.asarray(np.linalg.norm(difference @ self.root.swapaxes(1, 2), axis=-1))
 
     @property
-    def factor(self) -> float:
+    def factor(self) -> np.ndarray:
         """Largest norm of a vector whose scaled components are at most 1."""
-        return float(np.linalg.norm(self.root, 2) * np.sqrt(len(self.root)))
+        return np.asarray(np.linalg.norm(self.root, 2, axis=(1, 2)) * np.sqrt(self.root.shape[1]))
+
+
+@lru_cache(maxsize=4096)
+def _metric(entries: bytes, largest: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the norm for a monodromy matrix with this largest modulus of its eigenvalues; each is asked for often."""
+    flat = np.frombuffer(entries)
+    matrix, slow = flat.reshape(math.isqrt(len(flat)), -1), 0.5 * (1.0 + largest)
+    try:
+        weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(matrix)))
+        root = np.linalg.cholesky(0.5 * (weight + weight.T)).T
+    except np.linalg.LinAlgError:
+        return matrix, matrix, np.nan
+    moved = np.linalg.norm(root @ matrix @ np.linalg.inv(root), 2)
+    return root, matrix, float(moved)
 
 
 def decide(
-    block: Block, orbits: Sequence[Orbit], tolerance: float, geometry: Geometry
+    block: Block, orbits: Sequence[Orbit], tolerance: float, geometry: Geometry, owner: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Assign each cell of a block to the orbit that it has reached or approaches.
+    """Assign each cell of a block to the orbit of its parameter point that it has reached or approaches.
 
     A closed cell belongs to the nearest stable orbit, or else to the nearest other orbit, if the last period
     of its sections lies within `tolerance` of the orbit, each section at its phase. A tolerance above
@@ -81,6 +84,8 @@ def decide(
     then integrated for 2500 more. All 1166 certain and all 738 approaching cells ended on the predicted
     orbit. Without the bound on e, 67 of the 997 cells whose distance fell at every step did not.
 
+    `owner` has the number of each orbit's parameter point, ascending; by default all are of one point.
+
     Returns
     -------
     orbit : ndarray of int64
@@ -92,70 +97,111 @@ def decide(
     decision = np.zeros(len(block.status), np.int8)
     if not orbits:
         return label, decision
-    stable = [i for i, orbit in enumerate(orbits) if orbit.is_stable]
-    unstable = [i for i, orbit in enumerate(orbits) if not orbit.is_stable]
+    stable, owners = np.array([orbit.is_stable for orbit in orbits]), np.zeros(len(orbits), np.int64)
+    owners[:] = 0 if owner is None else owner
     within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance
-    both = [stable] if tolerance > STRICT else [stable, unstable]
-    for numbers in both if block.is_closed.any() else []:
+    for which in (stable,) if tolerance > STRICT else (stable, ~stable):
         closed = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
-        for cells, which, phase in _nearest(block.section, closed, [orbits[i] for i in numbers], geometry):
-            number = numbers[which]
-            own = cells[_on_orbit(block.section[cells], orbits[number], phase, within, geometry)]
-            label[own], decision[own] = number, CLOSED
-    if not stable:
-        return label, decision
+        near = _Near.of(block, closed, orbits, owners, np.flatnonzero(which), geometry)
+        on = near.on_orbit(block.section, within, geometry)
+        label[near.cells[on]], decision[near.cells[on]] = near.orbit[on], CLOSED
     rest = np.flatnonzero((block.is_closed | block.is_bounded) & (decision == UNDECIDED))
-    for cells, which, phase in _nearest(block.section, rest, [orbits[i] for i in stable], geometry):
-        code = _approach(block.section[cells], orbits[stable[which]], phase, tolerance, geometry)
-        label[cells[code > 0]] = stable[which]
-        decision[cells] = code
+    near = _Near.of(block, rest, orbits, owners, np.flatnonzero(stable), geometry)
+    code = near.approach(block.section, tolerance, geometry)
+    label[near.cells[code > 0]] = near.orbit[code > 0]
+    decision[near.cells] = code
     return label, decision
 
 
-def _nearest(
-    section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
-) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield the cells near each point of the orbits, with the index of the orbit and of the orbit point."""
-    most = 2**18  # distances between cells and points of orbits that are held at once
-    if not orbits or not len(cells):
-        return
-    owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
-    phase = np.concatenate([np.arange(o.period) for o in orbits])
-    points = np.concatenate([o.points for o in orbits])
-    near = np.full(len(cells), -1)
-    for rows in np.array_split(np.arange(len(cells)), -(-len(cells) * len(points) // most)):
-        away = geometry.distance(section[cells[rows], None, -1], points)
-        nearest = away.argmin(axis=1)
-        near[rows] = np.where(away[np.arange(len(rows)), nearest] < REACH, nearest, -1)
-    for i in np.unique(near[near >= 0]).tolist():
-        yield cells[near == i], int(owner[i]), int(phase[i])
+@dataclass(frozen=True)
+class _Near:
+    """Cells near orbits, each with the orbit point that is nearest to its last section."""
 
+    cells: np.ndarray  # (n,)
+    orbit: np.ndarray  # (n,): index of the orbit
+    phase: np.ndarray  # (n,): number of the point on the orbit
+    orbits: Sequence[Orbit]
 
-def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    q = min(orbit.period, section.shape[1])
-    points = orbit.points[(phase - np.arange(q)[::-1]) % orbit.period]
-    return np.asarray(geometry.distance(section[:, -q:], points).max(axis=1) <= tolerance)
+    @classmethod
+    def of(
+        cls,
+        block: Block,
+        cells: np.ndarray,
+        orbits: Sequence[Orbit],
+        owner: np.ndarray,
+        which: np.ndarray,
+        geometry: Geometry,
+    ) -> _Near:
+        """Find the `cells` of a block whose last section is near one of the orbits `which` of their parameter point."""
+        most = 2**18  # distances between cells and points of orbits that are held at once
+        periods = np.array([orbits[i].period for i in which.tolist()], np.int64)
+        points = np.concatenate([np.zeros((0, geometry.n_states)), *(orbits[i].points for i in which.tolist())])
+        number, phase = np.repeat(which, periods), _ranges(periods)
+        # the points of a cell's own parameter point follow each other
+        first = np.searchsorted(owner[number], block.owner[cells])
+        n = np.searchsorted(owner[number], block.owner[cells], side="right") - first
+        cells, first, n = cells[n > 0], first[n > 0], n[n > 0]
+        near = np.full(len(cells), -1)
+        for rows in np.array_split(np.arange(len(cells)), -(-int(n.sum()) // most) or 1):
+            row, places = np.repeat(rows, n[rows]), np.repeat(first[rows], n[rows]) + _ranges(n[rows])
+            away = geometry.distance(block.section[cells[row], -1], points[places])
+            least = np.minimum.reduceat(away, np.cumsum(n[rows]) - n[rows]) if len(rows) else away
+            at = np.flatnonzero(away == np.repeat(least, n[rows]))
+            found, at_first = np.unique(row[at], return_index=True)
+            near[found] = np.where(least < REACH, places[at[at_first]], -1)
+        is_near = near >= 0
+        return cls(cells[is_near], number[near[is_near]], phase[near[is_near]], orbits)
 
+    def _alike(self, *keys: np.ndarray) -> Iterator[tuple[np.ndarray, list[Orbit], np.ndarray]]:
+        """Yield rows whose orbits have one period and that agree in other keys, the orbits, and each row's orbit."""
+        periods = np.array([one.period for one in self.orbits], np.int64)[self.orbit]
+        _, which = np.unique(np.stack([periods, *keys]), axis=1, return_inverse=True)
+        for rows in rows_by_number(which.reshape(-1)).values():
+            numbers, place = np.unique(self.orbit[rows], return_inverse=True)
+            yield rows, [self.orbits[i] for i in numbers.tolist()], place
 
-def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return for each cell near an orbit whether it surely converges to the orbit, approaches it, or is undecided (a
-    code).
-    """
-    code = np.zeros(len(section), np.int8)
-    last = section.shape[1] - 1 - phase
-    if not orbit.is_stable or last < 2 * orbit.period:
+    def on_orbit(self, section: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
+        """Return for each cell whether the last period of its sections lies on the orbit."""
+        found = np.zeros(len(self.cells), bool)
+        for rows, orbits, place in self._alike():
+            q = min(orbits[0].period, section.shape[1])
+            points = np.stack([one.points for one in orbits])
+            phase = (self.phase[rows, None] - np.arange(q)[::-1]) % orbits[0].period
+            away = geometry.distance(section[self.cells[rows], -q:], points[place[:, None], phase])
+            found[rows] = away.max(axis=1) <= tolerance
+        return found
+
+    def approach(self, section: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
+        """Return a code for each cell: whether it surely converges to the orbit, approaches it, or is undecided."""
+        code = np.zeros(len(self.cells), np.int8)
+        for rows, orbits, place in self._alike(self.phase):
+            last, period = section.shape[1] - 1 - int(self.phase[rows[0]]), orbits[0].period
+            if last < 2 * period:
+                continue
+            metrics = _Metrics.of(orbits, geometry)
+            contracts = metrics.contraction[place] < 1.0
+            rows, place = rows[contracts], place[contracts]
+            index = np.arange(last, -1, -period)[::-1]
+            first = np.stack([one.points[:1] for one in orbits])
+            difference = geometry.difference(section[self.cells[rows][:, None], index], first[place])
+            code[rows] = _approach(difference, metrics.take(place), tolerance)
         return code
-    metric = _Metric.of(orbit, geometry)
-    if metric is None or metric.contraction >= 1.0:
-        return code
-    index = np.arange(last, -1, -orbit.period)[::-1]
-    difference = geometry.difference(section[:, index], orbit.points[0])
+
+
+def _ranges(lengths: np.ndarray) -> np.ndarray:
+    """Return the numbers 0, 1, ... below each length, one after another."""
+    return np.asarray(np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths))
+
+
+def _approach(difference: np.ndarray, metric: _Metrics, tolerance: float) -> np.ndarray:
+    """Return a code for each cell by its distances (cell, section, state) from the orbit at one phase."""
+    code = np.zeros(len(difference), np.int8)
     size = metric.norm(difference)
     # errors of the integration, which exceed the distance near the orbit
-    noise = 0.01 * tolerance * metric.factor
-    n = len(index) - 1
-    error = metric.norm(difference[:, 1:] - difference[:, :-1] @ metric.matrix.T)
-    obstacle = (1.0 - metric.contraction) * size[:, :-1]
+    noise = 0.01 * tolerance * metric.factor[:, None]
+    n = difference.shape[1] - 1
+    error = metric.norm(difference[:, 1:] - difference[:, :-1] @ metric.matrix.swapaxes(-1, -2))
+    obstacle = (1.0 - metric.contraction[:, None]) * size[:, :-1]
     younger = slice(n // 2, None)
     if n >= 8:
         falls = ((size[:, 1:] < size[:, :-1]) | (size[:, 1:] <= noise)).all(axis=1)

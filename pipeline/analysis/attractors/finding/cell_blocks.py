@@ -1,8 +1,12 @@
-"""Hold the trajectories (cells) of one parameter point in blocks, and collect guesses of closed orbits from them."""
+"""Hold the trajectories (cells) of parameter points in blocks, and collect guesses of closed orbits from them.
+
+A block may hold the cells of many points: `owner` is the number of each cell's point. Nothing that is computed for a
+point depends on the other points of the block.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,9 +17,9 @@ from pipeline.results.sets import Geometry, groups, hashes
 
 @dataclass(frozen=True)
 class Block:
-    """Some cells (trajectories) of one parameter point, with their section points and status."""
+    """Some cells (trajectories) of one or several parameter points, with their section points and status."""
 
-    cells: slice  # their places among all cells of the point
+    cells: slice  # their places among all cells of the point or points
     section: np.ndarray  # (cell, period_index, state)
     # (cell,)
     status: np.ndarray
@@ -27,6 +31,7 @@ class Block:
     step: np.ndarray | None = None  # (cell,): step size that continues each cell bit for bit from its last section [s]
     # uint64, (cell,): hashes of the cells' sections, if they were computed before
     known_marks: np.ndarray | None = None
+    owners: np.ndarray | None = None  # int64, (cell,): number of each cell's parameter point; None if all are of one
 
     def take(self, rows: np.ndarray | slice) -> Block:
         """Return a block of the cells at the given indices. Its attribute `cells` is still the range of the whole
@@ -41,6 +46,11 @@ class Block:
         if self.rest is None:
             return self.section[:, -1]
         return np.where((self.status == Status.NO_RETURN)[:, None], self.rest, self.section[:, -1])
+
+    @cached_property
+    def owner(self) -> np.ndarray:
+        """Number of each cell's parameter point."""
+        return np.zeros(len(self.status), np.int64) if self.owners is None else self.owners
 
     @cached_property
     def marks(self) -> np.ndarray:
@@ -75,17 +85,17 @@ class Guesses:
     mark: np.ndarray  # hash of the cell's own sections; decides between equal scores
     point: np.ndarray  # (n, state): last section point
     period: np.ndarray  # period; 0 if unknown, and then the point is integrated further until it closes
+    owner: np.ndarray  # number of the parameter point, which is a part of the key
 
     @classmethod
     def none(cls, n_states: int) -> Guesses:
         """Return an empty collection of guesses."""
-        empty = np.zeros(0)
-        whole = np.zeros(0, np.uint64)
-        return cls(whole, empty, whole, np.zeros((0, n_states)), np.zeros(0, np.int64))
+        marks, whole = np.zeros(0, np.uint64), np.zeros(0, np.int64)
+        return cls(marks, np.zeros(0), marks, np.zeros((0, n_states)), whole, whole)
 
     def take(self, rows: np.ndarray) -> Guesses:
         """Return the guesses at the given indices."""
-        return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
+        return Guesses(*(getattr(self, one.name)[rows] for one in fields(self)))
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
         """Return the best guess for each key, sorted by key. By default, a guess's key is its box of section points."""
@@ -96,22 +106,22 @@ class Guesses:
         return self.take(order[first])
 
     def least(self, n: int) -> Guesses:
-        """Return the `n` guesses with the lowest score, sorted by the hashes of their cells."""
-        least = np.lexsort((self.mark, self.score))[:n]
-        return self.take(least[np.argsort(self.mark[least], kind="stable")])
+        """Return the `n` guesses of each parameter point with the lowest score, sorted by the hashes of their cells."""
+        least = first_of_each(np.lexsort((self.mark, self.score, self.owner)), self.owner, n)
+        return self.take(least[np.lexsort((self.mark[least], self.owner[least]))])
 
     def without_period(self) -> Guesses:
         """Return the same guesses with all periods set to unknown."""
-        return Guesses(self.key, self.score, self.mark, self.point, np.zeros_like(self.period))
+        return replace(self, period=np.zeros_like(self.period))
 
     def joined(self, other: Guesses) -> Guesses:
         """Merge two collections of guesses, and keep the best guess of each box."""
         return self.followed_by(other).best()
 
-    def followed_by(self, other: Guesses) -> Guesses:
-        """Append the guesses of another collection to these guesses."""
-        names = ("key", "score", "mark", "point", "period")
-        return Guesses(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+    def followed_by(self, *others: Guesses) -> Guesses:
+        """Append the guesses of other collections to these guesses."""
+        names = [one.name for one in fields(self)]
+        return Guesses(*(np.concatenate([getattr(one, name) for one in (self, *others)]) for name in names))
 
 
 @dataclass
@@ -133,23 +143,18 @@ class ClosedCells:
 
     def add(self, block: Block) -> None:
         """Add the closed (periodic) cells of a block to the groups."""
-        for p in np.unique(block.orbit_period[block.is_closed]):
+        for p in np.unique(block.orbit_period[block.is_closed]).tolist():
             cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
-            section = block.section[cells]
-            rows, keys = _rows_of(section[:, -int(p) :], int(p), self.geometry, self.tolerance)
+            section, owner = block.section[cells], block.owner[cells]
+            rows, keys = _rows_of(section[:, -p:], p, owner, self.geometry, self.tolerance)
             self._keep(rows.reshape(-1, rows.shape[-1]), keys.ravel())
             if keys.shape[1] > 1:
                 edges = np.stack([keys[:, :-1].ravel(), keys[:, 1:].ravel()], axis=1)
                 self._edges.append(np.unique(edges, axis=0))
             last = section[:, -1]
-            back = section[:, -1 - int(p)] if section.shape[1] > p else last
-            found = Guesses(
-                keys[:, -1],
-                self.geometry.distance(last, back),
-                block.marks[cells],
-                last,
-                np.full(len(cells), int(p), np.int64),
-            )
+            back = section[:, -1 - p] if section.shape[1] > p else last
+            away, period = self.geometry.distance(last, back), np.full(len(cells), p, np.int64)
+            found = Guesses(keys[:, -1], away, block.marks[cells], last, period, owner)
             self.guesses = self.guesses.joined(found)
 
     def _keep(self, rows: np.ndarray, keys: np.ndarray) -> None:
@@ -166,25 +171,42 @@ class ClosedCells:
         keys, first = np.unique(np.concatenate(self._keys), return_index=True)
         rows = np.concatenate(self._rows)[first]
         pairs = [np.searchsorted(keys, edges) for edges in self._edges]
-        for p in np.unique(rows[:, 0]):
-            own = np.flatnonzero(rows[:, 0] == p)
-            pairs.append(own[self.geometry.box_pairs(rows[own, 1:], self.tolerance)])
+        pairs.append(self.geometry.box_pairs(rows[:, 2:], self.tolerance, rows[:, :2]))
         return keys, groups(len(keys), np.concatenate(pairs))
+
+    def best(self, keys: np.ndarray, group: np.ndarray) -> Guesses:
+        """Return the best guess of each group, with the keys and numbers that `close` returned."""
+        return self.guesses.best(group[np.searchsorted(keys, self.guesses.key)].astype(np.uint64))
 
     def group_of(self, block: Block, keys: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Return the group number of each cell of a block; -1 for cells that are not closed (periodic)."""
         found = np.full(len(block.status), -1, np.int64)
-        for p in np.unique(block.orbit_period[block.is_closed]):
+        for p in np.unique(block.orbit_period[block.is_closed]).tolist():
             cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
-            _, own = _rows_of(block.section[cells, -1:], int(p), self.geometry, self.tolerance)
+            _, own = _rows_of(block.section[cells, -1:], p, block.owner[cells], self.geometry, self.tolerance)
             found[cells] = group[np.searchsorted(keys, own[:, 0])]
         return found
 
 
-def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
+def _rows_of(
+    points: np.ndarray, p: int, owner: np.ndarray, geometry: Geometry, side: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (owner, period, box) of section points (cell, section, state), and their hashes."""
     boxes = geometry.boxes(points, side)
-    rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
-    return rows, hashes(rows)
+    first = np.broadcast_to(owner[:, None, None], (*boxes.shape[:-1], 1))
+    rows = np.concatenate([first, np.full(first.shape, p, np.int64), boxes], axis=-1)
+    return rows, of_owner(hashes(rows[..., 1:]), owner[:, None])
+
+
+def of_owner(keys: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """Return hashes that also depend on the number of the parameter point; those of point 0 stay as they are."""
+    return np.asarray(keys ^ (owner.astype(np.uint64) * np.uint64(0xD1342543DE82EF95)))
+
+
+def first_of_each(order: np.ndarray, owner: np.ndarray, n: int) -> np.ndarray:
+    """Return the first `n` rows of each parameter point from an order of rows that is sorted by `owner`."""
+    owners = owner[order]
+    return np.asarray(order[np.arange(len(order)) - np.searchsorted(owners, owners) < n])
 
 
 def marks_of(section: np.ndarray) -> np.ndarray:

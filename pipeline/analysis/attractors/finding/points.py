@@ -118,8 +118,6 @@ class Point:
     # (cell,): index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
     # nor bounded.
     on_cycle: np.ndarray | None = None
-    # `Status` with which Newton's method ended in vain, by the key of the guess (its box of section points)
-    unpolished: dict[int, int] = field(default_factory=dict)
     n_periods: int = 0  # drive periods or returns that the run integrated here, summed over cells
     has_returns: bool = False  # whether sections are crossings of a flow
     can_rest: bool = False  # whether equilibria are searched
@@ -188,22 +186,22 @@ class Point:
         step = max(1, self.block_cells // max(inner, 1))
         if step >= length:
             self._whole = self._whole or self._read(slice(0, length), slice(0, self.n_cells))
-            yield self._known(self._whole)
+            yield _without(self._whole, self.is_elsewhere)
             return
         for begin in range(0, length, step):
             report(PASSING, begin * inner, self.n_cells, UNTOLD)
             end = min(begin + step, length)
-            yield self._known(self._read(slice(begin, end), slice(begin * inner, end * inner)))
+            cells = slice(begin * inner, end * inner)
+            yield _without(self._read(slice(begin, end), cells), self.is_elsewhere[cells])
 
-    def _known(self, block: Block) -> Block:
-        """Set the status of cells at an equilibrium or on a limit cycle to ``NO_RETURN``, so that the search for orbits
-        skips them.
-        """
+    @property
+    def is_elsewhere(self) -> np.ndarray:
+        """Whether each cell is at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
+        found = np.zeros(self.n_cells, bool)
         for told in (self.at_rest, self.on_cycle):
             if told is not None:
-                status = np.where(told[block.cells] >= 0, np.int8(Status.NO_RETURN), block.status)
-                block = replace(block, status=status)
-        return block
+                found |= told >= 0
+        return found
 
     def _read(self, rows: slice, cells: slice) -> Block:
         """Read the cells of some values of the first start dim."""
@@ -211,19 +209,75 @@ class Point:
         if not arrays:
             part = self.cube.isel({**self.at, **dict.fromkeys(self.start_dims[:1], rows)})
             arrays = _arrays(part, (), self.start_dims)
-        n, n_keep = arrays["section"].shape[:2]
-        turns, seconds = arrays.get("turns"), arrays.get("return_time")
-        return Block(
-            cells,
-            arrays["section"],
-            arrays["status"],
-            arrays["orbit_period"],
-            np.zeros((n, self.n_angles), np.int64) if turns is None else turns,
-            arrays.get("rest_state"),
-            np.full((n, n_keep), 1.0 / self.frequency) if seconds is None else seconds,
-            arrays.get("step_size"),
-            arrays.get(_MARK),
-        )
+        return _block(cells, arrays, np.full(len(arrays["status"]), 1.0 / self.frequency), self.n_angles)
+
+
+def _block(cells: slice, arrays: Mapping[str, np.ndarray], seconds: np.ndarray, n_angles: int) -> Block:
+    """Return cells as a block, with the time between their sections [s] unless it is among the arrays."""
+    n, n_keep = arrays["section"].shape[:2]
+    turns, times = arrays.get("turns"), arrays.get("return_time")
+    return Block(
+        cells,
+        arrays["section"],
+        arrays["status"],
+        arrays["orbit_period"],
+        np.zeros((n, n_angles), np.int64) if turns is None else turns,
+        arrays.get("rest_state"),
+        np.repeat(seconds[:, None], n_keep, axis=1) if times is None else times,
+        arrays.get("step_size"),
+        arrays.get(_MARK),
+    )
+
+
+def _without(block: Block, elsewhere: np.ndarray) -> Block:
+    """Set the status of some cells to ``NO_RETURN``, so that the search for orbits skips them."""
+    if not elsewhere.any():
+        return block
+    return replace(block, status=np.where(elsewhere, np.int8(Status.NO_RETURN), block.status))
+
+
+class Slab(dict[tuple[int, ...], Point]):
+    """Parameter points that are analysed together, by their indices in the result cube; all have as many cells."""
+
+    # variables of all cells, shapes (point, cell, ...), if they fit the memory; else the points read them
+    arrays: Mapping[str, np.ndarray]
+
+    @property
+    def points(self) -> list[Point]:
+        """Points by number."""
+        return list(self.values())
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells (trajectories) of all points."""
+        return sum(point.n_cells for point in self.values())
+
+    def only(self, which: np.ndarray) -> Slab:
+        """Return the points that are marked in `which` (point,)."""
+        if which.all():
+            return self
+        part = Slab(one for one, own in zip(self.items(), which.tolist(), strict=True) if own)
+        part.arrays = {name: array[which] for name, array in self.arrays.items()}
+        return part
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the cells of all points in blocks: those of some points together, or a part of the cells of one."""
+        points = self.points
+        each = points[0].n_cells if points else 1
+        n = points[0].block_cells // max(each, 1) if self.arrays and points else 0
+        for first in range(0, len(points), max(n, 1)):
+            some, start = points[first : first + max(n, 1)], first * each
+            if not n:
+                for block in some[0].blocks():
+                    cells = slice(start + block.cells.start, start + block.cells.stop)
+                    yield replace(block, cells=cells, owners=np.full(len(block.status), first))
+                continue
+            rows = len(some) * each
+            arrays = {k: x[first : first + n].reshape(rows, *x.shape[2:]) for k, x in self.arrays.items()}
+            seconds = np.repeat([1.0 / point.frequency for point in some], each)
+            block = _block(slice(start, start + rows), arrays, seconds, some[0].n_angles)
+            block = replace(block, owners=np.repeat(np.arange(first, first + len(some)), each))
+            yield _without(block, np.concatenate([point.is_elsewhere for point in some]))
 
 
 def _arrays(part: xr.Dataset, dims: tuple[str, ...], start_dims: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -237,7 +291,7 @@ def _arrays(part: xr.Dataset, dims: tuple[str, ...], start_dims: tuple[str, ...]
     return found
 
 
-def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
+def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[Slab]:
     """Yield parameter points in groups, by their indices in the result cube. A group that fits the memory budget is
     read at once.
     """
@@ -258,7 +312,10 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
             section = arrays["section"]
             arrays[_MARK] = marks_of(section.reshape(-1, *section.shape[-2:])).reshape(section.shape[:-2])
         n_periods = slab["n_periods"].sum(start_dims).transpose(*dims).values if "n_periods" in slab else None
-        points = {}
+        points = Slab()
+        points.arrays = {
+            name: x.reshape(math.prod(x.shape[: len(dims)]), *x.shape[len(dims) :]) for name, x in arrays.items()
+        }
         for local in np.ndindex(*(slab.sizes[d] for d in dims)):
             index = (local[0] + begin, *local[1:]) if dims else ()
             values = {**fixed, **{d: float(axes[d][i]) for d, i in zip(dims, index, strict=True)}}

@@ -216,19 +216,27 @@ def _slices(
 def _polished(
     asked: Mapping[tuple[int, ...], Polish], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], list[Orbit | None]]:
+    guesses = [replace(one.guesses, owner=np.full(len(one.guesses.key), k)) for k, one in enumerate(asked.values())]
+    sizes = [len(one.key) for one in guesses]
+    found, _ = polish_guesses(guesses[0].followed_by(*guesses[1:]), [points[i] for i in asked], settings)
+    return {index: found[own] for index, own in _slices(asked, sizes, np.cumsum(sizes))}
+
+
+def polish_guesses(
+    guesses: Guesses, points: Sequence[Point], settings: Settings
+) -> tuple[list[Orbit | None], np.ndarray]:
+    """Refine guesses of closed orbits by Newton's method, those of all parameter points together. Return an orbit or
+    None for each guess, and the `Status` with which its search ended.
+    """
     assert settings.system is not None
-    guesses = [request.guesses for request in asked.values()]
-    sizes = [len(g.key) for g in guesses]
-    packed, frequency, ends = _gathered(sizes, asked, points)
-    start = np.concatenate([g.point for g in guesses])
-    period = np.concatenate([g.period for g in guesses])
-    mark = np.concatenate([g.mark for g in guesses])
+    packed, frequency = _of_points(points, guesses.owner)
+    start, period = guesses.point.copy(), guesses.period.copy()
     unknown = np.flatnonzero(period == 0)
     start[unknown], period[unknown] = run_on(
         packed[unknown], frequency[unknown], start[unknown], settings.longest, settings.system
     )
-    rows, place = _each_once(np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, settings.geometry)
-    status = np.full(len(rows), int(Status.BOUNDED))
+    rows, place = _each_once(guesses.owner, start, period, guesses.mark, unknown, settings.geometry)
+    status = np.full(len(rows) + 1, int(Status.BOUNDED))  # the last one is that of guesses that have not closed
     polished = polish(
         packed[rows],
         frequency[rows],
@@ -238,14 +246,9 @@ def _polished(
         system=settings.system,
         tolerance=settings.residual,
         known=settings.known,
-        status=status,
+        status=status[:-1],
     )
-    for point, guess, own in zip((points[i] for i in asked), guesses, _slices(asked, sizes, ends), strict=True):
-        for key, i in zip(guess.key.tolist(), place[own[1]].tolist(), strict=True):
-            if i < 0 or polished[i] is None:
-                point.unpolished.setdefault(key, int(status[i]) if i >= 0 else int(Status.BOUNDED))
-    found = [polished[i] if i >= 0 else None for i in place]
-    return {index: found[own] for index, own in _slices(asked, sizes, ends)}
+    return [polished[i] if i >= 0 else None for i in place.tolist()], status[place]
 
 
 def _each_once(
@@ -274,20 +277,35 @@ def _each_once(
 def _slopes(
     asked: Mapping[tuple[int, ...], Slopes], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
-    most = 16_384  # derivatives of the section map in one call of the engine
-    assert settings.system is not None
     found: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
     for rtol in {request.rtol for request in asked.values()}:
         own = {index: request for index, request in asked.items() if request.rtol == rtol}
         sizes = [len(request.point) for request in own.values()]
-        packed, frequency, ends = _gathered(sizes, own, points)
-        start = np.concatenate([request.point for request in own.values()])
-        images, derivatives = np.empty_like(start), np.empty((*start.shape, start.shape[1]))
-        # some at a time: the map needs far more memory than its results
-        for begin in range(0, len(start), most):
-            some = slice(begin, begin + most)
-            ways = section_map(packed[some], frequency[some], start[some], 1, rtol=rtol, system=settings.system)
-            images[some], derivatives[some] = ways.images[:, -1], ways.derivatives
-        for index, rows in _slices(own, sizes, ends):
+        start, owner = np.concatenate([request.point for request in own.values()]), np.repeat(range(len(own)), sizes)
+        images, derivatives = map_slopes(start, owner, [points[i] for i in own], settings, rtol)
+        for index, rows in _slices(own, sizes, np.cumsum(sizes)):
             found[index] = images[rows], derivatives[rows]
     return found
+
+
+def map_slopes(
+    start: np.ndarray, owner: np.ndarray, points: Sequence[Point], settings: Settings, rtol: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Map states (n, state) by the section map once, each at its parameter point; return the images and the map's
+    derivatives.
+    """
+    most = 16_384  # derivatives of the section map in one call of the engine
+    assert settings.system is not None
+    packed, frequency = _of_points(points, owner)
+    images, derivatives = np.empty_like(start), np.empty((*start.shape, start.shape[1]))
+    # some at a time: the map needs far more memory than its results
+    for begin in range(0, len(start), most):
+        some = slice(begin, begin + most)
+        ways = section_map(packed[some], frequency[some], start[some], 1, rtol=rtol, system=settings.system)
+        images[some], derivatives[some] = ways.images[:, -1], ways.derivatives
+    return images, derivatives
+
+
+def _of_points(points: Sequence[Point], owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the packed parameters and the frequency of the parameter point of each trajectory."""
+    return np.array([point.packed for point in points])[owner], np.array([point.frequency for point in points])[owner]

@@ -1,4 +1,4 @@
-"""Search for the closed orbits of a parameter point, one block of cells after another.
+"""Search for the closed orbits of parameter points, one block of cells after another.
 
 Cells are read in blocks, several times. The data kept between blocks (boxes, best guesses, least hashes,
 sums) do not depend on how the cells were cut into blocks.
@@ -8,18 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
 from pipeline.analysis.attractors.declaration import IdentifyOptions
 from pipeline.analysis.attractors.finding.assigning import decide
-from pipeline.analysis.attractors.finding.cell_blocks import ClosedCells, Guesses
+from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses, of_owner
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, number_of
 from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
-from pipeline.analysis.attractors.finding.points import Dynamics, Point
-from pipeline.analysis.attractors.finding.requests import Polish, Settings, Work
+from pipeline.analysis.attractors.finding.points import Dynamics, Point, Slab
+from pipeline.analysis.attractors.finding.requests import Settings, polish_guesses
 from pipeline.analysis.attractors.finding.spirals import beside, near_closed
-from pipeline.results.sets import Geometry
+from pipeline.results.sets import Geometry, rows_by_number
 from pipeline.results.tolerances import LOOSE_SHARE, STRICT
 
 
@@ -57,51 +58,68 @@ class Search:
 
 @dataclass
 class State:
-    """Result of the search for orbits at one parameter point, before its cells are labelled."""
+    """Result of the search for orbits at all parameter points of a slab, before cells are labelled."""
 
-    orbits: list[Orbit]  # orbits, those of the last rounds last
+    orbits: list[list[Orbit]]  # orbits of each point, those of the last rounds last
     # keys of the boxes of closed cells, and the group of each box
     keys: np.ndarray
     group: np.ndarray
     closed: ClosedCells  # closed cells by group
-    ends: dict[int, int]  # index of the orbit that a closed cell reached after further integration, by the cell's mark
+    # for each point the index of the orbit that a closed cell reached after further integration, by the cell's mark
+    ends: list[dict[int, int]]
+    # `Status` with which Newton's method ended in vain, by the key of the guess (its box of section points)
+    unpolished: dict[int, int]
+
+    def decide(self, block: Block, search: Search) -> tuple[np.ndarray, np.ndarray]:
+        """Return the number of the orbit of each cell, among those of its parameter point, and the decision; see
+        `assigning.decide`.
+        """
+        owner = np.repeat(range(len(self.orbits)), [len(own) for own in self.orbits])
+        label, decision = decide(block, list(chain(*self.orbits)), search.tolerance, search.geometry, owner)
+        return np.where(label < 0, -1, label - np.searchsorted(owner, block.owner)), decision
 
 
-def search_orbits(point: Point, search: Search) -> Work[State]:
-    """Find the closed orbits that the cells of a parameter point have reached or approach."""
+def search_orbits(slab: Slab, search: Search) -> State:
+    """Find the closed orbits that the cells of parameter points have reached or approach."""
     rounds, rounds_loose = 3, 6  # most rounds of guessing and polishing, with a strict and with a loose tolerance
-    n_states = len(search.geometry.scales)
-    closed = ClosedCells(search.geometry, search.box, Guesses.none(n_states))
-    for block in point.blocks():
+    points = slab.points
+    closed = ClosedCells(search.geometry, search.box, Guesses.none(search.geometry.n_states))
+    for block in slab.blocks():
         closed.add(block)
     keys, group = closed.close()
-    orbits: list[Orbit] = []
-    if search.options.polish:
-        guesses = closed.guesses
-        guesses = guesses.best(group[np.searchsorted(keys, guesses.key)].astype(np.uint64))
-        if search.is_loose:
-            guesses = guesses.least(search.most_guesses)
-        for _ in range(rounds_loose if search.is_loose else rounds):
-            if len(guesses.key):
-                polished = moving((yield Polish(guesses)), point, search.geometry)
-                more = distinct([*orbits, *(o for o in polished if o is not None)], search.geometry)
-                if len(more) == len(orbits):
-                    break
-                orbits = more
-            guesses = _undecided(point, orbits, search)
-            if not len(guesses.key):
-                break
-    ends: dict[int, int] = {}
+    state = State([[] for _ in points], keys, group, closed, [{} for _ in points], {})
+    if not search.options.polish:
+        return state
+    guesses = closed.best(keys, group)
     if search.is_loose:
-        rest = _closed_undecided(point, orbits, search)
-        if len(rest.key):
-            answers = moving((yield Polish(rest)), point, search.geometry)
-            for mark, orbit in zip(rest.mark, answers, strict=True):
-                if orbit is not None and orbit.is_stable:
-                    number = number_of(orbit, orbits, search.geometry)
-                    orbits = orbits if number < len(orbits) else [*orbits, orbit]
-                    ends[int(mark)] = number
-    return State(orbits, keys, group, closed, ends)
+        guesses = guesses.least(search.most_guesses)
+    goes_on = np.ones(len(points), bool)
+    for _ in range(rounds_loose if search.is_loose else rounds):
+        for k, polished in _polished(guesses, points, state, search).items():
+            more = distinct([*state.orbits[k], *(one for one in polished if one is not None)], search.geometry)
+            goes_on[k] = len(more) > len(state.orbits[k])
+            state.orbits[k] = more if goes_on[k] else state.orbits[k]
+        guesses = _undecided(slab, goes_on, state, search)
+        goes_on = np.isin(np.arange(len(points)), guesses.owner)
+        if not goes_on.any():
+            break
+    if search.is_loose:
+        _follow_loose(slab, state, search)
+    return state
+
+
+def _polished(guesses: Guesses, points: Sequence[Point], state: State, search: Search) -> dict[int, list[Orbit | None]]:
+    """Refine guesses of orbits; return those of each parameter point. An orbit that is really an equilibrium is added
+    to the point's equilibria, and None stands for it.
+    """
+    if not len(guesses.key):
+        return {}
+    orbits, status = polish_guesses(guesses, points, search.settings)
+    for key, one, ended in zip(guesses.key.tolist(), orbits, status.tolist(), strict=True):
+        if one is None:
+            state.unpolished.setdefault(key, ended)
+    rows = rows_by_number(guesses.owner)
+    return {k: moving([orbits[i] for i in own.tolist()], points[k], search.geometry) for k, own in rows.items()}
 
 
 def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
@@ -111,38 +129,43 @@ def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> 
     return [None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits]
 
 
-def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Make guesses of orbits, without periods, from the closed (periodic) cells that are on no known orbit."""
-    found = Guesses.none(len(search.geometry.scales))
-    for block in point.blocks():
-        label, _ = decide(block, orbits, search.tolerance, search.geometry)
-        rest = np.flatnonzero(block.is_closed & (label < 0))
-        marks, zero = block.marks[rest], np.zeros(len(rest))
-        own = Guesses(marks, zero, marks, block.section[rest, -1], zero.astype(np.int64))
-        found = found.joined(own)
-    return found
+def _follow_loose(slab: Slab, state: State, search: Search) -> None:
+    """Integrate the closed (periodic) cells that are on no known orbit until they close more exactly; store the orbits
+    on which they end.
+    """
+    rest = Guesses.none(search.geometry.n_states)
+    for block in slab.blocks():
+        label, _ = state.decide(block, search)
+        cells = np.flatnonzero(block.is_closed & (label < 0))
+        marks, zero = block.marks[cells], np.zeros(len(cells))
+        owner = block.owner[cells]
+        own = Guesses(of_owner(marks, owner), zero, marks, block.section[cells, -1], zero.astype(np.int64), owner)
+        rest = rest.joined(own)
+    rows = rows_by_number(rest.owner)
+    for k, found in _polished(rest, slab.points, state, search).items():
+        orbits = state.orbits[k]
+        for mark, orbit in zip(rest.mark[rows[k]].tolist(), found, strict=True):
+            if orbit is not None and orbit.is_stable:
+                number = state.ends[k][mark] = number_of(orbit, orbits, search.geometry)
+                orbits += [orbit] if number == len(orbits) else []
 
 
-def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Make guesses of closed orbits from all cells that are on no known orbit."""
-    closed = ClosedCells(search.geometry, search.box, Guesses.none(len(search.geometry.scales)))
-    near = Guesses.none(len(search.geometry.scales))
-    for block in point.blocks():
-        label, _ = decide(block, orbits, search.tolerance, search.geometry)
-        rest = np.flatnonzero(label < 0)
-        if not len(rest):
-            continue
+def _undecided(slab: Slab, which: np.ndarray, state: State, search: Search) -> Guesses:
+    """Make guesses of closed orbits from all cells of some parameter points that are on no known orbit."""
+    none = Guesses.none(search.geometry.n_states)
+    closed, near = ClosedCells(search.geometry, search.box, none), none
+    for block in slab.blocks() if which.any() else ():
+        label, _ = state.decide(block, search)
+        rest = np.flatnonzero((label < 0) & which[block.owner])
         closed.add(block.take(rest))
         loose = rest[block.is_bounded[rest]]
-        near = near.joined(near_closed(block.section[loose], search.longest, search.geometry, block.marks[loose]))
-    if not len(closed.guesses.key) and not len(near.key):
-        return near
-    keys, group = closed.close()
-    own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
+        marks, owner = block.marks[loose], block.owner[loose]
+        near = near.joined(near_closed(block.section[loose], search.longest, search.geometry, marks, owner))
+    own = closed.best(*closed.close())
     if search.is_loose:
         # the observed period may be half the true one, or the orbit unstable: try without a period as well
         own = closed.guesses.least(search.most_guesses)
         own = own.followed_by(own.without_period())
-    if len(near.key):
-        own = own.followed_by(beside(orbits, search.longest, search.geometry))
-    return own.followed_by(near.least(search.most_guesses))
+    orbits = [(one, k) for k in np.unique(near.owner).tolist() for one in state.orbits[k]]
+    around = beside([one for one, _ in orbits], [k for _, k in orbits], search.longest, search.geometry)
+    return own.followed_by(around, near.least(search.most_guesses))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.analysis.attractors.finding.cell_blocks import Guesses, marks_of
+from pipeline.analysis.attractors.finding.cell_blocks import Guesses, marks_of, of_owner
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
 from pipeline.results.sets import Geometry, hashes
 
@@ -130,6 +130,7 @@ def near_closed(
     max_period: int,
     geometry: Geometry,
     marks: np.ndarray | None = None,
+    owner: np.ndarray | None = None,
     *,
     closing_only: bool = False,
     settings: SpiralSettings = SpiralSettings(),
@@ -140,7 +141,7 @@ def near_closed(
     Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
     the last section's phase. Cells whose sections recur at falling distances guess at every period, unlike
     chaos that merely passes an orbit; others up to the period `cheap`, unless `closing_only`. `marks` are the
-    hashes of the cells' sections, if they are known.
+    hashes of the cells' sections, if they are known, and `owner` the numbers of their parameter points.
     """
     if not len(section):
         return Guesses.none(section.shape[2])
@@ -152,13 +153,20 @@ def near_closed(
         marks = np.zeros(len(section), np.uint64)
         either = np.flatnonzero(worth | (found.centred > 0))
         marks[either] = marks_of(section[either])
-    spirals = _guesses(
-        found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry, settings
-    )
+    owner = np.zeros(len(section), np.int64) if owner is None else owner
     # rank means after recurring sections, since a mean is not a section
     centre = found.centre[contracting]
     away = geometry.distance(centre, section[contracting, -1]) + settings.near
-    return spirals.joined(_guesses(found.centred[contracting], away, marks[contracting], centre, geometry, settings))
+    rows = np.concatenate([recurring, contracting])
+    return _guesses(
+        np.concatenate([found.period[recurring], found.centred[contracting]]),
+        np.concatenate([found.lag[recurring], away]),
+        marks[rows],
+        np.concatenate([section[recurring, -1], centre]),
+        owner[rows],
+        geometry,
+        settings,
+    )
 
 
 def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry, settings: SpiralSettings) -> np.ndarray:
@@ -179,25 +187,31 @@ def _guesses(
     score: np.ndarray,
     mark: np.ndarray,
     point: np.ndarray,
+    owner: np.ndarray,
     geometry: Geometry,
     settings: SpiralSettings,
 ) -> Guesses:
     # separate decades of the score: a cell may guess well nearby after failing from far
     decade = np.floor(np.log10(np.maximum(score, 1e-12))).astype(np.int64)
     rows = np.concatenate([period[:, None], decade[:, None], geometry.boxes(point, settings.near)], axis=1)
-    return Guesses(hashes(rows), score, mark, point, period).best()
+    return Guesses(of_owner(hashes(rows), owner), score, mark, point, period, owner).best()
 
 
 def beside(
-    orbits: Sequence[Orbit], max_period: int, geometry: Geometry, settings: SpiralSettings = SpiralSettings()
+    orbits: Sequence[Orbit],
+    owner: Sequence[int],
+    max_period: int,
+    geometry: Geometry,
+    settings: SpiralSettings = SpiralSettings(),
 ) -> Guesses:
-    """Guess the orbits that branch off from slightly unstable orbits, along their unstable directions.
+    """Guess the orbits that branch off from slightly unstable orbits, along their unstable directions. `owner` has the
+    number of each orbit's parameter point.
 
     Cells that leave an orbit shortly after it lost stability go to the orbit that replaced it. That orbit has
     twice the period if the multiplier is below -1, and the same period if it is above 1.
     """
-    points, periods = [], []
-    for orbit in orbits:
+    points, periods, owners = [], [], []
+    for number, orbit in zip(owner, orbits, strict=True):
         values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
         k = int(np.abs(values).argmax())
         period = orbit.period * (1 if values[k].real > 0.0 else 2)
@@ -207,11 +221,12 @@ def beside(
         for size in settings.beside:
             points += [orbit.points[0] + sign * size * direction * np.asarray(geometry.scales) for sign in (1, -1)]
             periods += [period, period]
+            owners += [number, number]
     if not points:
         return Guesses.none(len(geometry.scales))
-    point, period_of = np.array(points), np.array(periods, np.int64)
+    point, period_of, owner_of = np.array(points), np.array(periods, np.int64), np.array(owners, np.int64)
     mark = hashes(np.concatenate([period_of[:, None], geometry.boxes(point, 1e-6)], axis=1))
-    return Guesses(mark, np.zeros(len(mark)), mark, point, period_of).best()
+    return Guesses(of_owner(mark, owner_of), np.zeros(len(mark)), mark, point, period_of, owner_of).best()
 
 
 def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:

@@ -41,7 +41,7 @@ def test_boxes__close_points_touch_on_the_circle_too(side):
     moved = points + side * rng.uniform(-1, 1, points.shape) * [1, 10]
     for a, b in zip(PLANE.boxes(points, side), PLANE.boxes(moved, side), strict=True):
         both = np.unique([a, b], axis=0)
-        assert len(both) == 1 or len(PLANE.box_pairs(both, side)) == 1
+        assert len(both) == 1 or len(PLANE.box_pairs(both, side, np.zeros((2, 1)))) == 1
 
 
 def test_hashes__of_the_row_alone():

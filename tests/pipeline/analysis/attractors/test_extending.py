@@ -6,10 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.extension.extending import Outcome, _Extension
+from pipeline.analysis.attractors import labelling
+from pipeline.analysis.attractors.extension.extending import _Extension
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
+from pipeline.analysis.attractors.finding.points import Slab
 from pipeline.analysis.attractors.finding.requests import Settings
-from pipeline.analysis.attractors.labelling import _label_courses, _Labels, _preserves_volume, _representatives
+from pipeline.analysis.attractors.labelling import _Ends, _label_courses, _preserve_volume, _representatives
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 from pipeline.results.sets import Geometry
 from pipeline.results.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
@@ -141,27 +143,25 @@ def test_extend__slopes_are_refined_unless_chaos_is_plain():
     assert still.rtols[:2] == [ROUGH_SLOPE_RTOL, SLOPE_RTOL]
 
 
-@pytest.mark.parametrize(("factor", "n_asked"), [(1.0, [1, 15]), (0.999, [1])])
-@pytest.mark.parametrize("lossy", [0, 1])
-def test_preserves_volume__asks_few_points_first(factor, n_asked, lossy):
-    """A map that preserves areas on all points, on all but a few, or on none."""
-    point = MapPoint(lambda z: z, None, np.random.default_rng(5).uniform(0.0, 1.0, (16, 2)))
-    asked = []
+def test_preserve_volume__asks_few_states_first(monkeypatch):
+    """A map that preserves areas at all states of a parameter point, at all but one, or at none."""
+    starts = np.random.default_rng(5).uniform(0.0, 1.0, (3, 16, 2))
+    slab = Slab({(i,): MapPoint(lambda z: z, None, own) for i, own in enumerate(starts)})
+    slab.arrays, asked = {}, []
 
-    def answered(work, answer=None):
-        while True:
-            try:
-                before = work.send(answer).point
-            except StopIteration as stop:
-                return stop.value
-            asked.append(len(before))
-            slopes = np.tile(factor * np.eye(2), (len(before), 1, 1))
-            if lossy and len(before) > 1:
-                slopes[-1] *= 0.99
-            answer = before, slopes
+    def slopes(states, owner, points, settings, rtol):
+        asked.append(np.bincount(owner, minlength=len(points)).tolist())
+        found = np.tile(np.eye(2), (len(states), 1, 1))
+        found[owner == 2] *= 0.999
+        if len(asked) > 1:
+            found[np.flatnonzero(owner == 1)[-1]] *= 0.99
+        return states, found
 
-    assert answered(_preserves_volume(point, None)) == (factor == 1.0 and not lossy)
-    assert asked == n_asked
+    monkeypatch.setattr(labelling, "map_slopes", slopes)
+    dynamics = SimpleNamespace(can_rest=False, integrates=SimpleNamespace(section=None))
+    search = SimpleNamespace(dynamics=dynamics, geometry=Geometry((False,) * 2, (1.0,) * 2), settings=None)
+    assert _preserve_volume(slab, search).tolist() == [True, False, False]
+    assert asked == [[1, 1, 1], [15, 15, 0]]
 
 
 def test_growth__exponents_of_the_henon_map():
@@ -204,9 +204,10 @@ def calls_of(work, n):
     for course, cell in zip(courses, range(3), strict=False):
         course.cell, course.end = cell, cell
     search = SimpleNamespace(settings=settings, geometry=geometry)
+    ends = _Ends(np.full(n, -1), np.zeros(n, np.int8), group, [], courses=courses)
     works = {
         "sample": lambda: extension.sample(np.arange(n), 24),
-        "label": lambda: _label_courses(point, Outcome([], courses, []), _Labels.of(n), group, search),
+        "label": lambda: _label_courses(point, ends, search),
         "represent": lambda: _representatives(next(point.blocks()), group, {}, geometry),
     }
     found = []

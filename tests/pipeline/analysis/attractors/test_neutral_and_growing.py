@@ -10,8 +10,9 @@ from pipeline.analysis.attractors.extension.bounded_sets import _is_in_family
 from pipeline.analysis.attractors.extension.conservative import _split, conservative_sets
 from pipeline.analysis.attractors.extension.courses import COURSE_GROWS
 from pipeline.analysis.attractors.extension.growth import Escape
+from pipeline.analysis.attractors.finding.points import Slab
 from pipeline.analysis.attractors.finding.requests import Settings
-from pipeline.analysis.attractors.labelling import _preserves_volume
+from pipeline.analysis.attractors.labelling import _preserve_volume
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, NEUTRAL
 from pipeline.results.sets import Geometry
 from tests.pipeline.analysis.maps import N_KEEP, MapPoint, drive, settle
@@ -130,11 +131,11 @@ def test_split__a_constant_quantity_keeps_cells_apart(offset, size):
     assert _split(np.zeros(4, int), np.full((4, 16), offset)).tolist() == [0] * 4
 
 
-def test_preserves_volume__not_asked_of_a_flow_with_one_state():
+def test_preserve_volume__not_asked_of_a_flow_with_one_state():
     """On a circle without equilibria all starts are on one orbit: there is no volume beside it."""
-    with pytest.raises(StopIteration) as found:
-        next(_preserves_volume(SimpleNamespace(can_rest=True, n_states=1), None))
-    assert found.value.value is False
+    slab = Slab({(): None})
+    dynamics, geometry = SimpleNamespace(can_rest=True), Geometry((True,), (1.0,))
+    assert _preserve_volume(slab, SimpleNamespace(dynamics=dynamics, geometry=geometry)).tolist() == [False]
 
 
 @pytest.mark.parametrize("can_rest", [False, True])
