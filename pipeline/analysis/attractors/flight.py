@@ -81,6 +81,33 @@ class Flight:
 
     def advance(self, n: int) -> Block:
         """Integrate the trajectories `rows` over `n` sections; return these sections."""
+        section, turns, seconds = self._integrated(n)
+        return self.block(section, turns, self.closed(section), seconds)
+
+    def legs(self, n: int, length: int) -> Block:
+        """Integrate the trajectories `rows` over `n` legs of `length` sections. Return a block with a row for each leg
+        of each trajectory, without turns.
+        """
+        section, _, seconds = self._integrated(n * length)
+        section = section.reshape(-1, length, section.shape[2])
+        whole = np.isfinite(section).all(axis=(1, 2))
+        period = np.zeros(len(section), np.int16)
+        period[whole] = self._periods(section[whole])
+        status, state, step = (np.repeat(each[self.rows], n, axis=0) for each in (self.status, self.state, self.step))
+        status[whole] = np.where(period[whole] > 0, int(Status.PERIODIC), int(Status.BOUNDED))
+        return Block(
+            slice(0, len(section)),
+            np.where(whole[:, None, None], section, np.nan),
+            status,
+            period,
+            np.zeros((len(section), sum(self._system.is_angle)), np.int64),
+            np.where((status == Status.NO_RETURN)[:, None], state, np.nan),
+            seconds.reshape(-1, length),
+            step,
+        )
+
+    def _integrated(self, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Integrate the trajectories `rows` over `n` sections; return these, the turns over them, and their times."""
         section = np.full((len(self.rows), n, self.state.shape[1]), np.nan)
         seconds = np.repeat(1.0 / self._frequency[self.rows, None], n, axis=1)
         turns = np.zeros((len(self.rows), sum(self._system.is_angle)), np.int64)
@@ -108,7 +135,7 @@ class Flight:
             done += k
         self.section = np.concatenate([self.section, section], axis=1)[:, -self._most :]
         self.seconds = np.concatenate([self.seconds, seconds], axis=1)[:, -self._most :]
-        return self.block(section, turns, self.closed(section), seconds)
+        return section, turns, seconds
 
     def _calls(self, n: int) -> Iterator[int]:
         """Yield the sections of each call of the engine, `n` in all."""
@@ -121,10 +148,13 @@ class Flight:
         found = np.zeros(len(self.rows), np.int16)
         flying = self.flying
         if flying.any():
-            found[flying] = orbit_periods(
-                section[flying], closure_tolerance=self._closure, max_orbit_period=self._longest, system=self._system
-            )
+            found[flying] = self._periods(section[flying])
         return found
+
+    def _periods(self, section: np.ndarray) -> np.ndarray:
+        return orbit_periods(
+            section, closure_tolerance=self._closure, max_orbit_period=self._longest, system=self._system
+        )
 
     def block(
         self, section: np.ndarray, turns: np.ndarray, period: np.ndarray, seconds: np.ndarray | None = None

@@ -8,7 +8,7 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.finding.requests import LEG, Effort, Leg, Polish, Settings, Slopes
 from pipeline.results.sets import Geometry
 
 N_KEEP = 20
@@ -47,7 +47,7 @@ class MapPoint:
             state = step(state)
             self.section[:, i] = state
         self.n_cells, self.n_periods, self.n_states = len(starts), seen * len(starts), starts.shape[1]
-        self.rtols, self.is_elsewhere = [], np.zeros(len(starts), bool)
+        self.rtols, self.n_legs, self.is_elsewhere = [], [], np.zeros(len(starts), bool)
 
     def blocks(self):
         n = self.n_cells
@@ -57,11 +57,11 @@ class MapPoint:
         return np.linalg.slogdet(derivatives)[1]
 
 
-def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0, n_sample=32) -> Outcome:
+def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0, n_sample=32, effort=Effort()) -> Outcome:
     """Drive the extension of a point by its own map."""
     n_states = point.section.shape[2]
     geometry = Geometry((False,) * n_states, (scale,) * n_states)
-    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry)
+    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry, effort=effort)
     return drive(extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, n_sample), point)
 
 
@@ -74,12 +74,14 @@ def drive(work, point):
         except StopIteration as stop:
             return stop.value
         if isinstance(asked, Leg):
-            section, state = np.empty((len(asked.state), LEG, n_states)), asked.state.copy()
-            for i in range(LEG):
+            point.n_legs.append(asked.n_legs)
+            section, state = np.empty((len(asked.state), asked.n_legs * LEG, n_states)), asked.state.copy()
+            for i in range(section.shape[1]):
                 state = point.step(state)
                 section[:, i] = state
-            n = len(state)
-            status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
+            section = section.reshape(-1, LEG, n_states)
+            n = len(section)
+            status = np.where(np.isfinite(section).all(axis=(1, 2)), Status.BOUNDED, Status.DIVERGED)
             none = np.zeros(n, int)
             answer = Block(
                 slice(0, n), section, status, none, np.zeros((n, 0), int), seconds=np.ones((n, LEG)), step=np.zeros(n)

@@ -164,11 +164,11 @@ def _dimension(growth: Growth | None, kind: int, point: Point) -> int:
 
 def _is_in_family(points: np.ndarray, dimension: int, point: Point, settings: Settings) -> bool:
     """Return whether the flow has more zero exponents than one trajectory with these section points fills."""
-    if dimension > 2 or (dimension == 2 and point.n_neutral):
-        return True
+    if dimension != 2 or point.n_neutral:
+        return dimension >= 2
     # on a section a torus shows as a curve, and an orbit as a few points
     boxes = np.unique(settings.geometry.boxes(points, 10.0 * settings.closure), axis=0)
-    return dimension == 2 and len(boxes) <= 2 * settings.longest
+    return len(boxes) <= 2 * settings.longest
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
@@ -275,12 +275,10 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
     samples, stretches = 8192, (1, 4, 16)
     assert point.parameters is not None
     aside = size * np.diag(geometry.scales)
-    states, seconds = course.state + np.concatenate([np.zeros((1, len(aside))), aside]), 0.0
-    for _ in range(legs):
-        leg = yield from _leg(states)
-        if leg is None:
-            return None
-        states, seconds = leg.state, float(leg.seconds[0].sum())
+    leg = yield from _last_leg(course.state + np.concatenate([np.zeros((1, len(aside))), aside]), legs)
+    if leg is None:
+        return None
+    states, seconds = leg.state, float(leg.seconds[0].sum())
     away = geometry.difference(states[1:], states[0])
     if point.n_neutral:
         flow = rates_at(point.integrates, states[:1], point.packed)[0] / np.asarray(geometry.scales)
@@ -318,9 +316,7 @@ def is_one_torus(a: Course, b: Course, geometry: Geometry) -> Work[bool]:
     along = np.linspace(0.0, 1.0, links + 1)
     length = float(np.abs(step / np.asarray(geometry.scales)).max())
     for _ in range(halvings):
-        leg = yield from _leg(start + along[:, None] * step)
-        for _ in range(legs - 1):
-            leg = (yield from _leg(leg.state)) if leg is not None else None
+        leg = yield from _last_leg(start + along[:, None] * step, legs)
         if leg is None:
             return False
         gaps = geometry.distance(leg.state[1:], leg.state[:-1])
@@ -331,7 +327,7 @@ def is_one_torus(a: Course, b: Course, geometry: Geometry) -> Work[bool]:
     return False
 
 
-def _leg(states: np.ndarray) -> Work[Any]:
-    """Integrate states over a leg; return its `Block`, None if one of them does not return."""
-    leg = yield Leg(states, np.zeros(len(states)))
-    return leg if np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED)).all() else None
+def _last_leg(states: np.ndarray, n: int) -> Work[Any]:
+    """Integrate states over `n` legs; return the `Block` of the last leg, None if one of them does not return."""
+    legs = yield Leg(states, np.zeros(len(states)), n_legs=n)
+    return legs.take(slice(n - 1, None, n)) if np.isin(legs.status, (Status.PERIODIC, Status.BOUNDED)).all() else None

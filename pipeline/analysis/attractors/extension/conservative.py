@@ -17,7 +17,7 @@ from magpend_core.pointwise import evaluate
 from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, slopes_along
 from pipeline.analysis.attractors.extension.clouds import Cloud, group, members
-from pipeline.analysis.attractors.extension.courses import COURSE_GROWS, FAILED, Course
+from pipeline.analysis.attractors.extension.courses import COURSE_GROWS, FAILED, ON_SET, Course
 from pipeline.analysis.attractors.extension.extending import sample_cells
 from pipeline.analysis.attractors.extension.growth import Escape, Growth, growth_of
 from pipeline.analysis.attractors.finding.points import Point
@@ -127,19 +127,16 @@ def _extended(point: Point, settings: Settings, n_sample: int) -> Work[tuple[lis
 
 
 def _advance(courses: Sequence[Course], settings: Settings) -> Work[None]:
-    for _ in range(settings.effort.least_stay // LEG):
-        going = [course for course in courses if course.goes_on]
-        if not going:
-            return
-        leg = yield Leg(np.array([c.state for c in going]), np.array([c.step for c in going]))
-        seconds = np.zeros(len(going)) if leg.seconds is None else leg.seconds.sum(axis=1)
-        for i, course in enumerate(going):
-            if leg.status[i] not in (Status.PERIODIC, Status.BOUNDED):
-                course.end = FAILED
-                continue
-            course.legs.append(leg.section[i])
-            course.state, course.step = leg.state[i], float(leg.step[i])
-            course.seconds += float(seconds[i])
+    n = settings.effort.least_stay // LEG
+    legs = yield Leg(np.array([c.state for c in courses]), np.array([c.step for c in courses]), n_legs=n)
+    assert legs.step is not None
+    assert legs.seconds is not None
+    state, seconds = legs.state, legs.seconds.sum(axis=1)
+    n_whole = np.isin(legs.status, (Status.PERIODIC, Status.BOUNDED)).reshape(-1, n).sum(axis=1)
+    for i, (course, whole) in enumerate(zip(courses, n_whole.tolist(), strict=True)):
+        own, last = slice(i * n, i * n + whole), i * n + max(whole - 1, 0)
+        course.add(legs.section[own], seconds[own], state[last], float(legs.step[last]))
+        course.end = ON_SET if whole == n else FAILED
 
 
 def _growths(courses: Sequence[Course], point: Point, settings: Settings) -> Work[list[Growth | None]]:

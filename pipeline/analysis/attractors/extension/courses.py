@@ -20,12 +20,13 @@ class Course:
     # state (state,) and step size [s] with which the integration continues
     state: np.ndarray
     step: float = 0.0
-    legs: list[np.ndarray] = field(default_factory=list)  # sections of the extension, leg by leg
     end: int = ON_SET  # number of an orbit, or one of the codes above
     seconds: float = 0.0  # time of the extension [s]; 0 if it is not known
     periods: float = 0.0  # drive periods or returns from its last kept section until it came near its end
     is_leaving: bool = False  # whether it was near its end from the start
     is_neighbour: bool = False  # whether it was drawn beside a cell, and is none itself
+    length: int = 0  # number of section points that the further integration has added
+    _added: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # these, with room for more
 
     @property
     def goes_on(self) -> bool:
@@ -35,13 +36,25 @@ class Course:
     @property
     def extension(self) -> np.ndarray:
         """Section points that the further integration has added to those of the run, shape (n, state)."""
-        return np.concatenate([self.kept[:0], *self.legs])
+        return self._added[: self.length] if self.length else self.kept[:0]
+
+    def add(self, sections: np.ndarray, seconds: np.ndarray, state: np.ndarray, step: float) -> None:
+        """Add section points (leg, n, state) to the extension, with the time of each leg, and the state and the step
+        size that continue it.
+        """
+        self.seconds, self.state, self.step = sum(seconds.tolist(), self.seconds), state, step
+        sections = sections.reshape(-1, sections.shape[2])
+        n = self.length + len(sections)
+        if n > len(self._added):
+            self._added = np.concatenate([self.extension, np.empty((2 * n - self.length, self.kept.shape[1]))])
+        self._added[self.length : n] = sections
+        self.length = n
 
     @property
     def stayed(self) -> np.ndarray:
         """Section points on the set that the trajectory stays on, or that it was on before it left."""
         if self.goes_on:
-            return self.extension if self.legs else self.kept
+            return self.extension if self.length else self.kept
         return np.asarray(self.extension[: int(self.periods)])
 
     @property
@@ -49,11 +62,6 @@ class Course:
         """Whether the trajectory has left a set after a least number of section points on it."""
         least = 8  # section points on a set for a cell to count as having left it
         return not self.goes_on and not self.is_leaving and len(self.stayed) >= least
-
-    @property
-    def length(self) -> int:
-        """Number of section points that the further integration has added."""
-        return len(self.legs) * len(self.legs[0]) if self.legs else 0  # legs are equally long
 
 
 def rest_number(end: int) -> int | None:

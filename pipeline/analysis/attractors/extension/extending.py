@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -125,6 +126,28 @@ def _has_no_shape(one: BoundedSet) -> bool:
     return one.is_regular and one.curve is None and not one.n_left and not settled
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """What trajectories do in a leg, one row per leg."""
+
+    is_whole: np.ndarray  # whether it was integrated to the end
+    # index of the orbit that the leg is on or approaches, the same if it attracts, and index of the equilibrium that it
+    # approaches; -1 for none
+    label: np.ndarray
+    orbit: np.ndarray
+    rest: np.ndarray
+    leap: np.ndarray  # (row, state): a later state, if the trajectory slowly leaves an unstable orbit; else NaN
+
+    @cached_property
+    def leaps(self) -> np.ndarray:
+        return np.asarray(np.isfinite(self.leap).all(axis=1))
+
+    @property
+    def is_end(self) -> np.ndarray:
+        """Whether the trajectory does not go on from the end of the leg."""
+        return np.asarray(~self.is_whole | (self.orbit >= 0) | (self.rest >= 0) | self.leaps)
+
+
 class _Extension:
     """Further integration at one parameter point: the sampled trajectories, and the orbits and sets found so far."""
 
@@ -141,6 +164,7 @@ class _Extension:
         self.spent, self.ran_out = 0, False
         self._tried: set[int] = set()
         self._told: list[tuple[int, bool]] = []
+        self._escapes: dict[int, tuple[int, bool]] = {}  # length, and whether it grows, of each trajectory
 
     @property
     def has_budget(self) -> bool:
@@ -227,55 +251,109 @@ class _Extension:
                 return
             # extend the shortest courses first: those of a later round
             least = min(course.length for course in going)
-            going = [course for course in going if course.length == least]
-            states, steps = np.array([c.state for c in going]), np.array([c.step for c in going])
-            leg = yield Leg(states, steps, self.spent / self.budget)
-            self.spent += LEG * len(going)
-            yield from self._take(going, leg)
+            shortest = [course for course in going if course.length == least]
+            states, steps = np.array([c.state for c in shortest]), np.array([c.step for c in shortest])
+            n_legs = self._n_legs(going, shortest, target)
+            legs = yield Leg(states, steps, self.spent / self.budget, n_legs)
+            yield from self._take(shortest, legs, n_legs)
 
-    def _has_stayed(self, going: Sequence[Course], target: int) -> bool:
-        """Return whether the unfinished trajectories stayed on their set long enough to call the set an attractor."""
-        least = min(course.length for course in going)
+    def _n_legs(self, going: Sequence[Course], shortest: Sequence[Course], target: int) -> int:
+        """Return over how many legs the shortest of the trajectories are integrated at once: as many as before, if
+        nothing is to be decided earlier.
+        """
+        n_before = shortest[0].length // LEG
+        most = min(max(n_before, 1), self.settings.effort.most_legs)
+        for n in range(1, most):
+            if (
+                self._searches(n_before + n)
+                or self.spent + n * LEG * len(shortest) >= self.budget
+                or any(course.length == (n_before + n) * LEG for course in going)
+                or self._has_stayed(going, target, n)
+            ):
+                return n
+        return most
+
+    def _searches(self, n_legs: int) -> bool:
+        """Return whether orbits are searched after so many legs."""
+        return n_legs.bit_count() == 1 or n_legs % self.settings.effort.search_each == 0
+
+    def _has_stayed(self, going: Sequence[Course], target: int, n_legs: int = 0) -> bool:
+        """Return whether the unfinished trajectories stayed on their set long enough to call the set an attractor, or
+        will have after some more legs of the shortest of them.
+        """
+        lengths = [course.length for course in going]
+        least = min(lengths) + n_legs * LEG
         if least < target:
             return False
         longest = self.settings.effort.times_longest * self._longest_transient()
         if any(course.is_neighbour for course in going):
             return least >= longest
-        at_risk = float(sum(course.length for course in going))
+        at_risk = float(sum(lengths) + n_legs * LEG * lengths.count(min(lengths)))
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
     def _longest_transient(self) -> float:
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
-    def _take(self, going: Sequence[Course], leg: Block) -> Work[None]:
-        """Record the newly integrated section points of each trajectory. Finish the trajectories that reached an orbit
-        or an equilibrium.
+    def _take(self, going: Sequence[Course], legs: Block, n: int) -> Work[None]:
+        """Record the newly integrated section points of each trajectory, `n` legs of it, up to the leg in which it
+        failed, reached an orbit or an equilibrium, or leaps. Finish the trajectories that are at an end.
         """
-        computed = (leg.status == Status.PERIODIC) | (leg.status == Status.BOUNDED)
-        assert leg.step is not None
-        seconds = np.zeros(len(going)) if leg.seconds is None else leg.seconds.sum(axis=1)
-        for i, course in enumerate(going):
-            course.state, course.step = leg.state[i], float(leg.step[i])
-            course.seconds += float(seconds[i])
-            if computed[i]:
-                course.legs.append(leg.section[i])
-        for i in np.flatnonzero(~computed).tolist():
-            self._fail(going[i], int(leg.status[i]))
-        rows = np.flatnonzero(computed)
-        if not len(rows):
+        seen, known = self._seen(legs), self._n_known
+        begins = n * np.arange(len(going))
+        ends = seen.is_end.reshape(-1, n)
+        last = begins + np.where(ends.any(axis=1), ends.argmax(axis=1), n - 1)
+        self.spent += LEG * int((last - begins + 1).sum())
+        n_done = going[0].length // LEG + n
+        assert legs.seconds is not None
+        assert legs.step is not None
+        state, seconds = legs.state, legs.seconds.sum(axis=1)
+        for course, begin, row in zip(going, begins.tolist(), last.tolist(), strict=True):
+            whole = slice(begin, row + int(seen.is_whole[row]))
+            course.add(legs.section[whole], seconds[whole], state[row], float(legs.step[row]))
+        is_done = seen.is_whole[last] & (last == begins + n - 1)
+        for i in np.flatnonzero(~is_done).tolist():
+            self._finish(going[i], seen, int(last[i]), int(legs.status[last[i]]))
+        own, rows = [course for course, done in zip(going, is_done, strict=True) if done], last[is_done]
+        if not own:
             return
-        block = leg.take(rows)
-        own = [going[i] for i in rows.tolist()]
-        n = len(own[0].legs)
-        if n.bit_count() == 1 or n % self.settings.effort.search_each == 0:
-            yield from self._search(own, block)
-        label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
-        for course, number in zip(own, label.tolist(), strict=True):
-            if number >= 0 and self.orbits[number].is_stable:
-                self._leave(course, number)
-        self._rest(own, block)
-        self._leap(own, block.section)
+        block = legs.take(rows)
+        if self._searches(n_done):
+            yield from self._search(own, block, seen.label[rows])
+        if self._n_known != known:
+            seen, rows = self._seen(block), np.arange(len(own))
+        for i, course in enumerate(own):
+            self._finish(course, seen, int(rows[i]), int(block.status[i]))
+
+    @property
+    def _n_known(self) -> tuple[int, int]:
+        return len(self.orbits), len(self.point.equilibria) if self.point.can_rest else 0
+
+    def _seen(self, legs: Block) -> _Seen:
+        is_whole = (legs.status == Status.PERIODIC) | (legs.status == Status.BOUNDED)
+        label, _ = decide(legs, self.orbits, 10.0 * self.settings.closure, self.geometry)
+        stable = np.array([*(orbit.is_stable for orbit in self.orbits), False])
+        orbit, rest = np.where(stable[label], label, -1), np.full(len(label), -1)
+        if self.point.can_rest:
+            assert legs.seconds is not None
+            rows = np.flatnonzero(is_whole & (orbit < 0))
+            section, seconds = legs.section[rows], legs.seconds[rows]
+            rest[rows] = approaching(self.point, section, seconds, self.settings.closure, self.geometry)
+        return _Seen(is_whole, label, orbit, rest, leap(legs.section, self.orbits, self.geometry))
+
+    def _finish(self, course: Course, seen: _Seen, row: int, status: int) -> None:
+        """Finish a trajectory that is at an end after a leg, or advance it without integration if it slowly leaves an
+        unstable orbit.
+        """
+        if not seen.is_whole[row]:
+            self._fail(course, status)
+        elif seen.orbit[row] >= 0:
+            self._leave(course, int(seen.orbit[row]))
+        elif seen.rest[row] >= 0:
+            course.end, course.periods = AT_REST - int(seen.rest[row]), float(course.length)
+            course.is_leaving = course.length <= LEG
+        elif seen.leaps[row]:
+            course.state, course.step = seen.leap[row], 0.0
 
     def _fail(self, course: Course, status: int) -> None:
         course.periods = float(course.length)
@@ -286,18 +364,19 @@ class _Extension:
             if number is not None:
                 course.end = AT_REST - number
 
-    def _search(self, own: Sequence[Course], block: Block) -> Work[None]:
-        """Find closed orbits by Newton's method, started from trajectories that close or nearly close."""
-        label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
+    def _search(self, own: Sequence[Course], block: Block, label: np.ndarray) -> Work[None]:
+        """Find closed orbits by Newton's method, started from trajectories that close or nearly close. The `label` is
+        the known orbit of each.
+        """
         rest = np.flatnonzero(label < 0).tolist()
         closed = ClosedCells(self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2]))
         closed.add(block.take(np.array(rest, np.int64)))
         found = closed.guesses
-        depths = [min(self.settings.effort.look_back, len(own[i].legs)) for i in rest]
+        depths = [min(self.settings.effort.look_back * LEG, own[i].length) for i in rest]
         for depth in set(depths):
             rows = [i for i, d in zip(rest, depths, strict=True) if d == depth and block.is_bounded[i]]
             if rows:
-                section = np.stack([np.concatenate(own[i].legs[-depth:]) for i in rows])
+                section = np.stack([own[i].extension[-depth:] for i in rows])
                 found = found.joined(near_closed(section, self.settings.longest, self.geometry, closing_only=True))
         new = [i for i, key in enumerate(found.key.tolist()) if key not in self._tried]
         self._tried.update(found.key[new].tolist())
@@ -323,30 +402,6 @@ class _Extension:
         entered = len(states) - (len(near) if near.all() else int(np.argmin(near)))
         course.end, course.periods = number, float(max(entered - len(course.kept), 0))
         course.is_leaving = entered <= len(course.kept)
-
-    def _rest(self, own: Sequence[Course], leg: Block) -> None:
-        if not self.point.can_rest:
-            return
-        assert leg.seconds is not None
-        going = [i for i, course in enumerate(own) if course.goes_on]
-        if not going:
-            return
-        section, seconds = leg.section[going], leg.seconds[going]
-        number = approaching(self.point, section, seconds, self.settings.closure, self.geometry)
-        for i, k in zip(going, number.tolist(), strict=True):
-            if k >= 0:
-                own[i].end, own[i].periods = AT_REST - k, float(own[i].length)
-                own[i].is_leaving = len(own[i].legs) <= 1
-
-    def _leap(self, own: Sequence[Course], section: np.ndarray) -> None:
-        """Advance trajectories that slowly leave an unstable orbit to a predicted later state, without integration."""
-        rows = [i for i, course in enumerate(own) if course.goes_on]
-        if not rows:
-            return
-        states = leap(section[rows], self.orbits, self.geometry)
-        for i, state in zip(rows, states, strict=True):
-            if np.isfinite(state).all():
-                own[i].state, own[i].step = state, 0.0
 
     def _draw_neighbours(self) -> bool:
         """Draw neighbours of the cells on each chaotic set with too few cells; return whether any were drawn."""
@@ -384,7 +439,7 @@ class _Extension:
         if not going:
             return True
         cells = [course for course in going if not course.is_neighbour]
-        has_stayed = bool(cells) and bool(cells[0].legs) and self._has_stayed(cells, self.settings.effort.least_stay)
+        has_stayed = bool(cells) and cells[0].length > 0 and self._has_stayed(cells, self.settings.effort.least_stay)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
         groups = [
             [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
@@ -403,7 +458,10 @@ class _Extension:
         return len(going) < len(on_sets) or not is_sure or in_doubt
 
     def _grows(self, course: Course) -> bool:
-        return Escape.of(course.extension, self.geometry) is not None
+        known = self._escapes.get(id(course))
+        if known is None or known[0] != course.length:
+            known = self._escapes[id(course)] = course.length, Escape.of(course.extension, self.geometry) is not None
+        return known[1]
 
     def end_growing(self) -> None:
         """Finish the trajectories that grow to the end of the extension."""

@@ -57,12 +57,21 @@ class Escape:
         straight = ~np.asarray(geometry.is_angle)
         if len(path) < 4 * n_windows or not straight.any():
             return None
-        scaled = path[:, straight] / np.asarray(geometry.scales)[straight]
-        windows = np.array_split(scaled, n_windows)
-        size = np.array([np.abs(window - windows[0].mean(axis=0)).max() for window in windows])
+        scales = np.asarray(geometry.scales)[straight]
+
+        def away(window: np.ndarray, origin: np.ndarray) -> float:
+            return float(np.abs(window[:, straight] / scales - origin).max())
+
+        # the last window alone rules out most
+        first, last = path[: -(-len(path) // n_windows)], path[-(len(path) // n_windows) :]
+        origin = (first[:, straight] / scales).mean(axis=0)
+        if away(last, origin) < beyond * max(1.0, away(first, origin)):
+            return None
+        windows = np.array_split(path, n_windows)
+        size = np.array([away(window, origin) for window in windows])
         gained, half = np.diff(size), n_windows // 2
         keeps_on = gained.min() > 0.0 and gained[half:].mean() >= least_ratio * gained[:half].mean()
-        if not keeps_on or size[-1] < beyond * max(1.0, size[0]):
+        if not keeps_on:
             return None
         rate = float(np.log(size[-1] / size[-2])) / len(windows[-1])
         return cls(float(size[-1] / max(size[0], 1e-300)), rate, len(path))

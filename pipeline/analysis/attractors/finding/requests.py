@@ -30,20 +30,22 @@ FINDING, EXTENDING = "finding attractors", "extending cells"
 """Names of the work before and after the first leg of an extension."""
 
 LEG = 64
-"""Number of drive periods or returns in a leg of an extension."""
+"""Number of drive periods or returns in a leg of an extension: what a trajectory does is looked at leg by leg."""
 
 
 @dataclass(frozen=True)
 class Leg:
-    """Request to integrate trajectories over `LEG` more sections, from states (n, state) with step sizes (n,).
+    """Request to integrate trajectories over some legs of `LEG` sections, from states (n, state) with step sizes (n,).
 
     With a step size of 0 the engine chooses the step. `spent` is the part of the point's budget that is spent. The
-    answer is a `Block` of the new sections; its `state` and `step` continue the trajectories bit for bit.
+    answer is a `Block` of the new sections, with a row for each leg: first those of the first trajectory. The `state`
+    and `step` of its last leg continue a trajectory bit for bit.
     """
 
     state: np.ndarray
     step: np.ndarray
     spent: float = 0.0
+    n_legs: int = 1
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class Effort:
     rounds: int = 6  # most samples of a parameter point; each is twice as large as the one before
     # orbits are searched after 1, 2, 4, ... legs and every `search_each` legs: Newton steps are expensive
     search_each: int = 32
+    most_legs: int = 8  # most legs that are integrated at once: as many as before, and so twice as many each time
     look_back: int = 4  # legs searched for a period: four legs show periods of up to two legs
     # most derivatives of the section map for the exponents of a set: at first, and if the first are too few
     slopes: tuple[int, ...] = (1024, 4096)
@@ -200,11 +203,15 @@ def _gathered(
 def _legs(
     asked: Mapping[tuple[int, ...], Leg], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], Block]:
-    sizes = [len(leg.state) for leg in asked.values()]
-    packed, frequency, ends = _gathered(sizes, asked, points)
-    state, step = (np.concatenate([getattr(leg, name) for leg in asked.values()]) for name in ("state", "step"))
-    found = settings.fly(packed, frequency, state, step=step).advance(LEG)
-    return {index: found.take(own) for index, own in _slices(asked, sizes, ends)}
+    found: dict[tuple[int, ...], Block] = {}
+    for n in {leg.n_legs for leg in asked.values()}:
+        own = {index: leg for index, leg in asked.items() if leg.n_legs == n}
+        sizes = [len(leg.state) for leg in own.values()]
+        packed, frequency, ends = _gathered(sizes, own, points)
+        state, step = (np.concatenate([getattr(leg, name) for leg in own.values()]) for name in ("state", "step"))
+        block = settings.fly(packed, frequency, state, step=step).legs(n, LEG)
+        found |= {index: block.take(slice(n * at.start, n * at.stop)) for index, at in _slices(own, sizes, ends)}
+    return found
 
 
 def _slices(

@@ -10,7 +10,7 @@ from pipeline.analysis.attractors import labelling
 from pipeline.analysis.attractors.extension.extending import _Extension
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.finding.points import Slab
-from pipeline.analysis.attractors.finding.requests import Settings
+from pipeline.analysis.attractors.finding.requests import Effort, Settings
 from pipeline.analysis.attractors.labelling import _Ends, _label_courses, _preserve_volume, _representatives
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 from pipeline.results.sets import Geometry
@@ -52,6 +52,22 @@ def test_extend__a_chaotic_attractor_stays():
     with np.errstate(over="ignore", invalid="ignore"):
         found = settle(MapPoint(lambda x: np.where(x < 3, x + 0.05, x**8), lambda x: x[:, :, None], starts))
     assert {course.end for course in found.courses} == {-3}
+
+
+@pytest.mark.parametrize("slope", [1.9, TENT_SLOPE, 2.002])
+def test_extend__legs_that_grow_end_alike(slope):
+    """Several legs at once save requests, and change nothing else: with and without trajectories that leave."""
+
+    def found(most_legs):
+        point = MapPoint(*tent(slope), np.random.default_rng(3).uniform(0.0, 1.0, (200, 1)), seen=200)
+        one = settle(point, [FIXED], scale=1.0 / 0.3, seen=200, budget=1.0, effort=Effort(most_legs=most_legs))
+        courses = [(c.cell, c.end, c.periods, c.length, c.is_leaving, c.seconds) for c in one.courses]
+        sets = [(s.kind, s.stability, s.n_left, s.time_at_risk, s.growth) for s in one.sets]
+        return (one.spent, one.ran_out, courses, sets), point.n_legs
+
+    whole, each = found(8), found(1)
+    assert whole[0] == each[0]
+    assert len(whole[1]) < len(each[1])
 
 
 @pytest.mark.slow

@@ -38,6 +38,10 @@ def test_flight__legs_have_the_bits_of_one_integration():
     first = flight.advance(32)
     # another flight goes on from the block of the first
     again = fly(first.state, first.step).advance(64)
+    legs = fly(starts).legs(3, 32)
+    np.testing.assert_array_equal(legs.section.reshape(5, 96, 2), whole.section[:, 0])
+    np.testing.assert_array_equal(legs.orbit_period, fly(legs.state).closed(legs.section))
+    np.testing.assert_array_equal(legs.state[2::3], whole.section[:, 0, -1])
     flight.keep(np.arange(5) != 2)
     flight.advance(64)
     rows = [0, 1, 3, 4]
