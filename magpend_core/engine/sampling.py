@@ -290,7 +290,7 @@ def follow_all(samples: Samples, seats: Seats, n_lanes: int, rtol: float, atol: 
         for group in range(in_use):
             remember(samples, rows, before, clock, group)
         attempt(rows, events, n_watching, in_use, samples.slack, rtol, atol, max_attempts)
-        lane = 0
+        lane = ZERO
         while lane < active:
             status = go_on(samples, seats, lane, scratch)
             if status == PENDING:
