@@ -86,6 +86,27 @@ def test_parts__bits_depend_on_the_system_alone(cold, folder, tmp_path):
     assert integrated(folder, "duffing")["duffing"][:2] == bits["duffing"]
 
 
+SAMPLE = """
+from magpend_core.engine import jit
+from magpend_core.models import load_model
+from magpend_core.sampling import sample
+from numba.core import types
+
+model = load_model("duffing")
+sample(model.system, model.load().pack()[None], [[0.2, 0.0]], [[0.5]])
+given = [(part.py_func.__name__, types_) for part, _ in jit._PARTS.values() for types_ in part.overloads]
+print(len(given), *[name for name, types_ in given if any(isinstance(one, types.Literal) for one in types_)])
+"""
+
+
+@pytest.mark.slow
+def test_parts__of_the_sampling_loop_are_compiled_for_no_literal(tmp_path):
+    """numba types a plain 0 as a literal, and would compile every part that is called with one once more."""
+    n, *literal = run_script(tmp_path, SAMPLE, MAGPEND_CACHE="0").split()
+    assert int(n) >= 15
+    assert not literal
+
+
 def damage(cache):
     """Take away the engines, and damage some of their parts each in its own way."""
     records = sorted(cache.rglob("*.part"))
