@@ -207,6 +207,11 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             lines.append(f"{what} preserves volume: a conservative system has no attractors")
         if any(row["evidence"] == "volume" and row["kind"] == "bounded_set" and row["n_cells"] > 1 for row in rows):
             lines.append("cells of a bounded set that is neutral are each on an orbit or a torus of their own")
+    stayed = [row for row in rows if row["evidence"] == "stayed"]
+    if stayed and ds[ROW_SIZE].size > FEW_POINTS:
+        least = min(stayed, key=lambda row: float(row["lifetime_low"]))
+        text = f"{number(least['lifetime_low'], '.0f')} {model_of(ds).clock.periods} {_confidence(least)}"
+        lines.append(f"sets that attract by staying: lifetimes above {text}")
     above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
     longest = int(ds.attrs.get("identify_max_orbit_period", 0))
     unsettled = [row for row in rows if row["stability"] == "not_settled"]
@@ -308,11 +313,15 @@ _SHOWN_BY = {
 def _shown_by(row: Row) -> str:
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
-        return f"{row['n_sampled']} stayed, lifetime above {low} ({100.0 * row['lifetime_confidence']:g} %)"
+        return f"{row['n_sampled']} stayed, lifetime above {low} {_confidence(row)}"
     if row["evidence"] == "left":
         high = number(row["lifetime_high"], ".0f")
         return f"{row['n_left']} of {row['n_sampled']} left, lifetime {low} to {high}"
     return _SHOWN_BY[row["evidence"]]
+
+
+def _confidence(row: Row) -> str:
+    return f"({100.0 * row['lifetime_confidence']:g} %)"
 
 
 def _eigenvalue(row: Row) -> str:

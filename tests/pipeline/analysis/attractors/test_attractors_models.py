@@ -5,6 +5,7 @@ import pytest
 
 import magpend
 from magpend_core import load_model, sections
+from pipeline.analysis.attractors import analysis
 from pipeline.analysis.attractors.analysis import attractors_table
 from pipeline.analysis.attractors.portraits import portraits
 from pipeline.analysis.attractors.settling import settling_table
@@ -68,7 +69,7 @@ def test_attractors__of_two_sections_that_do_not_close_yet(tmp_path):
 
 
 @pytest.mark.slow
-def test_identify__chaos_without_angles(chaotic, strange):
+def test_identify__chaos_without_angles(chaotic, strange, monkeypatch):
     """Grouping sets took the largest difference of no rotations."""
     assert strange["kind"].values.tolist() == [CHAOTIC_SET]
     assert strange["n_cells"].values.tolist() == [chaotic["status"].size]
@@ -76,13 +77,20 @@ def test_identify__chaos_without_angles(chaotic, strange):
     assert strange["mirror_partner"].values.tolist() == [0]
     assert {"rotation", "side"}.isdisjoint(strange.data_vars)
     assert strange["energy_min"].attrs["units"] == "J/kg"
-    text = "\n".join(attractors_table(rows_of(match(strange))).lines)
+    matched = match(strange)
+    text = "\n".join(attractors_table(rows_of(matched)).lines)
     assert "rotation" not in text
     assert "side" not in text
     assert strange["stability"].values.tolist() == [ATTRACTS]
     assert strange["n_left"].values.tolist() == [0]
     # the sample stayed for ten times the 300 periods that the cube tells of
-    assert strange["lifetime_low"].item() >= 3000.0
+    least = strange["lifetime_low"].item()
+    assert least >= 3000.0
+    assert f"stayed, lifetime above {least:.0f} (95 %)" in text
+    # the table of many points has the least of their bounds below it
+    monkeypatch.setattr(analysis, "FEW_POINTS", 0)
+    lines = attractors_table(rows_of(matched)).lines
+    assert f"sets that attract by staying: lifetimes above {least:.0f} drive periods (95 %)" in lines
     # 0.158 per unit time (ChaosTools.jl, issue 301)
     assert strange["lyapunov_low"].item() < 0.158 < strange["lyapunov_high"].item()
     table = settling_table(rows_of(strange.expand_dims("frequency")))
