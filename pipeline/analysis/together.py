@@ -26,17 +26,18 @@ def answer_together(
     computations
         Generators by key.
     answer
-        ``answer(asked, results)`` returns the answer to what each running computation has asked for. `results` has
-        those that have ended.
+        ``answer(asked, results)`` returns answers to what running computations have asked for, one at least; the
+        others wait. `results` has the computations that have ended.
     """
     results: dict[K, T] = {}
+    asked: dict[K, Q] = {}
     answers: Mapping[K, Any] = dict.fromkeys(computations)
     while answers:
-        asked: dict[K, Q] = {}
         for key, value in answers.items():
             try:
                 asked[key] = computations[key].send(value)
             except StopIteration as stop:
+                asked.pop(key, None)
                 results[key] = stop.value
         answers = answer(asked, results) if asked else {}
     return {key: results[key] for key in computations}

@@ -8,7 +8,17 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
-from pipeline.analysis.attractors.finding.requests import LEG, Effort, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.finding.requests import (
+    _ANSWERS,
+    LEG,
+    Decide,
+    Effort,
+    Leg,
+    Polish,
+    Recur,
+    Settings,
+    Slopes,
+)
 from pipeline.results.sets import Geometry
 
 N_KEEP = 20
@@ -62,10 +72,10 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0, n_sample=32,
     n_states = point.section.shape[2]
     geometry = Geometry((False,) * n_states, (scale,) * n_states)
     settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, seen, None, "", geometry, effort=effort)
-    return drive(extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, n_sample), point)
+    return drive(extend(point, list(orbits), np.full(point.n_cells, -1), settings, budget, n_sample), point, settings)
 
 
-def drive(work, point):
+def drive(work, point, settings=None):
     """Answer the requests of a work by the map of its point; return its result."""
     n_states, answer = point.section.shape[2], None
     while True:
@@ -89,6 +99,8 @@ def drive(work, point):
         elif isinstance(asked, Slopes):
             point.rtols.append(asked.rtol)
             answer = point.step(asked.point), point.slope(asked.point)
+        elif isinstance(asked, Decide | Recur):
+            answer = _ANSWERS[type(asked)]({(): asked}, {}, settings)[()]
         else:
             assert isinstance(asked, Polish)
             answer = [None] * len(asked.guesses.key)

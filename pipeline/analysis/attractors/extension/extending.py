@@ -33,13 +33,12 @@ from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, COURSE_DIVERGED, COURSE_GROWS, FAILED, Course
 from pipeline.analysis.attractors.extension.growth import Escape
 from pipeline.analysis.attractors.finding import stability
-from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.equilibria import approaching, rest_near, rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.attractors.finding.requests import LEG, Leg, Polish, Settings, Work
-from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
+from pipeline.analysis.attractors.finding.requests import LEG, Decide, Leg, Polish, Recur, Settings, Work
+from pipeline.analysis.attractors.finding.spirals import keys_of, leap
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET, NEUTRAL, NOT_SETTLED
 from pipeline.results.intervals import lifetime_interval
 from pipeline.results.sets import Geometry
@@ -299,7 +298,7 @@ class _Extension:
         """Record the newly integrated section points of each trajectory, `n` legs of it, up to the leg in which it
         failed, reached an orbit or an equilibrium, or leaps. Finish the trajectories that are at an end.
         """
-        seen, known = self._seen(legs), self._n_known
+        seen, known = (yield from self._seen(legs)), self._n_known
         begins = n * np.arange(len(going))
         ends = seen.is_end.reshape(-1, n)
         last = begins + np.where(ends.any(axis=1), ends.argmax(axis=1), n - 1)
@@ -321,7 +320,7 @@ class _Extension:
         if self._searches(n_done):
             yield from self._search(own, block, seen.label[rows])
         if self._n_known != known:
-            seen, rows = self._seen(block), np.arange(len(own))
+            seen, rows = (yield from self._seen(block)), np.arange(len(own))
         for i, course in enumerate(own):
             self._finish(course, seen, int(rows[i]), int(block.status[i]))
 
@@ -329,9 +328,9 @@ class _Extension:
     def _n_known(self) -> tuple[int, int]:
         return len(self.orbits), len(self.point.equilibria) if self.point.can_rest else 0
 
-    def _seen(self, legs: Block) -> _Seen:
+    def _seen(self, legs: Block) -> Work[_Seen]:
         is_whole = (legs.status == Status.PERIODIC) | (legs.status == Status.BOUNDED)
-        label, _ = decide(legs, self.orbits, 10.0 * self.settings.closure, self.geometry)
+        label = yield Decide(legs, self.orbits)
         stable = np.array([*(orbit.is_stable for orbit in self.orbits), False])
         orbit, rest = np.where(stable[label], label, -1), np.full(len(label), -1)
         if self.point.can_rest:
@@ -376,8 +375,7 @@ class _Extension:
         for depth in set(depths):
             rows = [i for i, d in zip(rest, depths, strict=True) if d == depth and block.is_bounded[i]]
             if rows:
-                section = np.stack([own[i].extension[-depth:] for i in rows])
-                found = found.joined(near_closed(section, self.settings.longest, self.geometry, closing_only=True))
+                found = found.joined((yield Recur(np.stack([own[i].extension[-depth:] for i in rows]))))
         new = [i for i, key in enumerate(found.key.tolist()) if key not in self._tried]
         self._tried.update(found.key[new].tolist())
         if not new:

@@ -97,6 +97,11 @@ class Guesses:
         """Return the guesses at the given indices."""
         return Guesses(*(getattr(self, one.name)[rows] for one in fields(self)))
 
+    def of(self, owner: int) -> Guesses:
+        """Return the guesses of one parameter point, as if there were no other."""
+        own = self.take(np.flatnonzero(self.owner == owner))
+        return replace(own, key=of_owner(own.key, own.owner), owner=np.zeros_like(own.owner))
+
     def best(self, key: np.ndarray | None = None) -> Guesses:
         """Return the best guess for each key, sorted by key. By default, a guess's key is its box of section points."""
         keys = self.key if key is None else key

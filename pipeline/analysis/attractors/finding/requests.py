@@ -6,7 +6,7 @@ so that their trajectories fill the engine's lanes together.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -17,9 +17,11 @@ from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from magpend_core.status import Status
+from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.spirals import near_closed
 from pipeline.analysis.attractors.flight import Flight
 from pipeline.analysis.together import answer_together
 from pipeline.products.reporting import UNTOLD, report
@@ -69,7 +71,26 @@ class Slopes:
     rtol: float = SLOPE_RTOL
 
 
-Request = Leg | Polish | Slopes
+@dataclass(frozen=True)
+class Decide:
+    """Request to assign the rows of a block to orbits. The answer has the index of each row's orbit, -1 for none; see
+    `assigning.decide`.
+    """
+
+    block: Block
+    orbits: Sequence[Orbit]
+
+
+@dataclass(frozen=True)
+class Recur:
+    """Request to guess orbits from section points (n, k, state) that recur ever more closely. The answer has the
+    guesses; see `spirals.near_closed`.
+    """
+
+    section: np.ndarray
+
+
+Request = Leg | Polish | Slopes | Decide | Recur
 T = TypeVar("T")
 Work = Generator[Request, Any, T]
 """The analysis of a point: a generator that yields requests, receives answers and returns its result."""
@@ -169,20 +190,19 @@ def answer_all(
 
     Progress is the number of points that are decided, and of a point whose cells are extended the part of its budget
     that is spent. A point may take a thousand times longer than another, so this number does not tell the time left.
+
+    Requests of one kind are answered at a time. What costs little comes first, so that many points wait for what costs
+    much, and share it.
     """
     what = FINDING
 
     def answer(asked: dict[tuple[int, ...], Request], results: Mapping[tuple[int, ...], T]) -> dict[Any, Any]:
         nonlocal what
-        legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
-        guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
-        slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
+        legs = [one for one in asked.values() if isinstance(one, Leg)]
         what = EXTENDING if legs else what
-        spent = sum(leg.spent for leg in legs.values())
-        report(what, round(len(results) + spent, 2), len(works), UNTOLD)
-        answers: dict[Any, Any] = _legs(legs, points, settings) if legs else {}
-        answers |= _polished(guesses, points, settings) if guesses else {}
-        answers |= _slopes(slopes, points, settings) if slopes else {}
+        report(what, round(len(results) + sum(leg.spent for leg in legs), 2), len(works), UNTOLD)
+        kind = min({type(one) for one in asked.values()}, key=list(_ANSWERS).index)
+        answers = _ANSWERS[kind]({i: one for i, one in asked.items() if type(one) is kind}, points, settings)
         report(what, len(results), len(works), UNTOLD)
         return answers
 
@@ -316,3 +336,40 @@ def map_slopes(
 def _of_points(points: Sequence[Point], owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the packed parameters and the frequency of the parameter point of each trajectory."""
     return np.array([point.packed for point in points])[owner], np.array([point.frequency for point in points])[owner]
+
+
+def _decided(
+    asked: Mapping[tuple[int, ...], Decide], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], np.ndarray]:
+    blocks = [one.block for one in asked.values()]
+    sizes, names = [len(block.status) for block in blocks], ("section", "status", "orbit_period", "turns")
+    arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
+    whole = Block(slice(0, sum(sizes)), owners=np.repeat(np.arange(len(sizes)), sizes), **arrays)
+    owner = np.repeat(np.arange(len(sizes)), [len(one.orbits) for one in asked.values()])
+    orbits = [orbit for one in asked.values() for orbit in one.orbits]
+    label, _ = decide(whole, orbits, 10.0 * settings.closure, settings.geometry, owner)
+    label = np.where(label < 0, -1, label - np.searchsorted(owner, whole.owner))
+    return {index: label[own] for index, own in _slices(asked, sizes, np.cumsum(sizes))}
+
+
+def _recurring(
+    asked: Mapping[tuple[int, ...], Recur], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], Guesses]:
+    found: dict[tuple[int, ...], Guesses] = {}
+    for length in {one.section.shape[1] for one in asked.values()}:
+        own = {index: one.section for index, one in asked.items() if one.section.shape[1] == length}
+        owner = np.repeat(np.arange(len(own)), [len(section) for section in own.values()])
+        section = np.concatenate([*own.values()])
+        near = near_closed(section, settings.longest, settings.geometry, owner=owner, closing_only=True)
+        found |= {index: near.of(k) for k, index in enumerate(own)}
+    return found
+
+
+_ANSWERS: dict[type, Callable[..., dict[tuple[int, ...], Any]]] = {
+    Decide: _decided,
+    Recur: _recurring,
+    Polish: _polished,
+    Slopes: _slopes,
+    Leg: _legs,
+}
+"""Functions that answer the requests of all points, by their kind; the first kind is answered first."""

@@ -31,8 +31,8 @@ def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
             lines.append((now[0], display._work.line(now[0])))
         return dict.fromkeys(asked)
 
-    monkeypatch.setattr(requests, "_legs", legs)
-    monkeypatch.setattr(requests, "_polished", lambda asked, points, settings: dict.fromkeys(asked))
+    monkeypatch.setitem(requests._ANSWERS, Leg, legs)
+    monkeypatch.setitem(requests._ANSWERS, Polish, lambda asked, points, settings: dict.fromkeys(asked))
     with reporting(display):
         found = answer_all({(i,): point(100 if i >= 15 else 1) for i in range(20)}, {}, None)
     assert found == {(i,): 100 if i >= 15 else 1 for i in range(20)}
@@ -47,7 +47,7 @@ def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
             yield Leg(np.zeros((1, 1)), np.zeros(1), spent)
 
     told = []
-    monkeypatch.setattr(requests, "_legs", lambda asked, points, settings: dict.fromkeys(asked))
+    monkeypatch.setitem(requests._ANSWERS, Leg, lambda asked, points, settings: dict.fromkeys(asked))
     with reporting(lambda what, done, total, expected_s=0.0: told.append((done, total))):
         answer_all({(0,): work(), (1,): work()}, {}, None)
     assert list(dict.fromkeys(told)) == [(0, 2), (0.5, 2), (1.0, 2), (2, 2)]
