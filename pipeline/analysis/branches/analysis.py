@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -38,6 +38,9 @@ from pipeline.results.run import OpenRun
 from pipeline.results.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values
 from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import FREQUENCY
+
+if TYPE_CHECKING:
+    from pipeline.analysis.branches.homoclinic import Loop
 
 BEYOND = 20
 """Points of a branch beyond its stable part that are followed with ``--stable``: they show what crosses there."""
@@ -114,10 +117,23 @@ def curves(run: OpenRun, options: CurveOptions) -> xr.Dataset:
     second = axis_name(options.second)
     base = parameters_of(run.cube())
     left_out: dict[int, str] = {}
-    found = curves_from(located, base, second, bounds, options.curve_period, left_out=left_out)
+    lost: list[Loop] = []
+    found = curves_from(located, base, second, bounds, options.curve_period, left_out=left_out, lost=lost)
     lines = [f"{_place_of(located, k)}: {why}" for k, why in sorted(left_out.items()) if k >= 0]
+    lines += [_lost(loop, run.spec.rate) for loop in lost]
     ds = curves_dataset(found, axis_name(options.parameter), second, base.model)
     return ds.assign_attrs(left_out="\n".join([*lines, *not_followed(ds, run.spec.rate)]))
+
+
+def _lost(loop: Loop, word: str) -> str:
+    """Say that the search of a homoclinic orbit ended without one."""
+    from pipeline.analysis.branches.homoclinic import HomoclinicSettings
+
+    place = ", ".join(place_in_words(n, word, x) for n, x in zip(loop.family.free, loop.values, strict=True))
+    most = HomoclinicSettings.to_start
+    return (
+        f"homoclinic orbits, near {place}: none found within {most} evaluations of their equations, which is the limit"
+    )
 
 
 def _place_of(ds: xr.Dataset, k: int) -> str:

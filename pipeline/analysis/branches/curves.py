@@ -45,11 +45,12 @@ from pipeline.analysis.branches.equilibrium_curves import (
 )
 from pipeline.analysis.branches.exploring import cycle_direction, cycle_family
 from pipeline.analysis.branches.following import end_of_crossings, has_halved, opposite
+from pipeline.analysis.branches.homoclinic import Loop
 from pipeline.analysis.branches.homoclinic_curves import (
     HETEROCLINIC,
     Bounds,
     homoclinic_curves,
-    loop_near,
+    loops_beside,
     loops_of,
     saddle_nodes_of,
     saddle_quantity,
@@ -75,7 +76,7 @@ LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 
 CURVE_ENDS = (
     *("bound", "closed", "resonance", "max_points", "stuck", "period_halving"),
-    *(BT, "equilibrium", "tangent", NONCENTRAL, HETEROCLINIC),
+    *(BT, "equilibrium", "tangent", NONCENTRAL, HETEROCLINIC, "budget"),
 )
 
 
@@ -138,6 +139,7 @@ def curves_from(
     max_period: int,
     generations: int = 3,
     left_out: dict[int, str] | None = None,
+    lost: list[Loop] | None = None,
 ) -> list[Curve]:
     """Continue the bifurcations located on branches as curves in the plane of the branches' parameter and a second one.
 
@@ -157,14 +159,14 @@ def curves_from(
         Number of generations of curves that spring from points of codimension two.
     left_out
         Gets the number of each located point that has no curve, with the reason.
+    lost
+        Gets the approximate homoclinic orbits that Newton's method did not refine.
 
     Returns
     -------
     list of Curve
         Curves in the order of the located points they start from, none twice; then those of homoclinic orbits.
     """
-    # from a Bogdanov-Takens point at which the curve of homoclinic orbits that springs from it begins [scaled]
-    distances = (0.2, 0.02)
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     left_out = {} if left_out is None else left_out
     starts = _starts(branches, parameters, second, bounds, longest, left_out)
@@ -172,11 +174,11 @@ def curves_from(
     starts += [(-1, family, FOLD, EquilibriumCurve(family, FOLD).start(u)) for family, u in nodes]
     found = continue_curves(starts, bounds, CURVE, longest, generations, left_out)
     takens = [p for p in merged({i: c.special for i, c in enumerate(found)}) if p.kind == BT]
-    beside = [loop_near(point, away) for point in takens for away in distances]
-    loops = loops_of(branches, parameters, second, bounds, longest) + [loop for loop in beside if loop is not None]
+    beside = [loop for point in takens for loop in loops_beside(point)]
+    loops = loops_of(branches, parameters, second, bounds, longest) + beside
     return found + [
         Curve(c.family, HOMOCLINIC, c.points, c.ends, -1, c.special, c.n_missed)
-        for c in homoclinic_curves(loops, bounds)
+        for c in homoclinic_curves(loops, bounds, lost=lost)
     ]
 
 

@@ -17,10 +17,10 @@ replaced by their tangents within r, which moves the curve by the order of r**2 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm, schur
+from scipy.linalg import expm, lu_factor, lu_solve, schur
 from scipy.optimize import brentq
 
 from magpend_core.engine.system import System
@@ -29,10 +29,11 @@ from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
-from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
+from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Rows, Value
-from pipeline.analysis.branches.steep_orbits import flown
+from pipeline.analysis.branches.steep_orbits import after, flown
 from pipeline.results.tolerances import BRANCH_RTOL
 
 
@@ -52,6 +53,7 @@ class HomoclinicSettings(Settings):
     # distance r from the saddle at which its manifolds are replaced by their tangents, in units of the orbit's size;
     # less errs less, and makes longer orbits
     radius: float = 1e-5
+    least_radius: float = 1e-6  # in scaled states; within less, rounding of the states shows
     stretch: float = 1.0  # logarithm of the growth on one segment of the orbit; less converges further, and costs more
     least_segments: int = 12
     most_segments: int = 120
@@ -61,6 +63,9 @@ class HomoclinicSettings(Settings):
     cuts: tuple[float, ...] = (3.0, 10.0, 30.0)
     damped: int = 30  # most damped Newton steps from a rough guess, and the residual at which they end
     near: float = 1e-4
+    # most evaluations of the equations to find the first orbit of a curve, and to follow the curve in one direction
+    to_start: int = 200
+    to_follow: int = 1000
 
 
 TIME_UNIT = 0.1
@@ -76,6 +81,7 @@ class Loop:
     states: np.ndarray  # (m, n_states), angles not wrapped
     saddle: np.ndarray  # (n_states,)
     values: np.ndarray  # (2,): the free parameters
+    takens: SpecialPoint | None = None  # Bogdanov-Takens point from which it is predicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,22 +166,22 @@ class HomoclinicProblem:
     def _joins(self, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
         """Return the gaps between the segments of the orbit, and their derivatives."""
         m, n, scales = self.n_segments, self.system.n_states, np.asarray(self.system.scales)
-        shifts = self._step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        unknowns = [np.column_stack([parts.nodes[:-1], np.tile(parts.values + s, (m, 1))]) for s in shifts]
-        rows = self.family.rows(np.concatenate(unknowns))
-        images, tangents = flown(self.family, rows, np.full(5 * m, parts.seconds / m), self.atol)
-        images = (images / scales).reshape(5, m, n)
+        shifts = self._step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        own, *beside = [np.column_stack([parts.nodes[:-1], np.tile(parts.values + s, (m, 1))]) for s in (0.0, *shifts)]
+        seconds = np.full(5 * m, parts.seconds / m)
+        ends, tangents = flown(self.family, self.family.rows(own), seconds[:m], self.atol)
+        others = after(self.system, self.family.rows(np.concatenate(beside)), seconds[m:], self.atol)
+        image, images = ends / scales, (others / scales).reshape(4, m, n)
         here = self.family.rows(np.append(parts.nodes[0], parts.values)[None]).parameters[0]
-        speeds = rates_at(self.system, images[0] * scales, here) / scales
+        speeds = rates_at(self.system, ends, here) / scales
         by = np.zeros((m, n, self.size))
         for k in range(m):
-            own = slice(n * k, n * (k + 1))
-            by[k, :, own] = self.family.scaled(tangents[k]) / self._weight
+            by[k, :, n * k : n * (k + 1)] = self.family.scaled(tangents[k]) / self._weight
             by[k, :, n * (k + 1) : n * (k + 2)] = -np.eye(n) / self._weight
         by[:, :, -3] = speeds * (parts.seconds / m / TIME_UNIT)
-        by[:, :, -2] = (images[1] - images[2]) / (2.0 * self._step)
-        by[:, :, -1] = (images[3] - images[4]) / (2.0 * self._step)
-        gaps = (images[0] - parts.nodes[1:]).ravel()
+        by[:, :, -2] = (images[0] - images[1]) / (2.0 * self._step)
+        by[:, :, -1] = (images[2] - images[3]) / (2.0 * self._step)
+        gaps = (image - parts.nodes[1:]).ravel()
         return gaps / self.extent, by.reshape(m * n, -1) / self.extent
 
     def _at_ends(self, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
@@ -278,8 +284,7 @@ def homoclinic_point(
         near = yield from _damped(problem, u, normal, settings)
         found = yield from correct(problem, near, normal, settings)
         if found is not None:
-            tangent = kernel_of(found.value)
-            return problem, replace(found, tangent=tangent * (1.0 if tangent[-1] >= 0.0 else -1.0))
+            return problem, found
     return None
 
 
@@ -295,12 +300,15 @@ def _damped(
     for _ in range(settings.damped):
         if not value.is_finite or np.linalg.norm(value.residual) < settings.near:
             break
-        inverse = np.linalg.pinv(np.vstack([value.derivative, normal]))
-        step = -inverse[:, :-1] @ value.residual
+        factors = lu_factor(np.vstack([value.derivative, normal]), check_finite=False)
+        step = -lu_solve(factors, np.append(value.residual, 0.0))
+        if not np.isfinite(step).all():
+            break
         step *= min(1.0, TIME_UNIT / max(abs(float(step[-3])), 1e-300))  # T by a factor of e at most
         for share in 0.5 ** np.arange(8):
             there = yield Query(problem, u + share * step)
-            if np.linalg.norm(inverse[:, :-1] @ there.residual) < (1.0 - 0.3 * share) * np.linalg.norm(step):
+            ahead = lu_solve(factors, np.append(there.residual, 0.0), check_finite=False)
+            if np.linalg.norm(ahead) < (1.0 - 0.3 * share) * np.linalg.norm(step):
                 break
         else:
             break
@@ -325,7 +333,7 @@ def lay_nodes(loop: Loop, cut: float, settings: HomoclinicSettings) -> tuple[Hom
     away = wrap_angles(loop.states - rest.states[0], family.system) / scales
     distance = np.linalg.norm(away, axis=1)
     extent = float(distance.max())
-    radius = settings.radius * extent
+    radius = max(settings.radius * extent, settings.least_radius)
     outside = np.flatnonzero(distance > max(cut * distance[[0, -1]].max(), radius))
     if not len(outside):
         return None

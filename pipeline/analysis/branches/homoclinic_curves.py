@@ -31,7 +31,7 @@ from magpend_core.orbits import wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
-from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of, trace
+from pipeline.analysis.branches.arclength import Point, Settings, correct, trace
 from pipeline.analysis.branches.bifurcations import find_root
 from pipeline.analysis.branches.center_manifold import Rest
 from pipeline.analysis.branches.codimension_two import BT, NEUTRAL, NONCENTRAL, SpecialPoint
@@ -46,7 +46,7 @@ from pipeline.analysis.branches.homoclinic import (
     loop_of,
 )
 from pipeline.analysis.branches.kinds import HOMOCLINIC, SNIC
-from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.lockstep import Steps, run_together, within
 from pipeline.analysis.branches.problems import Family
 from pipeline.results.tabular import words_of
 from pipeline.results.tolerances import BRANCH_RTOL
@@ -82,18 +82,41 @@ class Arm:
 
 
 def follow_homoclinic(
-    problem: HomoclinicProblem, start: Point, bounds: Bounds, settings: HomoclinicSettings = HomoclinicSettings()
+    problem: HomoclinicProblem,
+    start: Point,
+    bounds: Bounds,
+    settings: HomoclinicSettings = HomoclinicSettings(),
+    takens: SpecialPoint | None = None,
 ) -> Steps[Arm]:
     """Follow homoclinic orbits in the plane of two parameters in the direction of the tangent of a start.
 
-    Points of the arm have the saddle as their state. Its end is ``bound``, ``closed``, ``max_points``, ``stuck``,
-    ``bogdanov_takens`` and ``saddle_node_homoclinic`` where leading eigenvalues vanish, or ``heteroclinic`` where the
-    orbit comes near another saddle. Neutral saddles and these ends are among its special points.
+    Points of the arm have the saddle as their state. Its end is ``bound``, ``closed``, ``max_points``, ``budget``,
+    ``stuck``, ``bogdanov_takens`` and ``saddle_node_homoclinic`` where leading eigenvalues vanish, or ``heteroclinic``
+    where the orbit comes near another saddle. Neutral saddles and these ends are among its special points. `takens` is
+    the Bogdanov-Takens point from which the start was predicted.
     """
     arm = Arm([as_rest(problem, start)])
-    here, step = start, settings.first_step
+    if (yield from within(settings.to_follow, _along(arm, problem, start, bounds, settings, takens))) is None:
+        arm.end = "budget"
+    if arm.end == BT and takens is not None and _nears(takens, arm.points):
+        _end_at(takens, problem.family, arm)
+    elif arm.end in (BT, NONCENTRAL):
+        _carry_on(problem.family, arm)
+    return arm
+
+
+def _along(
+    arm: Arm,
+    problem: HomoclinicProblem,
+    here: Point,
+    bounds: Bounds,
+    settings: HomoclinicSettings,
+    takens: SpecialPoint | None,
+) -> Steps[Arm]:
+    """Add points to one arm of a curve of homoclinic orbits until it ends."""
+    step = settings.first_step
     while not arm.end:
-        watch = _Watch(problem, settings, bounds, arm)
+        watch = _Watch(problem, settings, bounds, arm, takens)
         size = np.full(problem.size, max(1.0, problem.extent))
         size[-3:] = 1.0  # time and parameters
         rest = replace(settings, first_step=step, max_points=settings.at_once, size=size)
@@ -109,8 +132,6 @@ def follow_homoclinic(
             arm.end = "stuck"
         else:
             problem, here = laid
-    if arm.end in (BT, NONCENTRAL):
-        _carry_on(problem.family, arm)
     return arm
 
 
@@ -127,10 +148,7 @@ def _laid_anew(
     normal[-n - 3 :] = here.tangent[-n - 3 :]
     normal /= np.linalg.norm(normal)
     found = yield from correct(fresh, u, normal, settings)
-    if found is None:
-        return None
-    tangent = kernel_of(found.value)
-    return fresh, replace(found, tangent=tangent * (1.0 if tangent @ normal >= 0.0 else -1.0))
+    return None if found is None else (fresh, found)
 
 
 @dataclass(eq=False)
@@ -141,12 +159,15 @@ class _Watch:
     settings: Settings
     bounds: Bounds
     arm: Arm
+    takens: SpecialPoint | None
 
     def stop(self, points: list[Point]) -> str:
         here = as_rest(self.problem, points[-1])
         if not self._is_inside(here):
             return "bound"
         self.arm.points.append(here)
+        if self.takens is not None and _nears(self.takens, self.arm.points):
+            return BT
         return vanished(self.arm.points) or ("closed" if _is_closed(self.arm.points) else "")
 
     def _is_inside(self, rest: Point) -> bool:
@@ -231,14 +252,29 @@ def meets_another(loop: Loop) -> bool:
     return bool((found.converged & (gaps < meets * away.max())).any())
 
 
+def _nears(takens: SpecialPoint, points: Sequence[Point]) -> bool:
+    """Return whether a curve has come near to the Bogdanov-Takens point from which its first point was predicted."""
+    nears = 0.1  # distance from it, in units of that of the first point
+    first, last = (float(np.linalg.norm(points[k].u[-2:] - takens.point.u[-2:])) for k in (0, -1))
+    return last < nears * first
+
+
+def _end_at(takens: SpecialPoint, family: Family, arm: Arm) -> None:
+    """End a curve at the Bogdanov-Takens point from which it was predicted."""
+    u = np.concatenate([takens.point.u[: family.system.n_states], takens.point.u[-2:]])
+    end = replace(takens.point, u=u, tangent=arm.points[-1].tangent)
+    arm.points.append(end)
+    arm.special.append(SpecialPoint(BT, family, end, takens.bracket))
+
+
 def _carry_on(family: Family, arm: Arm) -> None:
     """Carry a curve on to where leading eigenvalues vanish, by polynomials of them through its last points."""
     # range of the vanishing eigenvalue, as a factor, over which both parameters are fitted, and the number of points
     reach, fitted = 6.0, 7
     rates = np.array([_leading(one) for one in arm.points])
     size = rates.mean(axis=1) if arm.end == BT else rates[:, rates[-1].argmin()]
-    wanted = size[-1] * np.geomspace(1.0, reach, fitted)
-    chosen = np.unique([int(np.abs(size - one).argmin()) for one in wanted])[::-1]
+    wanted, falls = size[-1] * np.geomspace(1.0, reach, fitted), int(size.argmax())  # it may have vanished before, too
+    chosen = np.unique([falls + int(np.abs(size[falls:] - one).argmin()) for one in wanted])[::-1]
     x, u = size[chosen], np.array([arm.points[k].u for k in chosen])
     last = _at_zero(x, u)
     away = np.array([_at_zero(x[:-1], u[:-1]), _at_zero(x[1:], u[1:])]) - last
@@ -331,26 +367,37 @@ def _cycle(
 
 
 def homoclinic_curves(
-    loops: Sequence[Loop], bounds: Bounds, settings: HomoclinicSettings = HomoclinicSettings()
+    loops: Sequence[Loop],
+    bounds: Bounds,
+    settings: HomoclinicSettings = HomoclinicSettings(),
+    lost: list[Loop] | None = None,
 ) -> list[HomoclinicCurve]:
     """Follow homoclinic orbits in both directions in the plane of two parameters, no curve twice.
 
-    Loops are approximate orbits, such as those of `loops_of`, or predictions from Bogdanov-Takens points. Curves whose
-    first orbit could not be refined are left out.
+    Loops are approximate orbits, such as those of `loops_of`, or predictions from Bogdanov-Takens points. Those that
+    could not be refined are left out; `lost` gets them, unless another prediction from the same point could be.
     """
-    firsts = run_together([homoclinic_point(loop, settings) for loop in loops])
+    what = "following homoclinic orbits"
+    firsts = run_together([within(settings.to_start, homoclinic_point(loop, settings)) for loop in loops], what)
     found: list[HomoclinicCurve] = []
-    for loop, first in zip(loops, firsts, strict=True):
+    for k, (loop, first) in enumerate(zip(loops, firsts, strict=True)):
         if first is None or any(_passes(curve, *first) for curve in found):
             continue
         problem, start = first
-        ways = [follow_homoclinic(problem, way, bounds, settings) for way in (opposite(start), start)]
-        back, ahead = run_together(ways, "following homoclinic orbits")
+        ways = [follow_homoclinic(problem, way, bounds, settings, loop.takens) for way in (opposite(start), start)]
+        back, ahead = run_together(ways, f"{what}, curve {k + 1} of {len(loops)}")
         if back.end == "closed":
             ahead = Arm([back.points[0]], end="closed")
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
         ends, special, n_missed = (back.end, ahead.end), back.special + ahead.special, back.n_missed + ahead.n_missed
         found.append(HomoclinicCurve(loop.family, points, ends, special, n_missed, _middle(problem, start)))
+    if lost is not None:
+        known = [loop.takens for loop, first in zip(loops, firsts, strict=True) if first is not None and loop.takens]
+        lost += [
+            loop
+            for loop, first in zip(loops, firsts, strict=True)
+            if first is None and not any(loop.takens is one for one in known)
+        ]
     return found
 
 
@@ -377,6 +424,21 @@ def _passes(curve: HomoclinicCurve, problem: HomoclinicProblem, first: Point) ->
 # ---- starts at Bogdanov-Takens points ----------------------------------------------------------
 
 
+def loops_beside(takens: SpecialPoint) -> list[Loop]:
+    """Predict the homoclinic orbit at two distances from a Bogdanov-Takens point at which the prediction is good."""
+    farthest, nearest, closer = 0.2, 1e-4, 0.25  # distances that are tried, and the second one in units of the first
+    # largest strain of a loop that counts as near to that of the leading order, and the strain that is aimed at
+    good, aim = 0.3, 0.2
+    away, found = farthest, list[Loop]()
+    while away > nearest and len(found) < 2:
+        pair = _pair_beside(takens, away)
+        if pair is not None and pair.strain <= good:
+            found.append(pair.loop(takens))
+        # the strain grows with the root of the distance
+        away *= closer if pair is None or found else min(0.5, (aim / pair.strain) ** 2)
+    return found
+
+
 def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
     """Predict the homoclinic orbit at a small distance from a Bogdanov-Takens point.
 
@@ -384,6 +446,14 @@ def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
     x_s, with 4 k**2 = -l_u l_s. The damping, which is linear in x, does no work on it where a seventh of the trace of
     the critical eigenvalues at x_s and six sevenths of that at x_f add up to 0 (Melnikov's integral). None if no
     direction in the plane of the parameters fulfils the condition. Distances are in units of the parameters' scales.
+    """
+    pair = _pair_beside(takens, away)
+    return None if pair is None else pair.loop(takens)
+
+
+def _pair_beside(takens: SpecialPoint, away: float) -> _Pair | None:
+    """Find the saddle and the focus at a distance from a Bogdanov-Takens point on whose loop the damping does no
+    work.
     """
     angles, narrowest = 36, 1e-6  # directions that are tried, and the width to which they are narrowed [rad]
     known = [(angle, _pair_at(takens, away, angle)) for angle in np.linspace(0.0, 2.0 * np.pi, angles + 1)]
@@ -400,7 +470,7 @@ def loop_near(takens: SpecialPoint, away: float) -> Loop | None:
             else:
                 inner, pair = middle, found
         if beyond is not None:
-            return pair.loop(takens.family)
+            return pair
     return None
 
 
@@ -415,17 +485,30 @@ class _Pair:
     work: float  # of the damping on the loop about the focus, to leading order [1/s]
     values: np.ndarray  # (2,): scaled parameters
 
-    def loop(self, family: Family) -> Loop:
+    @property
+    def rate(self) -> float:
+        """Rate k of the loop of the leading order [1/s]."""
+        unstable, stable = (one.real for one in leading_of(np.linalg.eigvals(self.jacobian)))
+        return 0.5 * float(np.sqrt(-unstable * stable))
+
+    @property
+    def strain(self) -> float:
+        """Size of the damping at the saddle, over the loop's rate: 0 where the leading order is exact."""
+        return 0.5 * abs(sum(one.real for one in leading_of(np.linalg.eigvals(self.jacobian)))) / self.rate
+
+    def loop(self, takens: SpecialPoint) -> Loop:
         """Return the loop of the leading order about the focus."""
+        family = takens.family
         half, samples = 6.0, 2000  # length of the loop, in units of its time 1/k, and its instants
-        rates = leading_of(np.linalg.eigvals(self.jacobian))
-        k = 0.5 * float(np.sqrt(rates[0].real * -rates[1].real))
+        k = self.rate
         along = self.focus - self.saddle
         t = np.linspace(-half / k, half / k, samples)
         bow = 1.5 / np.cosh(k * t) ** 2
         states = self.saddle + bow[:, None] * along + (-2.0 * k * np.tanh(k * t) * bow)[:, None] * self.across
         scales = np.asarray(family.system.scales)
-        return Loop(family, t - t[0], states * scales, self.saddle * scales, self.values * np.asarray(family.scales))
+        return Loop(
+            family, t - t[0], states * scales, self.saddle * scales, self.values * np.asarray(family.scales), takens
+        )
 
 
 def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
@@ -441,11 +524,13 @@ def _pair_at(takens: SpecialPoint, away: float, angle: float) -> _Pair | None:
     rate = rates_at(system, (at * scales)[None], packed)[0] / scales
     slope = family.scaled(jacobian_at(system, (at * scales)[None], packed)[0]) @ q
     # along q, with p the left null vector, the rates are to leading order p.f + p.A q s + p.B(q, q) s**2 / 2
-    constant, linear, square = np.abs(left[:, -1] @ np.column_stack([rate, slope, 0.5 * bend])).tolist()
-    is_mirrored = square <= SINGULAR * float(np.linalg.norm(bend))  # as at a pitchfork, the cubic term decides
-    reach = np.sqrt(away) if is_mirrored else max(np.sqrt(constant / square), linear / square)
+    constant, linear, square = (left[:, -1] @ np.column_stack([rate, slope, 0.5 * bend])).tolist()
+    is_mirrored = abs(square) <= SINGULAR * float(np.linalg.norm(bend))  # as at a pitchfork, the cubic term decides
+    roots = np.array([0.0]) if is_mirrored else np.roots([square, linear, constant]).real
+    reach = np.sqrt(away) if is_mirrored else max(np.sqrt(abs(constant / square)), abs(linear / square))
+    guesses = np.concatenate([reach * np.array([-1.0, -0.3, 0.3, 1.0]), roots])
     with np.errstate(all="ignore"):
-        found = find_equilibria(system, (at + reach * np.outer([-1.0, -0.3, 0.3, 1.0], q)) * scales, packed)
+        found = find_equilibria(system, (at + np.outer(guesses, q)) * scales, packed, max_iterations=20)
     good = found.converged & (np.abs(found.states / scales - at).max(axis=1) < 4.0 * reach)
     ends: dict[bool, tuple[np.ndarray, np.ndarray, float]] = {}
     for state, jacobian in zip(found.states[good] / scales, found.jacobians[good], strict=True):

@@ -52,7 +52,8 @@ NAMES = {
 CURVE_WHY = {
     "closed": "closed",
     "resonance": "the multipliers become real",
-    "max_points": "too many points",
+    "max_points": "as many points as a curve may have: a run at other values of the second parameter shows more",
+    "budget": "as many evaluations as a curve may take: a run at other values of the second parameter shows more",
     "stuck": "Newton's method finds no next point",
     "period_halving": "an orbit of half the period",
     "equilibrium": "the cycles shrink to an equilibrium",

@@ -55,6 +55,18 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
     return list(found.values())
 
 
+def within(most: int, computation: Steps[T]) -> Steps[T | None]:
+    """Run a computation until its end, or until it has asked for as many values as it may: then return None."""
+    try:
+        query = next(computation)
+        for _ in range(most):
+            query = computation.send((yield query))
+    except StopIteration as end:
+        return end.value  # type: ignore[no-any-return]
+    computation.close()
+    return None
+
+
 def run_alone(computation: Steps[T]) -> T:
     """Run one computation and return its result."""
     return run_together([computation])[0]

@@ -65,23 +65,27 @@ def flown(family: Family, rows: Rows, seconds: np.ndarray, atol: float) -> tuple
     """Return states after a time each, shape (m, n_states), and their derivatives by the start, (m, n_states,
     n_states).
     """
-    states = rows.states
     n, sizes = family.system.n_states, np.asarray(family.system.sizes)
     system = replace(with_tangents(family.system, n), n_controlled=None)
-    starts = np.concatenate([states, np.tile(np.diag(sizes).ravel(), (len(states), 1))], axis=1)
+    tangents = np.tile(np.diag(sizes).ravel(), (len(rows.states), 1))
+    found = after(system, replace(rows, states=np.concatenate([rows.states, tangents], axis=1)), seconds, atol)
+    return found[:, :n], found[:, n:].reshape(-1, n, n).transpose(0, 2, 1) / sizes
+
+
+def after(system: System, rows: Rows, seconds: np.ndarray, atol: float) -> np.ndarray:
+    """Return states after a time each, shape (m, n_states)."""
     times, which = np.unique(seconds, return_inverse=True)
     found = sample(
         system,
         rows.parameters,
-        starts,
+        rows.states,
         [np.array([time]) for time in times],
         piece=which,
         drives=[Drive(np.array([time])) for time in times],
         rtol=BRANCH_RTOL,
         atol=atol,
     )
-    ends = found.states[:, 0]
-    return ends[:, :n], ends[:, n:].reshape(-1, n, n).transpose(0, 2, 1) / sizes
+    return np.asarray(found.states[:, 0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
