@@ -206,8 +206,9 @@ def continue_curves(
     left_out |= {s[0]: LOST for s, f in zip(starts, firsts, strict=True) if f is None}
     curves: list[Curve] = []
     seen: list[SpecialPoint] = []
-    for _ in range(1 + generations):
-        _follow_all(ready, curves, bounds, settings, left_out)
+    for generation in range(1 + generations):
+        what = f"following curves{f' that spring from others, round {generation}' if generation else ''}"
+        _follow_all(ready, curves, bounds, settings, left_out, what)
         points = merged({i: curve.special for i, curve in enumerate(curves)})
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
@@ -231,13 +232,11 @@ Ready = tuple[int, CurveProblem, Point]
 
 
 def _follow_all(
-    ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings, left_out: dict[int, str]
+    ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings, left_out: dict[int, str], what: str
 ) -> None:
     """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
     ready = [r for r in ready if not any(_passes(curve, r[1], r[2]) for curve in curves)]
-    traces = run_together(
-        [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
-    )
+    traces = run_together([_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], what)
     for i, (number, problem, first) in enumerate(ready):
         (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
@@ -386,7 +385,7 @@ def _follow(
             return "resonance"
         if problem.kind == HOPF and not np.isfinite(here.value.seconds):
             return BT
-        if not _persists(problem, here):
+        if not _persists(problem, here) or crawls(points):
             return "stuck"
         if has_halved(problem.family, points):
             return "period_halving"
@@ -412,6 +411,15 @@ def _follow(
     if found.end in ("resonance", BT):
         found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
+
+
+def crawls(points: Sequence[Point]) -> bool:
+    """Return whether the last steps of a curve led nowhere: Newton's method converges from no other point.
+
+    So it is near canards, where the cycles change by as much as they are large within differences of the parameters.
+    """
+    many, nowhere = 20, 1e-4  # number of steps, and the distance that they cover [arclength]
+    return len(points) > many and bool(np.linalg.norm(points[-1].u - points[-1 - many].u) < nowhere)
 
 
 def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:

@@ -210,7 +210,7 @@ BRANCHES = Analysis(
     settle=f"{_ROOM}:settle_branches",
     builds_on=("attractors",),
     figure="branches",
-    version=12,
+    version=13,
 )
 
 COEFFICIENTS = {
@@ -263,7 +263,7 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
-    version=6,
+    version=7,
 )
 
 BAND_COLUMNS: Columns = (

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -327,39 +326,39 @@ def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:
     return np.asarray(wrap_angles(difference * scales, family.system) / scales)
 
 
-def fold_test(monodromy: np.ndarray) -> float:
+def fold_test(monodromy: np.ndarray) -> Any:
     """Compute det(M - 1) of the monodromy matrix M, which is zero where a multiplier is +1 (fold)."""
-    return float(np.linalg.det(monodromy - np.eye(len(monodromy))))
+    return np.linalg.det(monodromy - np.eye(monodromy.shape[-1]))
 
 
-def doubling_test(monodromy: np.ndarray) -> float:
+def doubling_test(monodromy: np.ndarray) -> Any:
     """Compute det(M + 1) of the monodromy matrix M, which changes sign where a real multiplier passes -1 (period
     doubling).
     """
-    return float(np.linalg.det(monodromy + np.eye(len(monodromy))))
+    return np.linalg.det(monodromy + np.eye(monodromy.shape[-1]))
 
 
-def torus_test(monodromy: np.ndarray) -> float:
+def torus_test(monodromy: np.ndarray) -> Any:
     """Compute the test function of `torus_product` from the monodromy matrix M."""
     return torus_product(np.linalg.eigvals(monodromy))
 
 
-def torus_product(multipliers: np.ndarray) -> float:
+def torus_product(multipliers: np.ndarray) -> Any:
     """Compute the product of ``mu_i * mu_j - 1`` over all pairs of multipliers; it is zero at a torus bifurcation.
 
     The determinant of the bialternate product of M with itself, minus 1 (Kuznetsov, Elements of Applied
     Bifurcation Theory, 3rd ed., 2004, Sect. 10.2.2).
     """
-    pairs = [multipliers[i] * multipliers[j] - 1.0 for i, j in combinations(range(len(multipliers)), 2)]
-    return float(np.prod(pairs).real)
+    i, j = np.triu_indices(multipliers.shape[-1], 1)
+    return np.prod(multipliers[..., i] * multipliers[..., j] - 1.0, axis=-1).real
 
 
-TESTS: dict[str, Callable[[np.ndarray], float]] = {
+TESTS: dict[str, Callable[[np.ndarray], Any]] = {
     "fold": fold_test,
     "period_doubling": doubling_test,
     "neimark_sacker": torus_test,
 }
-"""Functions of the monodromy matrix that vanish at a bifurcation, by its name."""
+"""Functions of the monodromy matrix, or of a stack of them, that vanish at a bifurcation, by its name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,8 +388,8 @@ class BifurcationProblem(FamilyProblem):
         derivatives.
         """
         n, size = self.family.system.n_states, self.size
-        test = TESTS[self.kind]
-        tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])
+        tests, finite = np.full(len(ends.monodromy), np.nan), np.isfinite(ends.monodromy).all(axis=(1, 2))
+        tests[finite] = TESTS[self.kind](ends.monodromy[finite])
         mismatch = np.array([self.family.mismatch(u, image) for image in ends.images[:, -1]])
         up, down = slice(1 + n, 1 + size), slice(1 + size + n, None)
         slopes = np.array([_wrapped(a - b, self.family) for a, b in zip(mismatch[up], mismatch[down], strict=True)])

@@ -12,7 +12,8 @@ from pipeline.analysis.branches.analysis import _no_equilibria, curves_table
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.completeness import cut_words
-from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
+from pipeline.analysis.branches.curves import Curve, crawls, curves_dataset, not_followed
+from pipeline.analysis.branches.lockstep import within
 from pipeline.analysis.branches.problems import Family, Value
 from pipeline.layout.vocabulary import model_attribute, section_attributes
 
@@ -54,3 +55,40 @@ def test_not_followed():
         "chenciner at p = 1, q = 1: not followed from there: folds of tori",
     ]
     assert any("ends: Newton's method finds no next point" in line for line in curves_table(ds).lines)
+    for end in ("max_points", "budget"):
+        ds = curves_dataset([Curve(family, "neimark_sacker", points, ("bound", end), 0, [])], "p", "q")
+        assert any(
+            "a run at other values of the second parameter shows more" in line for line in curves_table(ds).lines
+        )
+
+
+def test_crawls():
+    """Steps of 1e-7 lead nowhere; those that grow again do."""
+
+    def points(steps):
+        return [SimpleNamespace(u=np.array([x, 0.0])) for x in np.cumsum(steps)]
+
+    assert crawls(points([0.01] * 5 + [1e-7] * 25))
+    assert not crawls(points([0.01] * 5 + [1e-7] * 15))
+    assert not crawls(points(1e-7 * 1.5 ** np.arange(30)))
+
+
+def test_within():
+    """A computation ends with its result, or with None after as many queries as it may ask."""
+
+    def asks(n):
+        for k in range(n):
+            assert (yield k) == -k
+        return "all"
+
+    def run(computation):
+        try:
+            query = next(computation)
+            while True:
+                query = computation.send(-query)
+        except StopIteration as end:
+            return end.value
+
+    assert run(within(5, asks(5))) == "all"
+    assert run(within(4, asks(5))) is None
+    assert run(within(0, asks(0))) == "all"

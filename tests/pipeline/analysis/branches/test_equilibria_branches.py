@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import fsolve
+from scipy.optimize import brentq, fsolve
 
 from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
@@ -54,6 +54,37 @@ def test_equilibria__folds_of_a_cubic():
     unstable = [p.value.monodromy[0, 0] > 0.0 for p in branch.points]
     assert unstable == (np.abs(states) < 1.0).tolist()
     assert branch.ends == ("bound", "bound")
+
+
+def test_equilibria__without_the_engine(monkeypatch):
+    """Predator and prey, whose states reach 100: two folds within few evaluations, all of them in numpy."""
+    rates = {"x": "x - x*z/(1 + p*x) - x^2/100", "z": "-z + x*z/(1 + p*x) - 3*z^2/10"}
+    model, counted = model_of(rates, {"p": 0.3}), []
+    monkeypatch.setattr("pipeline.analysis.branches.lockstep.section_map", None)
+    value = EquilibriumProblem.value
+    monkeypatch.setattr(EquilibriumProblem, "value", lambda *a: counted.append(1) or value(*a))
+
+    def nullclines(x, p):
+        z = (1.0 - x / 100.0) * (1.0 + p * x)
+        return -1.0 + x / (1.0 + p * x) - 0.3 * z, z
+
+    roots = [brentq(lambda x: nullclines(x, 0.3)[0], *ends) for ends in ((1.0, 10.0), (10.0, 40.0), (50.0, 80.0))]
+    (branch,), _ = branches_of(model, "p", (0.05, 0.55), [roots[2], nullclines(roots[2], 0.3)[1]], 0.3)
+    assert [b.kind for b in branch.bifurcations] == ["fold", "fold"]
+    assert branch.ends == ("bound", "bound")
+    assert len(counted) < 1200
+    states = np.array([branch.family.state(p.u)[0] for p in branch.points])
+    crossed = np.flatnonzero(np.diff(np.sign(branch.values - 0.3)))
+    for root in roots:
+        assert min(abs(states[k : k + 2].mean() - root) - np.ptp(states[k : k + 2]) for k in crossed) < 0.0
+
+
+def test_equilibria__two_hopf_points_within_a_step():
+    """Growth (p - .503)^2 - 1e-4: Hopf points at .493 and .513, nearer than the longest step."""
+    model = model_of({"x": "g*x - y", "y": "x + g*y"}, {"p": 0.0}, define={"g": "(p - 503/1000)^2 - 1/10000"})
+    (branch,), _ = branches_of(model, "p", (0.0, 1.0), [0.0, 0.0], 0.1)
+    found = [branch.family.values(b.point.u)[0] for b in branch.bifurcations]
+    np.testing.assert_allclose(found, [0.493, 0.513], atol=1e-7)
 
 
 @pytest.mark.slow
