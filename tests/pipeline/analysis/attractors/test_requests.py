@@ -51,3 +51,26 @@ def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
     with reporting(lambda what, done, total, expected_s=0.0: told.append((done, total))):
         answer_all({(0,): work(), (1,): work()}, {}, None)
     assert list(dict.fromkeys(told)) == [(0, 2), (0.5, 2), (1.0, 2), (2, 2)]
+
+
+def test_answer_all__integrates_once_for_all_points_that_wait_for_it(monkeypatch):
+    """One point asks for an orbit twice before its leg, one for none, one ends: two calls of the engine."""
+
+    def work(n_polish, n_legs):
+        for _ in range(n_polish):
+            yield Polish(None)
+        for _ in range(n_legs):
+            yield Leg(np.zeros((1, 1)), np.zeros(1))
+        return n_polish
+
+    called = []
+
+    def legs(asked, points, settings):
+        called.append(sorted(asked))
+        return dict.fromkeys(asked)
+
+    monkeypatch.setitem(requests._ANSWERS, Leg, legs)
+    monkeypatch.setitem(requests._ANSWERS, Polish, lambda asked, points, settings: dict.fromkeys(asked))
+    works = {(0,): work(2, 1), (1,): work(0, 2), (2,): work(1, 0)}
+    assert answer_all(works, {}, None) == {(0,): 2, (1,): 0, (2,): 1}
+    assert called == [[(0,), (1,)], [(1,)]]
