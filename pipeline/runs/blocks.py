@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.engine.threads import using_threads
+from magpend_core.engine.threads import number_of_threads, using_threads
 from magpend_core.models import import_model
 from magpend_core.models.imported import origin
 from magpend_core.models.model import Model
@@ -43,8 +43,8 @@ from pipeline.store.products import BLOCKS, read_block, write_block
 WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 8192
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
 
-WORTH_PROCESSES = 8.0
-"""Time of the work that is left from which processes are started for it [s]; a start costs each about 2 s."""
+WORTH_PROCESSES = 20.0
+"""CPU time of the work that is left from which processes are started for it [s]; a start costs each about 2 s."""
 
 Block = Any
 """Slices of parameter points by dim, or a list of parts."""
@@ -173,15 +173,20 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
     return joined(found, blocks, {d: cells.sizes[d] for d in split_dims(cells)[0]})
 
 
-def _begun_here(task: Callable[[int], Any], missing: list[int], what: str, n: int) -> list[int]:
-    """Compute blocks in the calling thread, and return those that are left once they are worth processes."""
+def _begun_here(task: Callable[..., Any], missing: list[int], what: str, n: int) -> list[int]:
+    """Compute blocks in the calling thread, and return those that are left once they are worth processes.
+
+    They share rows among threads of the engine, as an analysis without blocks does.
+    """
+    compiling = 10.0  # CPU time of the first block that may be the compiler's [s]
     while missing:
-        started = time.monotonic()
-        task(missing[0])
+        started = time.process_time()
+        task(missing[0], threads=None)
         missing = missing[1:]
         report(what, n - len(missing), n)
-        if (time.monotonic() - started) * len(missing) > WORTH_PROCESSES:
+        if (time.process_time() - started - compiling) * len(missing) > WORTH_PROCESSES:
             break
+        compiling = 0.0
     return missing
 
 
@@ -200,9 +205,13 @@ def compute_block(
     blocks: Sequence[Block],
     index: int,
     *,
+    threads: int | None = 1,
     origin: tuple[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Compute and store one block; a task of `pipeline.compute.execute.run_tasks`."""
+    """Compute and store one block; a task of `pipeline.compute.execute.run_tasks`.
+
+    `threads` is the number of threads of the engine; None takes that of the context.
+    """
     if origin is not None:
         import_model(*origin)
     run, known = _opened(opened, directory, digest)
@@ -215,7 +224,7 @@ def compute_block(
     given = (
         (Part(run, {}, known), options, blocks[index]) if analysis.parts else (Part(run, blocks[index], known), options)
     )
-    with using_threads(1), Precision.of(run.cube().attrs).used():
+    with using_threads(threads or number_of_threads()), Precision.of(run.cube().attrs).used():
         result: xr.Dataset = function_of(analysis.compute)(*given)
     with writing_results():
         write_block(run.info.files, _name(key, index), result.assign_attrs(key))

@@ -238,7 +238,7 @@ def test_in_blocks__every_analysis_of_parts(name, pairs, monkeypatch, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["none", "threads", "processes", "dask"])
 def test_in_blocks__parts_anywhere(copy, whole, monkeypatch, where):
-    monkeypatch.setattr(blocks, "WORTH_PROCESSES", 0.0)
+    monkeypatch.setattr(blocks, "WORTH_PROCESSES", -np.inf)
     derive(whole, "manifolds", PARTS["manifolds"], workers=0)
     run, lines = copy(where), []
     places, real = [], execute.run_tasks
