@@ -102,5 +102,15 @@ def reporting(listener: Listener) -> Iterator[None]:
         _listener.reset(token)
 
 
+@contextlib.contextmanager
+def unheard() -> Iterator[None]:
+    """Drop the progress reports from inside this context: whoever opens it reports the work as a whole."""
+    token = _listener.set(None)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
 def silent(_: str) -> None:
     """Print nothing: the function ``echo`` of a silent run."""

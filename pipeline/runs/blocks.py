@@ -30,7 +30,7 @@ from pipeline.compute.threads import writing_results
 from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
-from pipeline.products.reporting import report
+from pipeline.products.reporting import report, unheard
 from pipeline.results.ragged import isel, joined, stacked
 from pipeline.results.run import OpenRun
 from pipeline.runs.stopping import stoppable
@@ -224,7 +224,7 @@ def compute_block(
     given = (
         (Part(run, {}, known), options, blocks[index]) if analysis.parts else (Part(run, blocks[index], known), options)
     )
-    with using_threads(threads or number_of_threads()), Precision.of(run.cube().attrs).used():
+    with unheard(), using_threads(threads or number_of_threads()), Precision.of(run.cube().attrs).used():
         result: xr.Dataset = function_of(analysis.compute)(*given)
     with writing_results():
         write_block(run.info.files, _name(key, index), result.assign_attrs(key))

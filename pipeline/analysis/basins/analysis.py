@@ -15,6 +15,7 @@ from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import letter, split_dims
 from pipeline.products.product import Table
+from pipeline.products.reporting import track
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import DIVERGED, other_cells, outcomes, told
 from pipeline.results.ragged import dims_of, places_of_rows
@@ -298,7 +299,10 @@ def _boundaries(
 ) -> dict[str, Any]:
     """Measure the basin boundaries at each parameter point; return variables as (dims, values)."""
     shape, grid = labels.shape[: len(dims)], labels.shape[len(dims) :]
-    points = [dict(_boundary(one, options, missing)) for one in labels.values.reshape(-1, *grid)]
+    points = [
+        dict(_boundary(one, options, missing))
+        for one in track(labels.values.reshape(-1, *grid), "measuring boundaries")
+    ]
     found: dict[str, Any] = {}
     for name in _MEASURES:
         is_flag = name in _FLAGS

@@ -74,6 +74,9 @@ REST_CURVE = replace(CURVE, longest_step=0.05, max_points=2000, tolerance=1e-11)
 LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
 """Settings for locating points of codimension two, in both parameters to 1e-8."""
 
+FIRST = "finding first points of curves"
+"""Name of work in progress reports."""
+
 CURVE_ENDS = (
     *("bound", "closed", "resonance", "max_points", "stuck", "period_halving"),
     *(BT, "equilibrium", "tangent", NONCENTRAL, HETEROCLINIC, "budget"),
@@ -201,7 +204,7 @@ def continue_curves(
     """
     left_out = {} if left_out is None else left_out
     problems = [_problem_of(family, kind) for _, family, kind, _ in starts]
-    firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
+    firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)], FIRST)
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     left_out |= {s[0]: LOST for s, f in zip(starts, firsts, strict=True) if f is None}
     curves: list[Curve] = []
@@ -213,7 +216,7 @@ def continue_curves(
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]
         seen += fresh
         sprung = [steps for one in fresh for steps in _springing(one, max_period)]
-        ready = [(-1, *pair) for pair in run_together(sprung) if pair is not None]
+        ready = [(-1, *pair) for pair in run_together(sprung, FIRST) if pair is not None]
         if not ready:
             break
     return curves

@@ -50,6 +50,7 @@ from pipeline.layout.vocabulary import (
     parameters_of,
 )
 from pipeline.layout.vocabulary import KINDS as SETS
+from pipeline.products.reporting import track
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import isel, points_of_rows, rows_at
 from pipeline.results.run import OpenRun
@@ -109,7 +110,7 @@ def events(run: OpenRun, options: EventOptions) -> xr.Dataset:
     named = [_event(scene, one, rises, fates[one, rises][rises]) for one in stretches for rises in (False, True)]
     named = [_on_circle(scene, one, named) for one in named]
     if not options.orbits:
-        named = [_aperiodic(scene, one, named) for one in named]
+        named = [_aperiodic(scene, one, named) for one in track(named, "naming ends of attractors")]
     return dataset_of(scene, stretches, _merged(with_images(scene, named)))
 
 

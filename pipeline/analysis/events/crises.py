@@ -37,6 +37,7 @@ from pipeline.analysis.events.scene import Born, Event, Scene, Stretch
 from pipeline.analysis.events.transients import Lifetimes, lifetimes_of, transient_of
 from pipeline.layout.vocabulary import KINDS as SETS
 from pipeline.layout.vocabulary import letter, parameter_name
+from pipeline.products.reporting import track
 from pipeline.results.ragged import points_of_rows, rows_at
 from pipeline.results.sets import nearest_distances
 
@@ -110,7 +111,7 @@ class Crises:
     def split(self, stretches: Sequence[Stretch]) -> list[Stretch]:
         """Divide the stretches of chaotic sets where a crisis changes the size of a set or the number of its bands."""
         found = []
-        for one in stretches:
+        for one in track(stretches, "chaotic sets that change"):
             parts = [one]
             for place in self._changes(one) if SETS[one.kind] == "chaotic_set" else ():
                 tries = (

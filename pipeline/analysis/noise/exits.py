@@ -19,6 +19,7 @@ from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, parameters_of, split_dims
 from pipeline.motion.noisy import Noisy
 from pipeline.motion.steady import Inputs
+from pipeline.products.reporting import track
 from pipeline.results.run import OpenRun
 
 NOT_LEFT = -1
@@ -223,7 +224,7 @@ def cells_at_points(cube: xr.Dataset) -> Iterator[PointCells]:
     """Yield the cells of each parameter point."""
     dims, starts = split_dims(cube["status"])
     n_states = cube.sizes["state"]
-    for index in np.ndindex(*(cube.sizes[d] for d in dims)):
+    for index in track([*np.ndindex(*(cube.sizes[d] for d in dims))], "parameter points"):
         at = dict(zip(dims, index, strict=True))
         part = cube[["section", "status", "n_periods"]].isel(at).transpose(*starts, ...).load()
         section = part["section"].transpose(*starts, "period_index", "state").values

@@ -429,14 +429,11 @@ class Asked:
 
 def search_together(asked: Mapping[K, Asked], there: Destinations, units: np.ndarray) -> dict[K, Found]:
     """Run searches for shocks in step, so that their trajectories fill the engine's lanes together."""
-    n_followed = 0
 
     def answer(trials: dict[K, Trials], results: Mapping[K, Found]) -> dict[K, np.ndarray]:
-        nonlocal n_followed
-        report("trajectories after shocks", n_followed, 0)
+        report("searching shocks", len(results), len(asked))
         states, phase = zip(*(_states(trial, asked[key], units) for key, trial in trials.items()), strict=True)
         found = labels_after(there, np.concatenate(states), np.concatenate(phase))
-        n_followed += len(found)
         ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
         return dict(zip(trials, np.split(found, ends), strict=True))
 
