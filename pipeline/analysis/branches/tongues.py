@@ -30,7 +30,6 @@ from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.starting_orbits import family_of, parameters_at
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of, split_dims
 from pipeline.products.product import Table
-from pipeline.products.reporting import track
 from pipeline.products.rotation import RotationFlag
 from pipeline.results.run import OpenRun
 from pipeline.results.selection import select_points
@@ -167,7 +166,7 @@ def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int
     ends = np.array([[row.values[i], row.values[i + 1]] for i, _ in gaps.values()])
     rising = np.array([row.rotation[i, j] < row.rotation[i + 1, j] for i, j in gaps.values()])
     states = np.array([row.section[i, j] for i, j in gaps.values()])
-    for _ in track(range(search.settings.bisections), "bisecting rotation numbers"):
+    for _ in range(search.settings.bisections):
         middle = ends.mean(axis=1)
         reached = search.sections(middle, states, search.settings.n_transient, 1)[:, -1]
         states = np.where(np.isfinite(reached).all(axis=1)[:, None], reached, states)
