@@ -87,7 +87,7 @@ EVENTS = Analysis(
     prove them; all others are not decided.""",
     EventOptions,
     compute=f"{_ROOM}:events",
-    whole="an end of an attractor is named by those of others",
+    whole="an end of an attractor is named by ends of others; long calls of the engine use all threads",
     columns=COLUMNS,
     table="pipeline.analysis.events.sentences:events_table",
     needs=f"{_ROOM}:needs_one_axis",

@@ -18,6 +18,7 @@ from magpend_core.engine.threads import number_of_threads
 from pipeline.analysis.attractors import analysis
 from pipeline.compute import execute
 from pipeline.products.registry import ANALYSES, OWN
+from pipeline.products.reporting import reporting
 from pipeline.results.ragged import stacked
 from pipeline.runs import blocks
 from pipeline.runs.derive import AnalysedRun, derive, prune
@@ -251,6 +252,16 @@ def test_in_blocks__parts_anywhere(copy, whole, monkeypatch, where):
         derive(run, "manifolds", PARTS["manifolds"], workers=2, scheduler=place, echo=lines.append)
         assert places[-1].resolved() == where
     assert files_of(run, "manifolds") == files_of(whole, "manifolds")
+
+
+@pytest.mark.slow
+def test_in_blocks__progress_is_of_all_blocks(copy):
+    run, heard = copy("run"), []
+    with reporting(lambda what, done, total, expected_s=0.0: heard.append((what, done, total))):
+        derive(run, "manifolds", PARTS["manifolds"], workers=0)
+    n = heard[-1][2]
+    assert n > 2
+    assert [one for one in heard if "manifolds" in one[0]] == [("manifolds, blocks", k, n) for k in range(n + 1)]
 
 
 KILLED = """
