@@ -301,7 +301,7 @@ def _boundaries(
     shape, grid = labels.shape[: len(dims)], labels.shape[len(dims) :]
     points = [
         dict(_boundary(one, options, missing))
-        for one in track(labels.values.reshape(-1, *grid), "measuring boundaries")
+        for one in track([*labels.values.reshape(-1, *grid)], "measuring boundaries")
     ]
     found: dict[str, Any] = {}
     for name in _MEASURES:
