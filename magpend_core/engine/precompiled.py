@@ -18,7 +18,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -278,24 +278,31 @@ class PartCache:
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the cached code for a signature, or None if the cache has none."""
-        name = self._name(sig)
-        if name is None:
-            return None
-        record = _MEMORY.get(name)
-        if record is None and self._folder is not None:
-            record = self._folder.read(name)
-        if record is None:
-            return None
-        try:
-            whose, *content = pickle.loads(record)
-        except Exception as error:
-            # intact but unreadable: written by another version of Python than the cache key says
-            say(f"a compiled part of a kernel, {name}, cannot be used ({error!r}); it is compiled again.")
-            return None
-        found = self._rebuilt(content, target_context) if whose == name else None
-        if found is not None:
+        return next(filter(None, (self._rebuilt(content, target_context) for content in self._records(sig))), None)
+
+    def _records(self, sig: Any) -> Iterator[Any]:
+        """Yield the cached records for a signature. They differ in the types that the functions return which this part
+        calls: tuples, with an entry per state of a system.
+        """
+        for number in count():
+            name = self._name(sig, number)
+            record = None if name is None else self._record(name)
+            if name is None or record is None:
+                return
+            try:
+                whose, *content = pickle.loads(record)
+            except Exception as error:
+                # intact but unreadable: written by another version of Python than the cache key says
+                say(f"a compiled part of a kernel, {name}, cannot be used ({error!r}); it is compiled again.")
+                return
+            if whose != name:
+                return
             _MEMORY[name] = record
-        return found
+            yield content
+
+    def _record(self, name: str) -> bytes | None:
+        record = _MEMORY.get(name)
+        return record if record is not None or self._folder is None else self._folder.read(name)
 
     def making(self, sig: Any) -> contextlib.AbstractContextManager[None]:
         """Return a context in which no other process compiles this part for a signature, if it has yet to be read."""
@@ -306,7 +313,7 @@ class PartCache:
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         """Write the code compiled for a signature to the cache, if this part has a cache key."""
-        name = self._name(sig)
+        name = self._name(sig, sum(1 for _ in self._records(sig)))
         callees = self._callees(cres.library)
         if name is None or callees is None:
             return
@@ -321,10 +328,10 @@ class PartCache:
         if self._folder is not None:
             self._folder.write(name, record)
 
-    def _name(self, sig: Any) -> str | None:
+    def _name(self, sig: Any, number: int = 0) -> str | None:
         if self._dispatcher.key is None:
             return None
-        text = f"{self._dispatcher.key} {tuple(getattr(sig, 'args', sig))!r}"
+        text = f"{self._dispatcher.key} {tuple(getattr(sig, 'args', sig))!r} {number}"
         return f"{self._dispatcher.py_func.__name__[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
     def _callees(self, library: PartLibrary) -> list[Any] | None:
@@ -350,8 +357,7 @@ class PartCache:
         code, fndesc, signature, callees = record
         library = PartLibrary(target_context.codegen(), fndesc.qualname)
         library.dispatcher = self._dispatcher
-        module = llvm.parse_bitcode(code)
-        declared = []
+        found = []
         for path, args, symbol, returns in callees:
             callee = reached(self._dispatcher.py_func, path)
             callee.compile(args)
@@ -359,7 +365,9 @@ class PartCache:
             if compiled.signature.return_type != returns:
                 return None
             library.add_linking_library(compiled.library)
-            declared.append((module.get_function(symbol), compiled.library.symbol))
+            found.append((symbol, compiled.library.symbol))
+        module = llvm.parse_bitcode(code)
+        declared = [(module.get_function(symbol), own) for symbol, own in found]
         if len({symbol for _, symbol in declared}) < len(declared):
             return None
         # clear all names first, since a new name may be the old name of another function

@@ -181,6 +181,29 @@ def test_parts_of_one_engine__agree_in_their_sizes():
     assert out[0] == 33.0
 
 
+def _of_a_pair(w, out):
+    """Take from the first of a tuple of any length."""
+    out[0] = firsts(w)[0] + N  # noqa: F821
+
+
+def test_part__is_kept_for_each_type_that_its_callees_return(monkeypatch):
+    """One system after the other, each in what would be a process of its own: a record replaces no other one."""
+    code = {n: f"def firsts(w):\n    return ({'w[0], ' * n})\n" for n in (2, 3)}
+
+    def compiled(n):
+        monkeypatch.setattr(jit, "_PARTS", {})
+        scope = {"__name__": jit.__name__}
+        exec(code[n], scope)
+        part = bound_part(_of_a_pair, {"firsts": inline(scope["firsts"]), "N": n}, False)
+        out = np.zeros(1)
+        njit(lambda w, out: part(w, out))(np.full(1, 0.5), out)
+        assert out[0] == 0.5 + n
+        return sum(part.stats.cache_misses.values())
+
+    monkeypatch.setattr(_of_a_pair, "__module__", jit.__name__)  # only parts of the package are kept
+    assert [compiled(n) for n in (2, 3, 2, 3)] == [1, 1, 0, 0]
+
+
 def test_inline__can_be_called_from_python_too():
     @inline
     def cubed(x):
