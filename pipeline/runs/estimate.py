@@ -49,7 +49,7 @@ class Estimate:
 def estimate(plan: Plan) -> Estimate:
     """Estimate the computing time of a run on one core of this machine, from a sample of its cells.
 
-    This takes a second or two, after compiling. The time of products (exponents) is their number of periods
+    This takes less than a second, after compiling. The time of products (exponents) is their number of periods
     times the measured time of one.
     """
     from pipeline.compute.task import warm_up
@@ -203,7 +203,7 @@ def _periods_until_closed(plan: Plan, most: float, ratio: float) -> float:
     """
     from pipeline.compute.integrate import integrate
 
-    closing_s = 0.8  # most time for measuring when cells close, by the rule of thumb [s]
+    closing_s = 0.4  # most time for measuring when cells close, by the rule of thumb [s]
     spec, rng, n_keep = plan.spec, np.random.default_rng(1), plan.spec.integration.n_keep
     found, n_branches, left = np.empty(0), BRANCHES, closing_s
     while left > 0:

@@ -184,6 +184,31 @@ def test_write_product__a_bit_flips_while_it_is_written(tmp_path, monkeypatch):
     assert products.open_product(tmp_path / "x.zarr").identical(ds)
 
 
+def test_open_product__reads_what_was_written_at_once_and_lazily(tmp_path, monkeypatch):
+    """Arrays of all kinds, in several chunks whose last ones are cut short, a number alone, an empty one, labels."""
+    monkeypatch.setattr(products, "_PRODUCT_CHUNK_BYTES", 200)
+    rng = np.random.default_rng(0)
+    ds = xr.Dataset(
+        {
+            "x": (("n", "k"), rng.normal(size=(13, 7)), {"units": "s"}),
+            "whole": (("n",), rng.integers(-9, 9, 13)),
+            "is_good": (("n",), rng.integers(0, 2, 13).astype(bool)),
+            "code": (("k",), np.arange(7, dtype=np.int8)),
+            "side": (("n",), np.array(["left", "right", "straddling"])[np.arange(13) % 3]),
+            "total": ((), 2.5),
+            "none": (("empty",), np.zeros(0)),
+        },
+        coords={"state": ("k", list("abcdefg")), "n": np.linspace(0.0, 1.0, 13)},
+        attrs={"kind": "test", "level": 1.5},
+    )
+    products.write_product(tmp_path / "x.zarr", ds)
+    assert len(list((tmp_path / "x.zarr/x").glob("c*"))) > 3
+    found = products.open_product(tmp_path / "x.zarr")
+    xr.testing.assert_identical(found, ds)
+    assert {name: v.dtype for name, v in found.variables.items()} == {name: v.dtype for name, v in ds.variables.items()}
+    xr.testing.assert_identical(products.open_product(tmp_path / "x.zarr", lazy=True), ds)
+
+
 # ---- packs -------------------------------------------------------------------------------------
 
 
