@@ -18,7 +18,7 @@ from magpend_core.engine.entry import integrate
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
-from magpend_core.ordering import canonical_order
+from magpend_core.ordering import order_of_columns
 from magpend_core.pointwise import rates_packed
 from magpend_core.precision import limits_at
 from magpend_core.sizes import LEVEL
@@ -345,19 +345,24 @@ def _take(
             found.orbit_period[row], found.n_iterations[row] = least, -1
             continue
         going[i] = False
-        multipliers = np.linalg.eigvals(ends.derivatives[i])
-        found.multipliers[row] = multipliers[_by_modulus(multipliers)]
-        found.converged[row], found.status[row] = True, int(Status.PERIODIC)
         found.seconds[row] = ends.times[i, :period].sum()
         found.points[row, 0], found.points[row, 1:period] = found.section[row], images[:-1]
-        found.derivative[row] = ends.derivatives[i]
+    done = np.flatnonzero((residual <= tolerance) & ~going)
+    found.multipliers[rows[done]] = _by_modulus(np.linalg.eigvals(ends.derivatives[done]))
+    found.derivative[rows[done]] = ends.derivatives[done]
+    found.converged[rows[done]], found.status[rows[done]] = True, int(Status.PERIODIC)
     return np.asarray(going)
 
 
 def _by_modulus(multipliers: np.ndarray) -> np.ndarray:
-    """Return the order of multipliers by falling modulus; those of one modulus by their phase, the positive first."""
-    modulus, phase = np.maximum(np.abs(multipliers), 1e-300), np.angle(multipliers)
-    return canonical_order(-np.column_stack([np.log(modulus), np.cos(phase), np.sin(phase)]))
+    """Sort the multipliers (orbit, state) of each orbit by falling modulus; those of one modulus by their phase, the
+    positive first.
+    """
+    flat = multipliers.ravel()
+    modulus, phase = np.maximum(np.abs(flat), 1e-300), np.angle(flat)
+    orbit = np.repeat(np.arange(len(multipliers)), multipliers.shape[1])
+    order = order_of_columns([orbit, -np.log(modulus), -np.cos(phase), -np.sin(phase)], len(flat))
+    return np.asarray(flat[order].reshape(multipliers.shape))
 
 
 def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System) -> np.ndarray:

@@ -40,8 +40,13 @@ from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import DERIVED, Files
 from pipeline.store.products import BLOCKS, read_block, write_block
 
-WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 8192
-"""Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
+WANTED = 64
+"""Number of blocks of parts that is aimed at."""
+
+WANTED_OF_POINTS, FEWEST_CELLS, MOST_CELLS = 8, 1024, 8192
+"""Number of blocks of parameter points that is aimed at, and the fewest and most cells of a block of several points.
+Each block calls the engine anew, so many small ones cost more.
+"""
 
 WORTH_PROCESSES = 20.0
 """CPU time of the work that is left from which processes are started for it [s]; a start costs each about 2 s."""
@@ -112,7 +117,7 @@ def blocks_of(run: PlacedRun) -> list[Mapping[str, slice]]:
     cells = run.cube()["status"]
     dims, starts = split_dims(cells)
     n_starts = int(np.prod([cells.sizes[d] for d in starts]))
-    left = max(1, int(np.clip(cells.size // WANTED, FEWEST_CELLS, MOST_CELLS)) // n_starts)
+    left = max(1, int(np.clip(cells.size // WANTED_OF_POINTS, FEWEST_CELLS, MOST_CELLS)) // n_starts)
     lengths: dict[str, int] = {}
     for dim in reversed(dims):
         n, task = cells.sizes[dim], run.plan.block[run.plan.dims.index(dim)]

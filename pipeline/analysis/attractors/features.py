@@ -73,7 +73,7 @@ class Cells:
         self.points = both[least]
 
     @property
-    def mean_rotation(self) -> np.ndarray:
+    def _mean_rotation(self) -> np.ndarray:
         """Mean rotation of the cells [turns per drive period]. Its bits do not depend on the order of the cells."""
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
 
@@ -82,7 +82,12 @@ class Cells:
         """Mean time between two successive section points of the cells [s]; NaN if no times are known."""
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
-    def side(self, point: Point) -> int:
+    def fill(self, found: Features, point: Point) -> None:
+        """Store rotation, class of motion and ranges in the features of the attractor."""
+        found.rotation, found.side = self._mean_rotation, self._side(point)
+        found.state_min, found.state_max = self.low, self.high
+
+    def _side(self, point: Point) -> int:
         """Return the attractor's class of motion (a code): the class of all its cells or, if they differ, of their
         pooled points.
 
@@ -106,10 +111,10 @@ class Features:
     points: np.ndarray
     kind: int
     orbit_period: int
-    rotation: np.ndarray
-    side: int
-    state_min: np.ndarray
-    state_max: np.ndarray
+    rotation: np.ndarray = field(default_factory=lambda: np.full(1, np.nan))
+    side: int = UNKNOWN
+    state_min: np.ndarray = field(default_factory=lambda: np.full(1, np.nan))
+    state_max: np.ndarray = field(default_factory=lambda: np.full(1, np.nan))
     energy_min: float = np.nan
     energy_max: float = np.nan
     multipliers: np.ndarray | None = None
@@ -233,9 +238,8 @@ def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: 
         EQUILIBRIUM,
         0,
         np.zeros(n_angles),
-        UNKNOWN,
-        found.state,
-        found.state,
+        state_min=found.state,
+        state_max=found.state,
         residual=found.residual,
         is_polished=True,
         stability=found.stability,

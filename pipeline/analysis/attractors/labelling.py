@@ -48,7 +48,6 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.results.intervals import lifetime_interval
 from pipeline.results.sets import Geometry, hashes, looked_up, order_by_points, rows_by_number
-from pipeline.results.sides import UNKNOWN
 from pipeline.results.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 
 ENDLESS = (DIVERGES, GROWS)
@@ -461,7 +460,7 @@ def _features_of(point: Point, ends: _Ends, search: Search) -> dict[int, Feature
         elif n < cycles:
             found[n] = feature.of_equilibrium(point.equilibria[n - resting], point.parameters, point.n_angles)
         else:
-            found[n] = _of_points(cells[n], BOUNDED_SET, 0, point, search)
+            found[n] = _of_points(cells[n], BOUNDED_SET, point, search)
             feature.fill_cycle(found[n], point.cycles[n - cycles])
     return found
 
@@ -476,17 +475,18 @@ def _statistics(point: Point, label: np.ndarray, numbers: np.ndarray, search: Se
     return found
 
 
-def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
+def _of_points(cells: Cells, kind: int, point: Point, search: Search) -> Features:
     assert cells.points is not None
     points = feature.sorted_points(cells.points, search.geometry)
-    found = Features(points, kind, period, cells.mean_rotation, cells.side(point), cells.low, cells.high)
+    found = Features(points, kind, 0)
+    cells.fill(found, point)
     if point.parameters is not None and search.options.polish:
         feature.follow_points(found, point.parameters, point.frequency)
     return found
 
 
 def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Features:
-    found = _of_points(cells, one.kind, 0, point, search)
+    found = _of_points(cells, one.kind, point, search)
     found.stability, found.evidence = one.stability, one.evidence
     found.closes_above, found.dimension = one.closes_above, one.dimension
     found.n_sampled, found.n_left, found.n_leaving = one.n_sampled, one.n_left, one.n_leaving
@@ -506,18 +506,10 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
 
 def _of_orbit(cells: Cells | None, orbit: Orbit, point: Point, search: Search) -> Features:
     is_shown = orbit.is_polished or not search.options.polish
-    n_states, nothing = search.geometry.n_states, np.full(point.n_angles, np.nan)
-    found = Features(
-        orbit.points,
-        PERIODIC_ORBIT if is_shown else BOUNDED_SET,
-        orbit.period if is_shown else 0,
-        nothing if cells is None else cells.mean_rotation,
-        UNKNOWN if cells is None else cells.side(point),
-        np.full(n_states, np.nan) if cells is None else cells.low,
-        np.full(n_states, np.nan) if cells is None else cells.high,
-        stability=orbit.stability,
-        evidence=stability.by_failure(orbit.failed),
-    )
+    found = Features(orbit.points, PERIODIC_ORBIT, orbit.period) if is_shown else Features(orbit.points, BOUNDED_SET, 0)
+    found.stability, found.evidence = orbit.stability, stability.by_failure(orbit.failed)
+    if cells is not None:
+        cells.fill(found, point)
     if orbit.is_polished:
         _fill_orbit(found, orbit, search.dynamics.has_returns)
     elif point.parameters is not None and search.options.polish:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -97,19 +97,20 @@ def decide(
     decision = np.zeros(len(block.status), np.int8)
     if not orbits:
         return label, decision
-    stable, owners = np.array([orbit.is_stable for orbit in orbits]), np.zeros(len(orbits), np.int64)
-    owners[:] = 0 if owner is None else owner
+    stable = np.array([orbit.is_stable for orbit in orbits])
     within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance
     for which in (stable,) if tolerance > STRICT else (stable, ~stable):
-        closed = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
-        near = _Near.of(block, closed, orbits, owners, np.flatnonzero(which), geometry)
-        on = near.on_orbit(block.section, within, geometry)
-        label[near.cells[on]], decision[near.cells[on]] = near.orbit[on], CLOSED
-    rest = np.flatnonzero((block.is_closed | block.is_bounded) & (decision == UNDECIDED))
-    near = _Near.of(block, rest, orbits, owners, np.flatnonzero(stable), geometry)
-    code = near.approach(block.section, tolerance, geometry)
-    label[near.cells[code > 0]] = near.orbit[code > 0]
-    decision[near.cells] = code
+        cells = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
+        if len(cells) and which.any():
+            near = _Near.of(block, cells, orbits, owner, which, geometry)
+            cells, orbit = near.on_orbit(block.section, within, geometry)
+            label[cells], decision[cells] = orbit, CLOSED
+    cells = np.flatnonzero((block.is_closed | block.is_bounded) & (decision == UNDECIDED))
+    if len(cells) and stable.any():
+        near = _Near.of(block, cells, orbits, owner, stable, geometry)
+        code = near.approach(block.section, tolerance, geometry)
+        label[near.cells[code > 0]] = near.orbit[code > 0]
+        decision[near.cells] = code
     return label, decision
 
 
@@ -121,6 +122,8 @@ class _Near:
     orbit: np.ndarray  # (n,): index of the orbit
     phase: np.ndarray  # (n,): number of the point on the orbit
     orbits: Sequence[Orbit]
+    points: np.ndarray  # (m, state): points of all orbits
+    first: np.ndarray  # (orbit,): row of each orbit's first point
 
     @classmethod
     def of(
@@ -128,62 +131,59 @@ class _Near:
         block: Block,
         cells: np.ndarray,
         orbits: Sequence[Orbit],
-        owner: np.ndarray,
+        owner: np.ndarray | None,
         which: np.ndarray,
         geometry: Geometry,
     ) -> _Near:
         """Find the `cells` of a block whose last section is near one of the orbits `which` of their parameter point."""
         most = 2**18  # distances between cells and points of orbits that are held at once
-        periods = np.array([orbits[i].period for i in which.tolist()], np.int64)
-        points = np.concatenate([np.zeros((0, geometry.n_states)), *(orbits[i].points for i in which.tolist())])
-        number, phase = np.repeat(which, periods), _ranges(periods)
-        # the points of a cell's own parameter point follow each other
-        first = np.searchsorted(owner[number], block.owner[cells])
-        n = np.searchsorted(owner[number], block.owner[cells], side="right") - first
-        cells, first, n = cells[n > 0], first[n > 0], n[n > 0]
+        periods = np.array([orbit.period for orbit in orbits])
+        points, first = np.concatenate([orbit.points for orbit in orbits]), np.cumsum(periods) - periods
+        # the points of a parameter point follow each other
+        rows = np.flatnonzero(np.repeat(which, periods))
+        number = np.repeat(np.arange(len(orbits)), periods)[rows]
+        owners = np.zeros(len(rows), np.int64) if owner is None else owner[number]
+        begin = np.searchsorted(owners, block.owner[cells])
+        n = np.searchsorted(owners, block.owner[cells], side="right") - begin
+        cells, begin, n = cells[n > 0], begin[n > 0], n[n > 0]
         near = np.full(len(cells), -1)
-        for rows in np.array_split(np.arange(len(cells)), -(-int(n.sum()) // most) or 1):
-            row, places = np.repeat(rows, n[rows]), np.repeat(first[rows], n[rows]) + _ranges(n[rows])
-            away = geometry.distance(block.section[cells[row], -1], points[places])
-            least = np.minimum.reduceat(away, np.cumsum(n[rows]) - n[rows]) if len(rows) else away
-            at = np.flatnonzero(away == np.repeat(least, n[rows]))
-            found, at_first = np.unique(row[at], return_index=True)
-            near[found] = np.where(least < REACH, places[at[at_first]], -1)
+        for some in np.array_split(np.arange(len(cells)), -(-int(n.sum()) // most) or 1):
+            places = np.repeat(begin[some], n[some]) + _ranges(n[some])
+            away = geometry.distance(np.repeat(block.section[cells[some], -1], n[some], axis=0), points[rows[places]])
+            starts = np.cumsum(n[some]) - n[some]
+            least = np.minimum.reduceat(away, starts) if len(some) else away
+            nearest = np.flatnonzero(away == np.repeat(least, n[some]))
+            at = places[nearest[np.searchsorted(nearest, starts)]]
+            near[some] = np.where(least < REACH, at, -1)
         is_near = near >= 0
-        return cls(cells[is_near], number[near[is_near]], phase[near[is_near]], orbits)
+        orbit = number[near[is_near]]
+        return cls(cells[is_near], orbit, rows[near[is_near]] - first[orbit], orbits, points, first)
 
-    def _alike(self, *keys: np.ndarray) -> Iterator[tuple[np.ndarray, list[Orbit], np.ndarray]]:
-        """Yield rows whose orbits have one period and that agree in other keys, the orbits, and each row's orbit."""
-        periods = np.array([one.period for one in self.orbits], np.int64)[self.orbit]
-        _, which = np.unique(np.stack([periods, *keys]), axis=1, return_inverse=True)
-        for rows in rows_by_number(which.reshape(-1)).values():
-            numbers, place = np.unique(self.orbit[rows], return_inverse=True)
-            yield rows, [self.orbits[i] for i in numbers.tolist()], place
-
-    def on_orbit(self, section: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
-        """Return for each cell whether the last period of its sections lies on the orbit."""
-        found = np.zeros(len(self.cells), bool)
-        for rows, orbits, place in self._alike():
-            q = min(orbits[0].period, section.shape[1])
-            points = np.stack([one.points for one in orbits])
-            phase = (self.phase[rows, None] - np.arange(q)[::-1]) % orbits[0].period
-            away = geometry.distance(section[self.cells[rows], -q:], points[place[:, None], phase])
-            found[rows] = away.max(axis=1) <= tolerance
-        return found
+    def on_orbit(self, section: np.ndarray, tolerance: float, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cells of which the last period of sections lies on the orbit, and the orbit of each."""
+        period = np.diff(self.first, append=len(self.points))[self.orbit]
+        n = np.minimum(period, section.shape[1])
+        row, back = np.repeat(np.arange(len(n)), n), _ranges(n)
+        on_phase = self.points[self.first[self.orbit][row] + (self.phase[row] - back) % period[row]]
+        away = geometry.distance(section[self.cells[row], -1 - back], on_phase)
+        farthest = np.maximum.reduceat(away, np.cumsum(n) - n) if len(n) else away
+        return self.cells[farthest <= tolerance], self.orbit[farthest <= tolerance]
 
     def approach(self, section: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
         """Return a code for each cell: whether it surely converges to the orbit, approaches it, or is undecided."""
-        code = np.zeros(len(self.cells), np.int8)
-        for rows, orbits, place in self._alike(self.phase):
-            last, period = section.shape[1] - 1 - int(self.phase[rows[0]]), orbits[0].period
-            if last < 2 * period:
-                continue
-            metrics = _Metrics.of(orbits, geometry)
+        code, k = np.zeros(len(self.cells), np.int8), section.shape[1]
+        period = np.diff(self.first, append=len(self.points))[self.orbit]
+        long_enough = k - 1 - self.phase >= 2 * period
+        for rows in rows_by_number(np.where(long_enough, period * k + self.phase, -1)).values():
+            numbers, place = np.unique(self.orbit[rows], return_inverse=True)
+            metrics = _Metrics.of([self.orbits[i] for i in numbers.tolist()], geometry)
             contracts = metrics.contraction[place] < 1.0
+            if not contracts.any():
+                continue
             rows, place = rows[contracts], place[contracts]
-            index = np.arange(last, -1, -period)[::-1]
-            first = np.stack([one.points[:1] for one in orbits])
-            difference = geometry.difference(section[self.cells[rows][:, None], index], first[place])
+            index = np.arange(k - 1 - int(self.phase[rows[0]]), -1, -int(period[rows[0]]))[::-1]
+            first = self.points[self.first[numbers]][place, None]
+            difference = geometry.difference(section[self.cells[rows][:, None], index], first)
             code[rows] = _approach(difference, metrics.take(place), tolerance)
         return code
 

@@ -1,5 +1,7 @@
 """Distances on circles, boxes, and when a cell counts as on its way to an orbit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,33 @@ def test_decide__of_spirals_neighbours_and_closed_cells():
     orbit = stable_orbit()
     unstable = Orbit(orbit.points, orbit.multipliers / SHRINK * 1.01, 1e-12, orbit.derivative)
     assert decision_of(spiral(0.2), orbit=unstable) == [UNDECIDED]
+
+
+def test_decide__points_together_as_each_alone():
+    """The orbits of one parameter point are none of another's, and an orbit of two points has two phases."""
+    once = stable_orbit()
+    twice = Orbit(once.points + [[0.0, 0.0], [0.5, 1.0]], once.multipliers, 1e-12, once.derivative)
+    far = Orbit(once.points + [-1.0, 3.0], 1.5 * once.multipliers, 1e-12, once.derivative)
+    orbits = [[once], [], [far, twice], [far]]
+    alternating = np.tile(twice.points, (16, 1))
+    cells = [np.tile(once.points, (32, 1)), np.tile(far.points, (32, 1)), alternating, alternating[::-1], spiral(0.2)]
+    n, periods = len(cells), np.array([1, 1, 2, 2, 0])
+    alone = Block(slice(0, n), np.stack(cells), np.where(periods, 1, 2), periods, np.zeros((n, 1), int))
+    each = [decide(alone, own, 1e-4, PLANE) for own in orbits]
+    assert [label.tolist() for label, _ in each] == [
+        [0, -1, -1, 0, 0],
+        [-1] * 5,
+        [1, 0, 1, 1, -1],
+        [-1, 0, -1, -1, -1],
+    ]
+    # the cells of the points in turn
+    owner = np.tile(np.arange(4), n)
+    together = replace(alone.take(np.repeat(np.arange(n), 4)), owners=owner)
+    label, decision = decide(together, [x for own in orbits for x in own], 1e-4, PLANE, np.array([0, 2, 2, 3]))
+    for k, first in enumerate([0, 1, 1, 3]):
+        own = label[owner == k]
+        assert np.where(own < 0, -1, own - first).tolist() == each[k][0].tolist()
+        assert decision[owner == k].tolist() == each[k][1].tolist()
 
 
 def test_near_closed__finds_the_period_of_a_spiral():
