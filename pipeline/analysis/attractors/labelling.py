@@ -109,7 +109,8 @@ def analyse(slab: Slab, search: Search) -> dict[tuple[int, ...], Found]:
             none = np.full(point.n_cells, -1)
             ends[index] = _Ends(none, np.zeros(point.n_cells, np.int8), none.copy(), [])
             works[index] = _conservative(point, ends[index], search)
-    answer_all(works, slab, search.settings)
+    if works:
+        answer_all(works, slab, search.settings)
     return _describe(slab, {index: ends[index] for index in slab}, search)
 
 

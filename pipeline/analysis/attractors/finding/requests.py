@@ -212,14 +212,6 @@ def answer_all(
     return found
 
 
-def _gathered(
-    sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
-    frequency = np.repeat([points[i].frequency for i in asked], sizes)
-    return packed, frequency, np.cumsum(sizes)
-
-
 def _legs(
     asked: Mapping[tuple[int, ...], Leg], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], Block]:
@@ -227,17 +219,16 @@ def _legs(
     for n in {leg.n_legs for leg in asked.values()}:
         own = {index: leg for index, leg in asked.items() if leg.n_legs == n}
         sizes = [len(leg.state) for leg in own.values()]
-        packed, frequency, ends = _gathered(sizes, own, points)
+        packed, frequency = _of_points([points[i] for i in own], np.repeat(range(len(own)), sizes))
         state, step = (np.concatenate([getattr(leg, name) for leg in own.values()]) for name in ("state", "step"))
         block = settings.fly(packed, frequency, state, step=step).legs(n, LEG)
-        found |= {index: block.take(slice(n * at.start, n * at.stop)) for index, at in _slices(own, sizes, ends)}
+        found |= {index: block.take(slice(n * at.start, n * at.stop)) for index, at in _slices(own, sizes)}
     return found
 
 
-def _slices(
-    asked: Mapping[tuple[int, ...], Any], sizes: Sequence[int], ends: np.ndarray
-) -> list[tuple[tuple[int, ...], slice]]:
-    return [(i, slice(end - n, end)) for i, n, end in zip(asked, sizes, ends.tolist(), strict=True)]
+def _slices(asked: Mapping[tuple[int, ...], Any], sizes: Sequence[int]) -> list[tuple[tuple[int, ...], slice]]:
+    ends = np.cumsum(sizes).tolist()
+    return [(i, slice(end - n, end)) for i, n, end in zip(asked, sizes, ends, strict=True)]
 
 
 def _polished(
@@ -246,7 +237,7 @@ def _polished(
     guesses = [replace(one.guesses, owner=np.full(len(one.guesses.key), k)) for k, one in enumerate(asked.values())]
     sizes = [len(one.key) for one in guesses]
     found, _ = polish_guesses(guesses[0].followed_by(*guesses[1:]), [points[i] for i in asked], settings)
-    return {index: found[own] for index, own in _slices(asked, sizes, np.cumsum(sizes))}
+    return {index: found[own] for index, own in _slices(asked, sizes)}
 
 
 def polish_guesses(
@@ -310,7 +301,7 @@ def _slopes(
         sizes = [len(request.point) for request in own.values()]
         start, owner = np.concatenate([request.point for request in own.values()]), np.repeat(range(len(own)), sizes)
         images, derivatives = map_slopes(start, owner, [points[i] for i in own], settings, rtol)
-        for index, rows in _slices(own, sizes, np.cumsum(sizes)):
+        for index, rows in _slices(own, sizes):
             found[index] = images[rows], derivatives[rows]
     return found
 

@@ -18,8 +18,9 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells,
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, number_of
 from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Dynamics, Point, Slab
-from pipeline.analysis.attractors.finding.requests import Settings, polish_guesses
+from pipeline.analysis.attractors.finding.requests import FINDING, Settings, polish_guesses
 from pipeline.analysis.attractors.finding.spirals import beside, near_closed
+from pipeline.products.reporting import UNTOLD, report
 from pipeline.results.sets import Geometry, rows_by_number
 from pipeline.results.tolerances import LOOSE_SHARE, STRICT
 
@@ -99,6 +100,7 @@ def search_orbits(slab: Slab, search: Search) -> State:
             more = distinct([*state.orbits[k], *(one for one in polished if one is not None)], search.geometry)
             goes_on[k] = len(more) > len(state.orbits[k])
             state.orbits[k] = more if goes_on[k] else state.orbits[k]
+        report(FINDING, int((~goes_on).sum()), len(points), UNTOLD)
         guesses = _undecided(slab, goes_on, state, search)
         goes_on = np.isin(np.arange(len(points)), guesses.owner)
         if not goes_on.any():

@@ -124,12 +124,7 @@ def test_decide__points_together_as_each_alone():
     n, periods = len(cells), np.array([1, 1, 2, 2, 0])
     alone = Block(slice(0, n), np.stack(cells), np.where(periods, 1, 2), periods, np.zeros((n, 1), int))
     each = [decide(alone, own, 1e-4, PLANE) for own in orbits]
-    assert [label.tolist() for label, _ in each] == [
-        [0, -1, -1, 0, 0],
-        [-1] * 5,
-        [1, 0, 1, 1, -1],
-        [-1, 0, -1, -1, -1],
-    ]
+    assert [label.tolist() for label, _ in each] == [[0, -1, -1, 0, 0], [-1] * 5, [1, 0, 1, 1, -1], [-1, 0, -1, -1, -1]]
     # the cells of the points in turn
     owner = np.tile(np.arange(4), n)
     together = replace(alone.take(np.repeat(np.arange(n), 4)), owners=owner)
