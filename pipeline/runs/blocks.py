@@ -159,7 +159,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
     task = partial(
         compute_block, type(run).of, run.info.files.place, run.digest, options, key, blocks, origin=origin(run.model)
     )
-    missing = [k for k in range(n) if not _is_there(run.info.files, key, k)]
+    missing = [k for k in range(n) if not _is_there(run.info.files, key, k, n)]
     done, what = n - len(missing), f"{analysis.name}, blocks{' of parameter points' if analysis.by_point else ''}"
     if done:
         run.echo(f"{analysis.name}: {done} of {n} blocks done before")
@@ -171,7 +171,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
         with contextlib.closing(results):
             for k, _ in enumerate(results, n - len(missing) + 1):
                 report(what, k, n)
-    found = [read_block(run.info.files, _name(key, k)) for k in range(n)]
+    found = [read_block(run.info.files, _name(key, k, n)) for k in range(n)]
     if analysis.parts:
         return stacked(found, analysis.rows)
     cells = run.cube()["status"]
@@ -232,7 +232,7 @@ def compute_block(
     with unheard(), using_threads(threads or number_of_threads()), Precision.of(run.cube().attrs).used():
         result: xr.Dataset = function_of(analysis.compute)(*given)
     with writing_results():
-        write_block(run.info.files, _name(key, index), result.assign_attrs(key))
+        write_block(run.info.files, _name(key, index, len(blocks)), result.assign_attrs(key))
     return {"block": index}
 
 
@@ -242,13 +242,14 @@ def _opened(opened: Callable[[str], PlacedRun], directory: str, digest: str) -> 
     return opened(directory), {}
 
 
-def _name(key: Mapping[str, str], index: int) -> str:
-    return f"{DERIVED}/{key['derived_product']}-{key['derived_key'][:8]}{BLOCKS}/{index:06d}.npz"
+def _name(key: Mapping[str, str], index: int, n: int) -> str:
+    """Return the path of one of `n` blocks: another number of blocks divides the points otherwise."""
+    return f"{DERIVED}/{key['derived_product']}-{key['derived_key'][:8]}{BLOCKS}/{index:06d}-of-{n}.npz"
 
 
-def _is_there(files: Files, key: Mapping[str, str], index: int) -> bool:
+def _is_there(files: Files, key: Mapping[str, str], index: int, n: int) -> bool:
     try:
-        attrs = read_block(files, _name(key, index)).attrs
+        attrs = read_block(files, _name(key, index, n)).attrs
     except (FileNotFoundError, DamagedError):
         return False
     return all(attrs.get(name) == value for name, value in key.items())
