@@ -340,7 +340,7 @@ def _decided(
     orbits = [orbit for one in asked.values() for orbit in one.orbits]
     label, _ = decide(whole, orbits, 10.0 * settings.closure, settings.geometry, owner)
     label = np.where(label < 0, -1, label - np.searchsorted(owner, whole.owner))
-    return {index: label[own] for index, own in _slices(asked, sizes, np.cumsum(sizes))}
+    return {index: label[own] for index, own in _slices(asked, sizes)}
 
 
 def _recurring(
