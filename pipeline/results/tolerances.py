@@ -12,8 +12,13 @@ from __future__ import annotations
 BRANCH_RTOL = 1e-12
 """Orbits on branches: residuals go below 1e-10, and differences by a parameter keep six digits."""
 
-CONNECT_RTOL = 1e-9
+CONNECT_RTOL = 1e-7
 """Orbits that are followed from one parameter value to the next only to see which others they meet."""
+
+SEARCH_RTOL, SEARCH_CLOSE = 1e-8, 1e-7
+"""Newton's method from many starts on the orbits around a chaotic set, and the residual to which it leads: those found
+are polished.
+"""
 
 VOLUME_RTOL = 1e-11
 """Volumes along the flow: their change must be known better than `PRESERVED_VOLUME`."""

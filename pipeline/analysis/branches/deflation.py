@@ -40,6 +40,7 @@ class DeflationSettings:
     # one is shortened to this
     longest_step: float = 0.5
     close: float = 1e-9  # scaled residual at which an iteration ends; the orbits found are polished further
+    rtol: float = BRANCH_RTOL  # of the integrations up to there
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +185,7 @@ def _iterate(
             np.full(len(rows), frequency_hz),
             state[rows],
             periods[rows],
-            rtol=BRANCH_RTOL,
+            rtol=settings.rtol,
             system=system,
         )
         image = ends.images[np.arange(len(rows)), periods[rows] - 1]

@@ -14,7 +14,7 @@ and by time modulo the number of bands. The number of states does not matter, bu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import lcm
@@ -156,14 +156,24 @@ class SectionMap:
 
     def saddle(self, value: float, state: np.ndarray, period: int) -> Saddle | None:
         """Return the saddle orbit to which Newton's method leads from a state; None without such an orbit."""
-        system = self.family.system
-        rows = self.rows(value, state[None])
-        found = polish_orbits(rows.parameters, rows.frequency_hz, rows.states, np.array([period]), system=system)
-        if not found.converged[0] or found.orbit_period[0] != period:
-            return None
-        rows = self.rows(value, found.points[0, :period])
-        ends = section_map(rows.parameters, rows.frequency_hz, rows.states, period, system=system)
-        return _saddle(found.points[0, :period], ends.derivatives, np.asarray(self.geometry.scales))
+        return self.saddles(value, state[None], [period])[0]
+
+    def saddles(self, value: float, states: np.ndarray, periods: Sequence[int]) -> list[Saddle | None]:
+        """Return the saddle orbits to which Newton's method leads from states; None where it leads to none."""
+        system, asked = self.family.system, np.asarray(periods, np.int64)
+        rows = self.rows(value, states)
+        found = polish_orbits(rows.parameters, rows.frequency_hz, rows.states, asked, system=system)
+        kept = np.flatnonzero(found.converged & (found.orbit_period == asked))
+        orbits = [found.points[k, : asked[k]] for k in kept]
+        saddles: list[Saddle | None] = [None] * len(asked)
+        if orbits:
+            rows = self.rows(value, np.concatenate(orbits))
+            turns = np.repeat(asked[kept], asked[kept])
+            ends = section_map(rows.parameters, rows.frequency_hz, rows.states, turns, system=system).derivatives
+            scales = np.asarray(self.geometry.scales)
+            for k, points, own in zip(kept, orbits, np.split(ends, np.cumsum(asked[kept])[:-1]), strict=True):
+                saddles[k] = _saddle(points, own, scales)
+        return saddles
 
 
 def map_along(scene: Scene, place: int) -> SectionMap:
@@ -341,12 +351,15 @@ class Approach:
             away = min(float(np.nanmin(self.along.geometry.distance(paths, x))) for x in saddle.points)
         return max(2.0 * away, self.near * self.size)
 
-    def begin(self, paths: np.ndarray) -> bool:
-        """Find the sides on which the living set passes; return whether it keeps to one side in each class."""
+    def begin(self, some: np.ndarray, every: Callable[[], np.ndarray]) -> bool:
+        """Find the sides on which the living set passes; return whether it keeps to one side in each class.
+
+        `some` are the trajectories that are looked at first, and `every` returns all, which are integrated if needed.
+        """
         # another part of the set may lie on the other side of the manifold, but further away
         for near in self.effort.near[:2]:
             self.near = near
-            if all(self._keeps_to_one_side(some) for some in (paths[: self.effort.looked_at], paths)):
+            if self._keeps_to_one_side(some) and self._keeps_to_one_side(every()):
                 return bool(self.sides)
         return False
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import xarray as xr
@@ -40,6 +41,7 @@ from pipeline.layout.vocabulary import letter, parameter_name
 from pipeline.products.reporting import track
 from pipeline.results.ragged import points_of_rows, rows_at
 from pipeline.results.sets import nearest_distances
+from pipeline.results.tolerances import SEARCH_CLOSE, SEARCH_RTOL
 
 OF_MAP, OF_FLOW = Effort(256, 1024, 6, 48, 2), Effort(128, 256, 3, 36, 1, is_flow=True)
 """Effort for maps, and for flows, whose trajectories cost a thousand times as much."""
@@ -165,10 +167,8 @@ class Crises:
             return Crisis("", "")
         seen, beyond = (float(x) for x in scene.along[[place, place + way]])
         along, effort = self._map(place)
-        points = points_of_rows(scene.attractors)
-        try:
-            sample = sample_of(along, seen, points[row][-1], effort)
-        except ValueError:
+        points, sample = points_of_rows(scene.attractors), self._sample(row, along, seen, effort)
+        if sample is None:
             return Crisis("", "its trajectories end")
         met = self._met(along, effort, sample, (seen, beyond), self._orbits(along, sample, seen, effort))
         if isinstance(met, str):
@@ -213,9 +213,8 @@ class Crises:
             return Crisis("", "")
         seen, beyond = (float(x) for x in scene.along[[place, place + way]])
         along, effort = self._map(place)
-        try:
-            sample = sample_of(along, seen, points_of_rows(scene.attractors)[row][-1], effort)
-        except ValueError:
+        sample = self._sample(row, along, seen, effort)
+        if sample is None:
             return Crisis("", "")
         found = transient_of(along, sample, seen, beyond, effort)
         if isinstance(found, str):
@@ -223,6 +222,17 @@ class Crises:
         exponent, error = found.free_exponent
         why = f"beyond, its trajectories leave for good: {_law(scene.located, found, exponent, error)}"
         return Crisis(TRANSIENT, why, found.value, found.value_error, exponent=exponent, exponent_error=error)
+
+    def _sample(self, row: int, along: SectionMap, seen: float, effort: Effort) -> Sample | None:
+        """Return trajectories on the chaotic set of a row; None if they end."""
+        known = self.scene.verdicts
+        if ("sample", row) not in known:
+            try:
+                known["sample", row] = sample_of(along, seen, points_of_rows(self.scene.attractors)[row][-1], effort)
+            except ValueError:
+                known["sample", row] = None
+        found: Sample | None = known["sample", row]
+        return found
 
     def _row(self, attractor: int, place: int) -> int | None:
         """Return the row of a chaotic set at a place; None if it is not there."""
@@ -256,24 +266,30 @@ class Crises:
             float(rows.frequency_hz[0]),
             rows.parameters[0],
             system,
-            settings=DeflationSettings(rounds=effort.rounds),
+            settings=DeflationSettings(rounds=effort.rounds, rtol=SEARCH_RTOL, close=SEARCH_CLOSE),
         )
-        saddles = [along.saddle(seen, one.points[0], one.period) for one in found]
-        return [one for one in saddles if one is not None]
+        states = np.array([one.points[0] for one in found]).reshape(-1, system.n_states)
+        return [one for one in along.saddles(seen, states, [one.period for one in found]) if one is not None]
 
     def _met(
         self, along: SectionMap, effort: Effort, sample: Sample, values: tuple[float, float], orbits: Sequence[Saddle]
     ) -> tuple[Approach, Contact] | str:
         """Return the orbit that the set meets first, or why it meets none."""
         ds, (seen, beyond) = self.scene.located, values
-        here = Approach(along, sample, seen, orbits[0], effort).paths(seen) if orbits else np.zeros(0)
         ways = [Approach(along, sample, seen, orbit, effort) for orbit in orbits]
-        ways = [one for one in ways if one.begin(here)]
-        there = ways[0].paths(beyond) if ways else here
+        few, length = effort.looked_at, SETTLE + effort.length
+        some = along.paths(seen, sample.starts[:few], length) if orbits else np.zeros(0)
+
+        @cache
+        def here() -> np.ndarray:
+            return np.concatenate([some, along.paths(seen, sample.starts[few:], length)])
+
+        ways = [one for one in ways if one.begin(some, here)]
+        there = ways[0].paths(beyond) if ways else some
         near = [one for one in ways if one.least(beyond, there).is_beyond]
-        near.sort(key=lambda one: one.least(seen, here).least)
+        near.sort(key=lambda one: one.least(seen, here()).least)
         first: tuple[Approach, Contact] | None = None
-        before, earlier = seen, here
+        before, earlier = seen, here() if near else some
         for one in near:
             # where the set has grown, it crosses other orbits too: only one that it crosses before counts
             if first is not None and not one.least(before, earlier).is_beyond:

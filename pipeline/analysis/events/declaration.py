@@ -94,7 +94,7 @@ EVENTS = Analysis(
     settle=f"{_ROOM}:settle_events",
     builds_on=("attractors", "branches"),
     figure="genealogy",
-    version=16,
+    version=17,
 )
 
 

@@ -77,6 +77,10 @@ class PassageSettings:
     least_length: float = 10.0
     least_values: int = 4  # numbers of values that are fitted, the nearest ones
     most_values: int = 6
+    # trajectories at each value that are looked at first, and number of laminar phases, in units of the least one, at
+    # which their length is known so well that others are integrated only where it is not too long
+    looked_at: int = 8
+    enough: int = 4
     groups: int = 8  # groups of trajectories whose spread gives the error of a length
     agrees: float = 0.12  # largest deviation of an exponent from the expected one beyond its error, and largest error
     largest_error: float = 0.15
@@ -155,8 +159,17 @@ def passage_of(
     effort = MEASURED[LOCKING if is_torus else kind]
     distances = abs(bracket[1] - value) * 0.5 ** np.arange(effort.n_values)
     values = value + np.sign(bracket[1] - value) * distances
-    sections = _sections(family, values, points, effort.many, effort.n_sections)
-    found = phases(sections, ghost, _gate(points, ghost, geometry), distances, geometry, POWERS[kind], settings)
+    starts = points[np.linspace(0, len(points) - 1, effort.many).astype(int)]
+    gate, power = _gate(points, ghost, geometry), POWERS[kind]
+    few = _sections(family, values, starts[: settings.looked_at], effort.n_sections)
+    may_serve = _may_serve(phases(few, ghost, gate, distances, geometry, power, settings), effort, settings)
+    if may_serve.sum() < settings.least_values:
+        return _judged(ds, None, None, kind, told, value, is_torus, settings)
+    values, distances, sections = values[may_serve], distances[may_serve], few[may_serve]
+    if len(starts) > settings.looked_at:
+        more = _sections(family, values, starts[settings.looked_at :], effort.n_sections)
+        sections = np.concatenate([sections, more], axis=1)
+    found = phases(sections, ghost, gate, distances, geometry, power, settings)
     fitted = scaling(found, kind, len(ghost), effort, settings)
     born = replace(
         _judged(ds, found, fitted, kind, told, value, is_torus, settings), error=float(ds["bracket"].values[k])
@@ -168,7 +181,7 @@ def passage_of(
 
 def _judged(
     ds: xr.Dataset,
-    found: Phases,
+    found: Phases | None,
     fitted: tuple[float, float, np.ndarray] | None,
     kind: str,
     told: str,
@@ -177,7 +190,7 @@ def _judged(
     settings: PassageSettings = PassageSettings(),
 ) -> Born:
     """Name the end if the lengths grow towards the bifurcation with its exponent."""
-    if fitted is None:
+    if found is None or fitted is None:
         return Born("", f"{told}; its trajectories show too few laminar phases near this orbit to scale their lengths")
     exponent, error, chosen = fitted
     lengths, away = found.length[chosen], [own_width(ds, value, x) for x in found.distance[chosen]]
@@ -202,9 +215,8 @@ def _gate(points: np.ndarray, ghost: np.ndarray, geometry: Geometry) -> float:
     return float(min([gate * extent, *(of_gap * gaps)]))
 
 
-def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int, n: int) -> np.ndarray:
-    """Integrate trajectories of a set at some values of the parameter, shape (value, trajectory, section, state)."""
-    starts = points[np.linspace(0, len(points) - 1, many).astype(int)]
+def _sections(family: Family, values: np.ndarray, starts: np.ndarray, n: int) -> np.ndarray:
+    """Integrate trajectories from the same starts at some values, shape (value, trajectory, section, state)."""
     unknowns = [family.unknowns(state, [value]) for value in values for state in starts]
     rows = family.rows(np.array(unknowns))
     found = more_sections(
@@ -216,7 +228,15 @@ def _sections(family: Family, values: np.ndarray, points: np.ndarray, many: int,
         **limits_at(PASSAGE_RTOL),
         system=family.system,
     )
-    return np.asarray(found.section[:, 0].reshape(len(values), many, n, -1))
+    return np.asarray(found.section[:, 0].reshape(len(values), len(starts), n, -1))
+
+
+def _may_serve(found: Phases, effort: Effort, settings: PassageSettings) -> np.ndarray:
+    """Return at which values a fit may use the length, judged by a part of the trajectories: not where enough laminar
+    phases show that it is too long.
+    """
+    is_known = found.number >= settings.enough * effort.n_phases
+    return np.asarray(~is_known | (found.length <= effort.longest * effort.n_sections))
 
 
 def phases(

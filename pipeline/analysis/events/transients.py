@@ -33,6 +33,8 @@ class LifetimeSettings:
     # least share of trajectories that have left, and stay away for half of the time, at the value beyond the loss
     stay_away: float = 0.98
     lanes: int = 64  # most trajectories at a value
+    looked_at: int = 16  # of these, that are looked at first, and the further sections for which they are
+    further: int = 64
     halvings: int = 10  # bisections for the value up to which the set lives as long as trajectories are followed
     largest_error: float = 0.2  # largest error of the exponent, as a share of it
 
@@ -133,7 +135,21 @@ class Place:
     def stays(self, value: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the section points of trajectories at a value, and when each one was last near the set."""
         paths = self.along.paths(value, self.starts, SETTLE + self.length)
-        return paths, last_stays(paths, self.points, self.effort.around * self.size, self.along.geometry)
+        return paths, self._last(paths)
+
+    def _last(self, paths: np.ndarray) -> np.ndarray:
+        return last_stays(paths, self.points, self.effort.around * self.size, self.along.geometry)
+
+    def stays_or_comes_back(self, value: float, settings: LifetimeSettings) -> bool:
+        """Return whether more trajectories than may be are near the set in the second half of the time.
+
+        A part of them is looked at first, for a part of this half.
+        """
+        half, most = (SETTLE + self.length) // 2, (1.0 - settings.stay_away) * len(self.starts)
+        paths = self.along.paths(value, self.starts[: settings.looked_at], half + settings.further)
+        if (self._last(paths) > half).sum() > most:
+            return True
+        return bool((self.stays(value)[1] > half).sum() > most)
 
     def lifetime(self, value: float) -> tuple[float, int]:
         """Return the mean lifetime of trajectories at a parameter value [sections], and how many of them left.
@@ -166,8 +182,7 @@ def transient_of(
         Its `value` and `free_exponent` are fitted together; `exponent` is the one at this value.
     """
     place = Place(along, sample.starts[: settings.lanes], sample.points, sample.size(along.geometry), effort)
-    paths, until = place.stays(beyond)
-    if (until <= paths.shape[1] // 2).mean() < settings.stay_away:
+    if place.stays_or_comes_back(beyond, settings):
         return "beyond, its trajectories stay near it or come back"
     low, high = seen, beyond
     for _ in range(settings.halvings):

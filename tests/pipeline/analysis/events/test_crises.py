@@ -224,7 +224,8 @@ def test_contact_of__boundary_crisis_of_ueda():
     sample = sample_of(along, 13.375, np.array([3.1, -0.78]), effort)
     saddle = along.saddle(13.375, np.array([0.399, -5.58]), 1)
     approach = Approach(along, sample, 13.375, saddle, effort)
-    assert approach.begin(approach.paths(13.375))
+    paths = approach.paths(13.375)
+    assert approach.begin(paths[:32], lambda: paths)
     found = contact_of(approach, 13.45)
     assert found is not None
     assert abs(found.value - tangency_of_ueda()) <= found.error < 0.01
