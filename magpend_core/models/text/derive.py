@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -326,9 +326,7 @@ class Builder:
             for other in args[1:]:
                 found = g.call(f"{name}imum", found, other)
             return found
-        if name == "abs":
-            return g.call("absolute", *args)
-        return g.call(name, *args)
+        return _BUILT[name](g, *args) if name in _BUILT else g.call(name, *args)
 
     def _where(self, condition: Tree, yes: Node, no: Node) -> Node:
         g = self.graph
@@ -349,3 +347,19 @@ class Builder:
             return g.where_less(b, a, yes, no)
         # a <= b is not (b < a)
         return g.where_less(b, a, no, yes) if condition.value == "<=" else g.where_less(a, b, no, yes)
+
+
+def _mod(g: Graph, x: Node, y: Node) -> Node:
+    """Return x - y floor(x/y); division by 1/f is multiplication by f, so that jumps in time have known instants."""
+    is_inverse = y.op == "div" and y.args[0].is_number(1.0)
+    return g.sub(x, g.mul(y, g.call("floor", g.mul(x, y.args[1]) if is_inverse else g.div(x, y))))
+
+
+_BUILT: dict[str, Callable[..., Node]] = {
+    "abs": lambda g, x: g.call("absolute", x),
+    "ceil": lambda g, x: g.neg(g.call("floor", g.neg(x))),
+    "heaviside": lambda g, x: g.where_less(x, g.zero, g.zero, g.one),
+    "log10": lambda g, x: g.div(g.call("log", x), g.number(math.log(10.0))),
+    "mod": _mod,
+}
+"""Nodes of functions that the graph has under another name, or writes with others."""

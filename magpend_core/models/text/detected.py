@@ -45,8 +45,9 @@ def found_in(
         )
     for switch, slides in zip(derived.switches, derived.sliding.slides, strict=True):
         what = "a jump" if switch.jumps else "a corner"
+        passed = "a whole number" if switch.whole else "0"
         yield (
-            f"switch: {what} where {_text(switch.written, own)} passes 0; a step ends there"
+            f"switch: {what} where {_text(switch.written, own)} passes {passed}; a step ends there"
             + (", and motion may slide on it" if slides else "")
         )
     for impact in own.impacts:

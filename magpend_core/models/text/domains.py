@@ -185,7 +185,9 @@ def _values(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> np.ndarra
 def _why(tree: Tree, known: Mapping[str, Any], new: np.ndarray) -> str:
     row = int(np.argmax(new))
     args = [] if tree.kind == "product" else [float(_values(arg, known, new)[row]) for arg in tree.args]
-    if tree.kind == "call" and tree.value == "log" and args[0] <= 0.0:
+    if tree.kind == "call" and tree.value == "mod" and args[1] == 0.0:
+        return "remainder of a division by 0"
+    if tree.kind == "call" and tree.value in ("log", "log10") and args[0] <= 0.0:
         return f"logarithm of {args[0]:.6g}"
     if tree.kind == "call" and tree.value == "sqrt" and args[0] < 0.0:
         return f"square root of {args[0]:.6g}"

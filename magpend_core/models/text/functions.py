@@ -395,7 +395,9 @@ class _Call:
         )
 
     def write_phases(self, roots: Sequence[Traced], drive: Drive | None) -> None:
-        """Write ``t % T``, with the drive's period T, and ``(omega*t) % (2*pi)`` as multiples of ``phase``."""
+        """Write ``t % T``, with the drive's period T, and ``(omega*t) % (2*pi)`` as multiples of ``phase``, other
+        remainders as ``mod``.
+        """
         period = math.inf if drive is None or self.drive is None else drive.period(self.values[self.drive])
         for node in _nodes(roots):
             if node.op != "remainder":
@@ -406,12 +408,10 @@ class _Call:
                 turns = value_of(parse(text), known) if not parts else math.nan
             except KeyError:  # it changes with the state
                 turns = math.nan
-            if not np.allclose(turns, known["t"] / period, rtol=1e-9, atol=0.0):
-                raise self.error(
-                    f"{text.replace('/', ' % ', 1)}: the text of a model has a remainder of the time alone, by the "
-                    "drive's period. An angle needs none: leave it as it is, and declare it with on_circle = true"
-                )
-            node.op, node.args = "product", (name("phase"), node.args[1])
+            if np.allclose(turns, known["t"] / period, rtol=1e-9, atol=0.0):
+                node.op, node.args = "product", (name("phase"), node.args[1])
+            else:
+                node.op, node.value = "call", "mod"
 
     def repeats(self, key: str, drive: Drive) -> bool:
         """Return whether the rates are the same a period later, at trials at which they have values."""

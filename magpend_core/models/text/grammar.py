@@ -28,22 +28,23 @@ MANY = 8
 
 FUNCTIONS: dict[str, tuple[int, int]] = {
     **dict.fromkeys(
-        ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "abs", "sign"),
+        ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "log10", "sqrt", "abs"),
         (1, 1),
     ),
+    **dict.fromkeys(("ln", "sign", "heaviside", "floor", "ceil"), (1, 1)),
+    "mod": (2, 2),
     "atan2": (2, 2),
     "min": (2, MANY),
     "max": (2, MANY),
     "where": (3, 3),
     "square": (2, 2),
 }
-"""Least and greatest number of arguments by name."""
+"""Least and greatest number of arguments by name; ``ln`` is read as ``log``."""
 
 BUILT_IN = ("t", "f", "phase", "pi")
 """Time since the section [s], drive frequency [Hz], t f in [0, 1), and pi."""
 
 ELSEWHERE = {
-    "ln": "log",
     "arctan": "atan",
     "arcsin": "asin",
     "arccos": "acos",
@@ -51,7 +52,12 @@ ELSEWHERE = {
     "fabs": "abs",
     "pow": "**",
     "sgn": "sign",
-    "heaviside": "where",
+    "heav": "heaviside",
+    "Heaviside": "heaviside",
+    "flr": "floor",
+    "fmod": "mod",
+    "remainder": "mod",
+    "ceiling": "ceil",
     "if": "where",
     "Piecewise": "where",
     "Abs": "abs",
@@ -405,7 +411,7 @@ class _Parser:
             self.take()
         self.close(opened)
         self.check_arguments(name, args)
-        return Tree("call", name.at, name.text, tuple(args))
+        return Tree("call", name.at, "log" if name.text == "ln" else name.text, tuple(args))
 
     def check_arguments(self, name: _Token, args: list[Tree]) -> None:
         least, most = FUNCTIONS.get(name.text, (0, len(args)))

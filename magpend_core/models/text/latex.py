@@ -54,9 +54,12 @@ _NAMED = {
     "cos": r"\cos",
     "tan": r"\tan",
     "log": r"\ln",
+    "log10": r"\log_{10}",
     "min": r"\min",
     "max": r"\max",
     "sign": r"\operatorname{sign}",
+    "heaviside": r"\Theta",
+    "mod": r"\operatorname{mod}",
     "atan2": r"\operatorname{atan2}",
     "square": r"\operatorname{square}",
 }
@@ -189,6 +192,8 @@ def _call(tree: Tree, symbols: Mapping[str, str]) -> str:
         return rf"\sqrt{{{args[0]}}}"
     if tree.value == "abs":
         return rf"\left|{args[0]}\right|"
+    if tree.value in ("floor", "ceil"):
+        return rf"\left\l{tree.value} {args[0]} \right\r{tree.value}"
     if tree.value == "exp":
         return rf"\mathrm{{e}}^{{{args[0]}}}"
     if tree.value == "where":

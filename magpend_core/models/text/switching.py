@@ -1,4 +1,4 @@
-"""Find corners and jumps of a model's equations: ``sign``, ``abs``, ``min``, ``max``, ``where`` and ``square``.
+"""Find corners and jumps of a model's equations: ``sign``, ``abs``, ``min``, ``max``, ``where``, ``square``, ``floor``.
 
 Each is smooth between the places at which an expression passes zero, so it is written with the *side* on
 which that expression is: +1 or -1, a number that changes at these places alone and is the same throughout a
@@ -8,6 +8,7 @@ which the engine ends a step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -25,11 +26,11 @@ from magpend_core.models.text.graph import (
 )
 from magpend_core.models.text.layers import keeps_sign
 
-CORNERED = ("sign", "absolute", "minimum", "maximum", "less", "square")
+CORNERED = ("sign", "absolute", "minimum", "maximum", "less", "square", "floor")
 """Functions that are not smooth."""
 MAX_SWITCHES, MAX_INSTANTS = 16, 64
 MAX_WAVES = 16
-"""Most periods of a square wave in one of the drive."""
+"""Most periods of a square wave, and most whole numbers that ``floor`` passes, in one period of the drive."""
 
 
 @dataclass
@@ -48,6 +49,8 @@ class Switch:
         The value as the text has it, for people.
     jumps : bool
         Whether something jumps there.
+    whole : bool
+        Whether the surface is where `written` is a whole number, and not where it is 0.
     """
 
     value: Node
@@ -55,6 +58,7 @@ class Switch:
     mode: Node
     written: Node
     jumps: bool = False
+    whole: bool = False
 
 
 @dataclass
@@ -140,6 +144,8 @@ class Sides:
             return plain
         if node.op == "square":
             return self._square(node, more) or plain
+        if node.op == "floor":
+            return self._floor(node, args[0], more) or plain
         if node.op in ("sign", "absolute"):
             surface = self._surface[node.args[0].number]
             side = self.side(surface, args[0], node.op == "sign", more, _plain(surface, node.args[0]))
@@ -155,17 +161,23 @@ class Sides:
         return plain if side is None else g.choice(side, yes, no)
 
     def side(
-        self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
+        self,
+        value: Node,
+        rewritten: Node,
+        jumps: bool,
+        more: bool = True,
+        written: Node | None = None,
+        whole: bool = False,
     ) -> Node | None:
         """Return a graph node for the sign of an expression, adding a switch if necessary; None if no switch can stand
         for the sign.
         """
         g = self.graph
         if value.op == "neg":
-            inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written)
+            inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written, whole)
             return None if inner is None else g.neg(inner)
         if value.op == "mul" and value.args[0].op == "number":  # a positive factor, which does not change the sign
-            return self.side(value.args[1], rewritten, jumps, more, written)
+            return self.side(value.args[1], rewritten, jumps, more, written, whole)
         if keeps_sign(g, value):
             return g.one
         if not _moves(rewritten):  # depends on signs only, so it may be 0 for a while: no crossing to detect
@@ -185,7 +197,7 @@ class Sides:
             raise GraphError(f"the equations have corners or jumps on more than {MAX_SWITCHES} surfaces")
         op, k = "side" if value.kind == STATED else "clock", len(self.switches)
         mode = g.leaf(f"mode_{op}", k)
-        switch = Switch(value, g.leaf(op, k), mode, value if written is None else written, jumps)
+        switch = Switch(value, g.leaf(op, k), mode, value if written is None else written, jumps, whole)
         self.switches.append(switch)
         return switch.side if jumps else switch.mode
 
@@ -255,6 +267,51 @@ class Sides:
         steps = [self._after(e, g.zero, g.number(2.0)) for e in rises]
         steps += [self._after(e, g.zero, g.number(-2.0)) for e in falls]
         return g.node("add", wave, *steps)
+
+    def _floor(self, node: Node, rewritten: Node, more: bool) -> Node | None:
+        """Return a floor with the sign of sin(pi u), which changes where its argument u passes a whole number; jumps at
+        computed instants if u is n f t + a, n integer. None if u varies by jumps alone.
+
+        Each side is written such that it stays the same half a unit beyond the numbers where it ends.
+        """
+        g = self.graph
+        if not _moves(rewritten):
+            return None
+        if node.kind == TIMED and more and (found := self._count(node)) is not None:
+            return found
+        surface = self._surface[node.args[0].number]
+        value, own = (g.call("sin", g.mul(g.number(math.pi), u)) for u in (surface, rewritten))
+        side = self.side(value, own, True, more, node.args[0], whole=True)
+        if side is None:
+            return None
+        half, quarter = g.mul(g.number(0.5), rewritten), g.number(0.25)
+        even, odd = (g.mul(g.number(2.0), g.call("floor", u)) for u in (g.add(half, quarter), g.sub(half, quarter)))
+        return g.choice(side, even, g.add(odd, g.one))
+
+    def _count(self, node: Node) -> Node | None:
+        """Return a floor as jumps at computed instants; None unless its argument is n f t + a, n integer."""
+        g, u = self.graph, node.args[0]
+        (slope,) = derivatives(g, (u,), {g.leaf("time"): g.one})
+        (offset,) = _at_time_zero(g, u)
+        way = -1.0 if slope.op == "neg" else 1.0
+        count = _multiple_of(g.mul(g.number(way), slope), g.leaf("frequency"))
+        if count is None or offset.kind != CONSTANT:
+            return None
+        steps = []
+        for instant in self._at_whole(g.mul(g.number(way), offset), count):
+            steps.append(self._after(instant, g.zero, g.number(way)))
+        # an instant this near to the end of the period counts as its begin, see `runtime.within`
+        begin = g.call("floor", g.sub(offset, g.number(way * 1e-9 * count)))
+        return g.node("add", begin, *steps)
+
+    def _at_whole(self, offset: Node, count: int) -> list[Instant]:
+        """Return the instants of a period at which count f t + offset is a whole number."""
+        g, found = self.graph, []
+        for j in range(count):
+            turns = g.div(g.add(g.number(j), g.neg(offset)), g.number(count))
+            share = g.sub(turns, g.call("floor", turns))
+            found.append(self._instant(g.div(share, g.leaf("frequency"))))
+        return found
 
     def _first(self, ranks: list[Node]) -> Node:
         found = ranks[0]

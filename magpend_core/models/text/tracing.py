@@ -168,7 +168,13 @@ class Traced(NDArrayOperatorsMixin):
     def __complex__(self) -> complex:
         raise UntraceableError(f"a complex number is made here; {_REAL}")
 
-    __int__ = __round__ = __trunc__ = __floor__ = __ceil__ = __float__
+    __int__ = __round__ = __trunc__ = __float__
+
+    def __floor__(self) -> Traced:
+        return _floor(self)
+
+    def __ceil__(self) -> Traced:
+        return _ceil(self)
 
 
 class TracedArray(np.ndarray):
@@ -332,11 +338,13 @@ def _heaviside(x: Any, at_zero: Any) -> Traced:
 
 
 def _remainder(a: Any, b: Any) -> Traced:
-    return Traced("remainder", (number(a), number(b)))
+    found = _calls("mod")(a, b)
+    return found if found.is_number() else Traced("remainder", found.args)
 
 
 _sin, _sqrt, _exp, _log = (_calls(function) for function in ("sin", "sqrt", "exp", "log"))
 _sign, _abs, _min, _max = (_calls(function) for function in ("sign", "abs", "min", "max"))
+_floor, _ceil = _calls("floor"), _calls("ceil")
 _less, _greater = _compares("<", lambda a, b: a < b), _compares(">", lambda a, b: a > b)
 
 RULES: dict[str, Callable[..., Any]] = {
@@ -368,7 +376,11 @@ RULES: dict[str, Callable[..., Any]] = {
     **{f: lambda x: _multiply(x, math.pi / 180.0) for f in ("radians", "deg2rad")},
     **{f: lambda x: _multiply(x, 180.0 / math.pi) for f in ("degrees", "rad2deg")},
     "heaviside": _heaviside,
-    **{f: _remainder for f in ("remainder", "fmod")},
+    "floor": _floor,
+    "ceil": _ceil,
+    "floor_divide": lambda a, b: _floor(_divide(a, b)),
+    "remainder": _remainder,
+    "fmod": lambda a, b: where(_less(a, 0.0), _negative(_remainder(_negative(a), _abs(b))), _remainder(a, _abs(b))),
     "less": _less,
     "greater": _greater,
     "less_equal": _compares("<=", lambda a, b: a <= b),
@@ -451,7 +463,10 @@ def _applied(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Mappi
 
 def _no_equivalent(what: str) -> str:
     known = "sqrt, exp, log, sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, tanh, abs, sign, heaviside"
-    return f"{what} has no equivalent in the text of a model; use {known}, maximum, minimum, clip, where, interp"
+    return (
+        f"{what} has no equivalent in the text of a model; use {known}, floor, ceil, maximum, minimum, clip, where, "
+        "interp"
+    )
 
 
 def _called(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:

@@ -176,6 +176,12 @@ def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
         "abs(sign(x) - sign(v))",
         "sign(sin(2*pi*f*t) - 0.2)",
         "abs(cos(6*pi*f*t))*x",
+        "floor(3*x + 0.1)*v + ceil(v/0.4)",
+        "mod(x, 0.7) + mod(-v, a)*x + mod(x, b)",
+        "heaviside(x - 0.5)*v + heaviside(-v)",
+        "floor(x*v + sign(x)/2)",
+        "mod(3*f*t + a, 1)*x + floor(2*x - sin(2*pi*f*t))",
+        "mod(t, 1/(2*f)) + mod(0.3 - f*t, 1)",
     ],
 )
 def test_rates__on_either_side_of_a_corner(text):
@@ -255,6 +261,8 @@ def exact(name, x, v, a):
         "f_min": lambda: min(x, a),
         "f_max": lambda: max(x, a),
         "f_sign": lambda: (x > 0) - (x < 0),
+        "f_heaviside": lambda: x >= 0,
+        "f_mod": lambda: x - a * m.floor(x / a),
         "f_atan2": lambda: m.atan2(x, a),
     }
     return own[name]() if name in own else getattr(m, name.removeprefix("f_"))(x)

@@ -22,6 +22,8 @@ def faults(rate, define=None, **values):
     [
         ("k + 1/x", "1/x", "division by 0"),
         ("log(x)", "log(x)", "logarithm of 0"),
+        ("ln(log10(x))", "log10(x)", "logarithm of 0"),
+        ("mod(k, x)", "mod(k, x)", "remainder of a division by 0"),
         ("sin(log(x - 1))", "log(x - 1)", "logarithm of -1"),
         ("sqrt(x - g)", "sqrt(x - g)", "square root of -2"),
         ("asin(g)", "asin(g)", "asin of 2, which is not between -1 and 1"),

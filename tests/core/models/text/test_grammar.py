@@ -45,6 +45,10 @@ def value(text):
         ("- - x + +y", 0.7 - 1.3),
         (".5e1 + 1.E-2", 5.01),
         ("min(x, y, w) + max(x, y, k)", -1.3 + 3.0),
+        ("floor(y) + 10*ceil(y) + 100*floor(-k)", -2 - 10 - 300),
+        ("mod(y, k) + 10*mod(y, -k)", 1.7 - 13.0),
+        ("heaviside(x) + 10*heaviside(0*x) + 100*heaviside(y)", 11.0),
+        ("ln(w) - log(w) + log10(w)", math.log10(2.25)),
         ("where(x < y or not w <= k, 1, where(x > 0 and y < 0, 2, 3))", 2.0),
         ("square(2.25, 0.5) + square(-0.25, 0.5)", 0.0),
         ("sign(y)*abs(y) - atan2(y, x)", -1.3 - math.atan2(-1.3, 0.7)),
@@ -67,7 +71,8 @@ def test_parse__means_what_python_means(text, wanted):
         ("x y", "'y' at character 3 follows 'x' without a sign"),
         ("x(1)", "unknown function 'x' at character 1"),
         ("sine(x)", "unknown function 'sine' at character 1; did you mean sin"),
-        ("ln(x)", "here it is log"),
+        ("heav(x)", "here it is heaviside"),
+        ("if(x)", "here it is where"),
         ("x^y^2", "'^' at character 4: a power of a power"),
         ("x^-y**2", "a power of a power"),
         ("(x < 1)^2", "a condition stands at character 4 where '^' needs a number"),
@@ -117,10 +122,10 @@ def test_parse__reads_a_caret_as_a_power(text, same):
 
 def test_parse__says_all_that_is_wrong():
     with pytest.raises(GrammarError) as error:
-        parse("sine(x) + ln(y, 2) + (x < 1) + sin(x, y) + w + q*1e999)")
+        parse("sine(x) + lg(y, 2) + (x < 1) + sin(x, y) + w + q*1e999)")
     assert [problem.split(" at ")[0] for problem in error.value.problems] == [
         "unknown function 'sine'",
-        "unknown function 'ln'",
+        "unknown function 'lg'",
         "a condition stands",
         "sin",
         "the number",

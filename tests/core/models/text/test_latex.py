@@ -30,6 +30,9 @@ from tests.core.flows import table
         ("sqrt(a + b)", r"\sqrt{a + b}"),
         ("abs(x)*x", r"\left|x\right| \, x"),
         ("sin(2*pi*f*t)", r"\sin\left(2 \, \pi \, f \, t\right)"),
+        ("floor(x)*ceil(a/b)", r"\left\lfloor x \right\rfloor \, \left\lceil \frac{a}{b} \right\rceil"),
+        ("heaviside(x) + mod(x, b)", r"\Theta\left(x\right) + \operatorname{mod}\left(x, b\right)"),
+        ("ln(x)/log10(x)", r"\frac{\ln\left(x\right)}{\log_{10}\left(x\right)}"),
         ("atan2(y, x)", r"\operatorname{atan2}\left(y, x\right)"),
         (
             "where(x > 0 and y <= 1, a, b)",
