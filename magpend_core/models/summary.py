@@ -77,9 +77,9 @@ def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
     from magpend_core.models.text.latex import equations_of
 
     own = model.definition
-    needed = own.used(own.dynamics)
-    written = {name: str(text) for name, text in own.table.get("define", {}).items() if name in needed}
-    equations = {name: str(own.table["equations"][name]) for name in own.equations}
+    used = {line.key.text for line in own.lines_of(own.dynamics)}
+    written = {key: str(text) for key, text in own.table.get("define", {}).items() if key in used}
+    equations = {own.lines[name].key.text: own.lines[name].text for name in own.equations}
     return written, equations, equations_of(own)
 
 

@@ -77,7 +77,7 @@ def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping
                 at = ", ".join(f"{n} = {point[n]:.6g}" for n in (FREQUENCY, *model.parameter_names))
                 problems.setdefault(
                     name,
-                    f"model.equations.{name} = {definition.table['equations'][name]!r}: does not repeat after a period "
+                    f"model.equations.{name} = {definition.lines[name].text!r}: does not repeat after a period "
                     f"of the drive, 1/f, at {at}. Time must enter with this period: write 2*pi*f*t, or phase, and give "
                     f"the drive's rate as frequency_hz.{_hiding(model, name)}",
                 )

@@ -19,6 +19,7 @@ import numpy as np
 
 from magpend_core.models import load_model
 from magpend_core.models.text.definition import Definition
+from magpend_core.models.text.keys import flat
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.sizes import natural_size
@@ -58,7 +59,7 @@ def with_sizes(spec: Spec, kept: Spec | None = None) -> Spec:
     model = load_model(spec.reference)
     if not isinstance(model, TextModel) or model.shipped:
         return spec
-    given = model.definition.table["states"]
+    given = flat(model.definition.table["states"])
     open_states = [s.name for s in model.states if not s.on_circle and not _says(given[s.name])]
     if not open_states:
         return spec

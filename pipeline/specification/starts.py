@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BaseModel, Discriminator, Field, Tag, create_model, model_validator
 
 from magpend_core.models.model import Model
+from magpend_core.models.text.keys import read_key
 from pipeline.specification.problems import shown
 from pipeline.specification.tables import MAX_POINTS, Integration, Range, Table
 
@@ -87,7 +88,10 @@ class _PerState(Table):
     @classmethod
     def _flat(cls, table: Any) -> Any:
         """Move the entries of the table ``states`` to their aliases."""
-        below = table.get(STATES) if isinstance(table, Mapping) else None
+        if not isinstance(table, Mapping):
+            return table
+        table = _elements(table)
+        below = table.get(STATES)
         if below is None:
             return table
         if not isinstance(below, Mapping):
@@ -95,7 +99,7 @@ class _PerState(Table):
         if twice := [key for key in below if key in table and key not in cls.own_keys]:
             raise ValueError(f"{twice[0]} and {STATES}.{twice[0]} are both given; keep one.")
         beside = {key: value for key, value in table.items() if key != STATES}
-        return beside | {alias_of(key, cls.own_keys, cls.fields_by_key): value for key, value in below.items()}
+        return beside | {alias_of(key, cls.own_keys, cls.fields_by_key): v for key, v in _elements(below).items()}
 
     @model_validator(mode="after")
     def _one_unit(self) -> _PerState:
@@ -121,6 +125,16 @@ class _PerState(Table):
         own = {key: value for key, value in found.items() if not key.startswith(BELOW)}
         below = {key.removeprefix(BELOW): value for key, value in found.items() if key.startswith(BELOW)}
         return {**own, **({STATES: below} if below else {})}
+
+
+def _elements(table: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return a table with an entry for each state that a key such as ``x[1..20]`` stands for."""
+    several = {key: read_key(key) for key in table if isinstance(key, str) and "[" in key}
+    return {
+        name: value
+        for key, value in table.items()
+        for name, _ in (several[key].elements if key in several else [(key, None)])
+    }
 
 
 def alias_of(key: str, own: Sequence[str], known: Container[str] = ()) -> str:

@@ -12,6 +12,7 @@ from magpend_core.models.clock import DRIVEN, MAP, STROBED, Clock
 from magpend_core.models.model import Mirror, Preset, Quantity, State
 from magpend_core.models.parameters import Parameter
 from magpend_core.models.text.grammar import Tree, names
+from magpend_core.models.text.keys import Line, calls
 from magpend_core.models.text.writing import written
 
 OMEGA = "omega"
@@ -73,6 +74,8 @@ class Definition:
         The first of the presets has the values of the table of parameters.
     table : dict
         The text as plain data.
+    lines : mapping of str to Line
+        The line of the text of each definition, function and state.
     is_map : bool
         Whether the equations give the next state, and not the rate of the state.
     """
@@ -93,6 +96,7 @@ class Definition:
     presets: tuple[Preset, ...]
     classifier: ClassifierText | None
     table: Mapping[str, Any] = field(repr=False)
+    lines: Mapping[str, Line] = field(repr=False)
     is_map: bool = False
 
     def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
@@ -111,6 +115,24 @@ class Definition:
                 pending.append((name, True))
                 pending += [(inner, False) for inner, _ in names(self.define[name])][::-1]
         return tuple(found)
+
+    def lines_of(self, trees: Iterable[Tree]) -> list[Line]:
+        """Return the lines of the definitions and functions that expressions use, each after those that it needs."""
+        found: dict[str, Line] = {}
+        functions = {name for name, line in self.lines.items() if line.key.arguments is not None}
+
+        def add(line: Line) -> None:
+            for name in calls(line.tree, functions):
+                add(self.lines[name])
+            found[line.key.text] = line
+
+        for name in self.used(trees):
+            if name in self.define:
+                add(self.lines[name])
+        for name in self.equations:
+            for called in calls(self.lines[name].tree, functions):
+                add(self.lines[called])
+        return list(found.values())
 
     @property
     def dynamics(self) -> list[Tree]:

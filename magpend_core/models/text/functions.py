@@ -441,7 +441,7 @@ class _Call:
             expected.append(rates)
         if found and (wrong := _differs(np.array(expected), np.array(found))) is not None:
             k, i = wrong
-            text = definition.table["equations"][self.states[i]]
+            text = definition.lines[self.states[i]].text
             raise self.error(
                 f"at t = {rows[k].t:.3g} the rate of {self.states[i]} is {expected[k][i]:.6g}, and {found[k][i]:.6g} "
                 f"by the text that was read from it, {text[:80]}. A function must depend on its arguments alone, and "

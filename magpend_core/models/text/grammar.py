@@ -1,8 +1,9 @@
 """Parse arithmetic expressions given as text, with a whitelist and without evaluating them.
 
-Numbers, names, ``+ - * / **``, comparisons, ``and or not``, and calls of `FUNCTIONS`. There is nothing else:
-no attributes, no indices, no text, no assignment. Length, nesting, and what numbers may be are bounded, so
-that whatever is given ends in a tree or in one `GrammarError`, in time proportional to its length.
+Numbers, names, ``+ - * / **``, comparisons, ``and or not``, calls of `FUNCTIONS`, elements ``x[i + 1]``, and
+``sum(j=1..20, x[j])``. There is nothing else: no attributes, no text, no assignment. Length, nesting,
+and what numbers may be are bounded, so that whatever is given ends in a tree or in one `GrammarError`, in time
+proportional to its length.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import itertools
 import keyword
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from magpend_core.models.parameters import near_names
 
@@ -71,8 +73,8 @@ ELSEWHERE = {
 """What other languages call it."""
 
 _TOKEN = re.compile(
-    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
-    r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/(),<>^=])"
+    r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
+    r"|(?P<sign>\*\*|<=|>=|==|!=|\.\.|[-+*/(),<>^=\[\]])"
 )
 _SPACE = re.compile(r"[ \t\r\n]*")
 _COMPARISONS = ("<", "<=", ">", ">=")
@@ -116,7 +118,8 @@ class Tree:
     kind : str
         ``number``, ``name``, ``call``, ``sum``, ``product``, ``negative``, ``inverse``, ``power``,
         ``compare``, ``and``, ``or`` or ``not``. A difference is the sum with a negative, a quotient the
-        product with an inverse.
+        product with an inverse. Before it is written out (`calls`) also ``index``, an element of the name `value`,
+        and ``total``, a sum over the index `value`, of lowest and highest index and term.
     at : int
         Character of the text, from 1.
     value : float or str
@@ -134,13 +137,20 @@ class Tree:
         return self.kind in ("compare", "and", "or", "not")
 
 
-def parse(text: object) -> Tree:
+NONE: Mapping[str, Any] = {}
+
+
+def parse(text: object, functions: Mapping[str, int] = NONE, known: Mapping[str, str] = NONE) -> Tree:
     """Parse an arithmetic expression.
 
     Parameters
     ----------
     text
         A string; a number, as TOML has it without quotes, stands for itself.
+    functions
+        Numbers of arguments of further functions, by name.
+    known
+        What names mean, such as ``state``, for messages.
 
     Raises
     ------
@@ -151,27 +161,27 @@ def parse(text: object) -> Tree:
         if not -1e300 < text < 1e300:
             raise GrammarError("is not a finite number")
         return _number(float(text), 1)
-    tree = _parse(text)
+    tree = _parse(text, functions, known)
     if tree.is_condition:
         raise GrammarError("is true or false and not a number; use where(condition, a, b)")
     return tree
 
 
-def parse_condition(text: object) -> Tree:
-    """Parse a condition, such as ``x < 0 and v > 1``.
+def parse_condition(text: object, functions: Mapping[str, int] = NONE, known: Mapping[str, str] = NONE) -> Tree:
+    """Parse a condition, such as ``x < 0 and v > 1``; arguments are those of `parse`.
 
     Raises
     ------
     GrammarError
         If it is none.
     """
-    tree = _parse(text)
+    tree = _parse(text, functions, known)
     if not tree.is_condition:
         raise GrammarError("must be a condition, such as x < 0")
     return tree
 
 
-def _parse(text: object) -> Tree:
+def _parse(text: object, functions: Mapping[str, int], known: Mapping[str, str]) -> Tree:
     if not isinstance(text, str):
         raise GrammarError("must be an expression in quotes")
     if len(text) > MAX_LENGTH:
@@ -180,39 +190,56 @@ def _parse(text: object) -> Tree:
         raise GrammarError("is empty; write an expression")
     tokens, problems = _tokens(text)
     tree = None
+    numbers = {**FUNCTIONS, **{name: (n, n) for name, n in functions.items()}}
     if not problems:
-        parser = _Parser(tokens)
+        parser = _Parser(tokens, numbers, known)
         problems = parser.problems
         try:
             tree = parser.whole()
         except GrammarError as error:
             problems += error.problems
     if tree is None:
-        problems += [p for p in _unknown_functions(tokens) if p not in problems]
+        problems += [p for p in _unknown_functions(tokens, numbers, known) if p not in problems]
     if tree is None or problems:
         raise GrammarError(problems, _names_among(tokens))
     return tree
 
 
-def _unknown_functions(tokens: list[_Token]) -> Iterator[str]:
+def _unknown_functions(
+    tokens: list[_Token], functions: Mapping[str, tuple[int, int]], known: Mapping[str, str]
+) -> Iterator[str]:
     for token, after in itertools.pairwise(tokens):
         is_call = token.kind == "name" and after.text == "(" and token.text not in ("and", "or", "not")
-        if is_call and token.text not in FUNCTIONS:
-            yield unknown(token.text, token.at, FUNCTIONS, "function")
+        if is_call and token.text not in functions:
+            yield _no_function(token, functions, known)
+
+
+def _no_function(token: _Token, functions: Iterable[str], known: Mapping[str, str]) -> str:
+    if token.text in known:
+        return (
+            f"{token.text!r} at character {token.at} is a {known[token.text]} and takes no arguments; for a product "
+            f"write {token.text}*(...)"
+        )
+    return unknown(token.text, token.at, functions, "function")
 
 
 def _names_among(tokens: list[_Token]) -> Iterator[tuple[str, int]]:
+    left_out = {"and", "or", "not"} | {token.text for token, after in itertools.pairwise(tokens) if after.text == "="}
     for token, after in itertools.pairwise(tokens):
-        if token.kind == "name" and after.text != "(" and token.text not in ("and", "or", "not"):
+        if token.kind == "name" and after.text not in ("(", "[") and token.text not in left_out:
             yield token.text, token.at
 
 
 def names(tree: Tree) -> Iterator[tuple[str, int]]:
-    """Yield each name in an expression with its character position; names of functions are left out."""
+    """Yield each name in an expression with its character position; names of functions, of elements and of the indices
+    of sums are left out.
+    """
     if tree.kind == "name":
         yield str(tree.value), tree.at
-    for arg in tree.args:
+    for arg in tree.args[:2] if tree.kind == "total" else tree.args:
         yield from names(arg)
+    if tree.kind == "total":
+        yield from (found for found in names(tree.args[2]) if found[0] != tree.value)
 
 
 def name_problem(name: object) -> str | None:
@@ -263,8 +290,10 @@ def _tokens(text: str) -> tuple[list[_Token], list[str]]:
 class _Parser:
     """Parser of expressions by precedence climbing; each level of brackets takes two nested calls."""
 
-    def __init__(self, tokens: list[_Token]) -> None:
-        self.tokens = tokens
+    def __init__(
+        self, tokens: list[_Token], functions: Mapping[str, tuple[int, int]], known: Mapping[str, str]
+    ) -> None:
+        self.tokens, self.functions, self.known = tokens, functions, known
         self.next = 0
         self.depth = 0
         self.problems: list[str] = []  # those after which the rest can still be read
@@ -383,7 +412,10 @@ class _Parser:
             self.close(token)
             return inner
         if token.kind == "name" and token.text not in ("and", "or"):
-            return self.call(token) if self.token.text == "(" else _name(token)
+            if self.token.text == "[":
+                return self.element(token)
+            is_sum = token.text == "sum" and self.token.text == "("
+            return self.total(token) if is_sum else self.call(token) if self.token.text == "(" else _name(token)
         self.next -= token.kind != "end"
         raise GrammarError(
             "ends where something must follow"
@@ -391,18 +423,45 @@ class _Parser:
             else f"{token.text!r} at character {token.at} cannot stand here"
         )
 
-    def close(self, opened: _Token) -> None:
-        if self.token.text == ")":
+    def close(self, opened: _Token, sign: str = ")") -> None:
+        if self.token.text == sign:
             self.take()
         elif self.token.kind == "end":
-            raise GrammarError(f"the ( at character {opened.at} is not closed")
+            raise GrammarError(f"the {opened.text} at character {opened.at} is not closed")
         else:
             raise self.unexpected(self.token)
 
+    def element(self, name: _Token) -> Tree:
+        """Parse the index of an element, such as ``x[i + 1]``."""
+        opened = self.take()
+        index = self.expression(_OR)
+        self.numbers((index,), opened)
+        self.close(opened, "]")
+        return Tree("index", name.at, _name(name).value, (index,))
+
+    def total(self, name: _Token) -> Tree:
+        """Parse a sum over an index, such as ``sum(j=1..20, x[j])``."""
+        opened, variable = self.take(), self.take()
+        form = GrammarError(f"sum at character {name.at} needs an index with its range: sum(j=1..20, x[j])")
+        if variable.kind != "name" or self.take().text != "=":
+            raise form
+        if (problem := name_problem(variable.text)) is not None:
+            self.problems.append(f"the index {variable.text!r} at character {variable.at} {problem}")
+        low = self.expression(_SUM)
+        if self.take().text != "..":
+            raise form
+        high = self.expression(_SUM)
+        if self.take().text != ",":
+            raise form
+        term = self.expression(_OR)
+        self.numbers((term,), name)
+        self.close(opened)
+        return Tree("total", name.at, variable.text, (low, high, term))
+
     def call(self, name: _Token) -> Tree:
         opened = self.take()
-        if name.text not in FUNCTIONS:
-            self.problems.append(unknown(name.text, name.at, FUNCTIONS, "function"))
+        if name.text not in self.functions:
+            self.problems.append(_no_function(name, self.functions, self.known))
         args: list[Tree] = []
         while self.token.text != ")":
             args.append(self.expression(_OR))
@@ -414,10 +473,11 @@ class _Parser:
         return Tree("call", name.at, "log" if name.text == "ln" else name.text, tuple(args))
 
     def check_arguments(self, name: _Token, args: list[Tree]) -> None:
-        least, most = FUNCTIONS.get(name.text, (0, len(args)))
+        least, most = self.functions.get(name.text, (0, len(args)))
         if not least <= len(args) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
-            self.problems.append(f"{name.text} at character {name.at} has {len(args)} arguments; it takes {wanted}")
+            given = f"{len(args)} argument{'s' * (len(args) != 1)}"
+            self.problems.append(f"{name.text} at character {name.at} has {given}; it takes {wanted}")
         elif name.text == "where":
             if not args[0].is_condition:
                 self.problems.append(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.grammar import Tree
+from magpend_core.models.text.keys import Key
 
 _OR, _AND, _COMPARE, _SUM, _PRODUCT, _POWER, _ATOM = range(7)
 _GREEK = (
@@ -83,17 +84,39 @@ def equations_of(definition: Definition) -> list[str]:
     """Return lines of LaTeX: the definitions that the equations use, then the time derivative of each state."""
     symbols = {s.name: s.symbol for s in definition.states if s.symbol}
     symbols |= {p.name: p.symbol for p in definition.parameters if p.symbol}
-    used = definition.used(definition.dynamics)
-    lines = [
-        f"{symbol_of(name, symbols)} &= {latex_of(definition.define[name], symbols)}"
-        for name in used
-        if name in definition.define
-    ]
-    for name, tree in definition.equations.items():
-        symbol = symbol_of(name, symbols)
+    rates = {line.key.text: line for line in (definition.lines[name] for name in definition.equations)}
+    parts = definition.lines_of(definition.dynamics)
+    lines = [f"{_left(line.key, symbols)} &= {latex_of(line.tree, symbols)}{_range(line.key)}" for line in parts]
+    for line in rates.values():
+        symbol = _left(line.key, symbols)
         rate = rf"{{{symbol}}}'" if definition.is_map else rf"\frac{{\mathrm{{d}}{symbol}}}{{\mathrm{{d}}t}}"
-        lines.append(f"{rate} &= {latex_of(tree, symbols)}")
+        lines.append(f"{rate} &= {latex_of(line.tree, symbols)}{_range(line.key)}")
     return lines
+
+
+def _left(key: Key, symbols: Mapping[str, str]) -> str:
+    """Return the LaTeX of what a key stands for."""
+    if key.arguments is not None:
+        return rf"{symbol_of(key.name, symbols)}\left({', '.join(symbol_of(a, {}) for a in key.arguments)}\right)"
+    if key.indices is None or len(key.indices) == 1:
+        return symbol_of(next(name for name, _ in key.elements), symbols)
+    return _with_index(key.name, symbol_of(key.variable or "i", {}), symbols)
+
+
+def _with_index(name: str, index: str, symbols: Mapping[str, str]) -> str:
+    """Return the LaTeX of an element with an index: that of the name, or of its rate, with a subscript."""
+    symbol = symbols.get(f"{name}1", "")
+    if symbol.endswith("_{1}"):
+        return f"{symbol.removesuffix('_{1}')}_{{{index}}}"
+    head = symbol_of(name, symbols)
+    return f"{head.removesuffix('}')},{index}}}" if "_{" in head else f"{head}_{{{index}}}"
+
+
+def _range(key: Key) -> str:
+    """Return the LaTeX of the values of an index, behind an equation of several elements."""
+    if key.indices is None or len(key.indices) == 1:
+        return ""
+    return rf", \quad {symbol_of(key.variable or 'i', {})} = {key.indices[0]}, \dots, {key.indices[-1]}"
 
 
 def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
@@ -128,6 +151,11 @@ def _written(tree: Tree, symbols: Mapping[str, str]) -> tuple[str, int]:
         return _sum(tree, symbols), _SUM
     if tree.kind == "negative":
         return f"-{_in(tree.args[0], symbols, _PRODUCT)}", _SUM
+    if tree.kind == "index":
+        return _with_index(str(tree.value), latex_of(tree.args[0], {}), symbols), _ATOM
+    if tree.kind == "total":
+        low, high, term = latex_of(tree.args[0], {}), latex_of(tree.args[1], {}), _in(tree.args[2], symbols, _PRODUCT)
+        return rf"\sum_{{{symbol_of(str(tree.value), {})}={low}}}^{{{high}}} {term}", _SUM
     if tree.kind == "compare":
         left, right = (_in(arg, symbols, _SUM) for arg in tree.args)
         return f"{left} {_SIGNS[str(tree.value)]} {right}", _COMPARE
@@ -187,7 +215,7 @@ def _times(parts: list[Tree], symbols: Mapping[str, str]) -> str:
 
 
 def _call(tree: Tree, symbols: Mapping[str, str]) -> str:
-    args = [latex_of(arg, symbols) for arg in tree.args]
+    args, name = [latex_of(arg, symbols) for arg in tree.args], str(tree.value)
     if tree.value == "sqrt":
         return rf"\sqrt{{{args[0]}}}"
     if tree.value == "abs":
@@ -199,4 +227,4 @@ def _call(tree: Tree, symbols: Mapping[str, str]) -> str:
     if tree.value == "where":
         condition, first, second = args
         return rf"\begin{{cases}} {first} & \text{{if }} {condition} \\ {second} & \text{{else}} \end{{cases}}"
-    return rf"{_NAMED[str(tree.value)]}\left({', '.join(args)}\right)"
+    return rf"{_NAMED.get(name, symbol_of(name, symbols))}\left({', '.join(args)}\right)"

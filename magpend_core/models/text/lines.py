@@ -4,6 +4,9 @@
     drive = A*cos(omega*t)              a part with a name
     d = 0.2                             a parameter and its value
 
+    g(u, v) = u*v/(1 + v)           a part with arguments
+    y[i=1..20]' = y[i+1] - y[i]     a rate for each of several states
+
 A comment begins with #. A line with an open bracket goes on in the next one.
 """
 
@@ -18,15 +21,16 @@ import numpy as np
 
 from magpend_core.models.parameters import ParameterError, near_names
 from magpend_core.models.text.grammar import ELSEWHERE, name_problem
+from magpend_core.models.text.keys import read_key
 from magpend_core.models.text.reading import KEYS, read_definition
 from magpend_core.models.text.tables import shown
 
 SUFFIXES = ("", "_dot", "_ddot", "_dddot")
 """Ends of the names of a state's derivatives, by order."""
 
-_LEFT = re.compile(r"\s*([A-Za-z_]\w*)\s*('*)\s*=(?!=)")
+_LEFT = re.compile(r"\s*([A-Za-z_]\w*)\s*(\[[^\[\]]*\]|\([^()]*\)|)\s*('*)\s*=(?!=)")
 _FRACTION = re.compile(r"\s*d([A-Za-z]\w*)\s*/\s*dt\s*=")
-_PRIMED = re.compile(r"([A-Za-z_]\w*)('+)")
+_PRIMED = re.compile(r"([A-Za-z_]\w*)(\[[^\[\]]*\]|)('+)")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _QUOTES = str.maketrans({"′": "'", "’": "'", "″": "''"})
 _UNKNOWN = re.compile(r"unknown name '(\w+)'")
@@ -36,17 +40,25 @@ _FORMS = "write NAME' = ... for a rate, NAME = ... for a part, or NAME = NUMBER 
 def is_equations(text: str) -> bool:
     """Return whether a text is lines of equations: whether any line has a primed name on its left side."""
     matches = (_LEFT.match(line) for line in text.translate(_QUOTES).splitlines())
-    return any(match is not None and match[2] for match in matches)
+    return any(match is not None and match[3] for match in matches)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A line: the name on its left side, the order of the derivative, the right side, and its place for messages."""
+    """A line: the name on its left side, the order of the derivative, the right side, its place for messages, and the
+    index or the arguments behind the name.
+    """
 
     name: str
     order: int
     right: str
     place: str
+    behind: str = ""
+
+    @property
+    def left(self) -> str:
+        """The left side."""
+        return self.name + self.behind + "'" * self.order
 
 
 @dataclass
@@ -102,16 +114,23 @@ def read_lines(
     orders = _orders(entries, found)
     if tables.get("kind") == "map":
         found.problems += [
-            f"{e.place}: {e.name}{chr(39) * e.order}: an equation of a map has one prime, {e.name}' = ... for the next "
+            f"{e.place}: {e.left}: an equation of a map has one prime, {e.name}' = ... for the next "
             f"{e.name}; make the {e.name} before a state of its own."
             for e in entries
             if e.order > 1
         ]
     names = {name: [name + suffix for suffix in SUFFIXES[:order]] for name, order in orders.items()}
+    spans = {name: _span([e for e in entries if e.order and e.name == name], found) for name in names}
     rates: dict[str, Any] = {}
+    states: dict[str, str] = {}
     for k in range(max(orders.values(), default=0)):  # first all positions, then all their rates
-        rates |= {own[k]: own[k + 1] for own in names.values() if k + 1 < len(own)}
-        rates |= {own[k]: "" for own in names.values() if k + 1 == len(own)}
+        for name in [*(n for n in names if k + 1 < orders[n]), *(n for n in names if k + 1 == orders[n])]:
+            states[names[name][k]] = spans[name]
+            if k + 1 < orders[name]:
+                every, one = (spans[name].replace("[", "[i="), "[i]") if spans[name] else ("", "")
+                rates[names[name][k] + every] = names[name][k + 1] + one
+            else:
+                rates |= {names[name][k] + e.behind: "" for e in entries if e.order and e.name == name}
     parts: dict[str, Any] = {}
     numbers: dict[str, Any] = {}
     for entry in entries:
@@ -119,18 +138,18 @@ def read_lines(
         if entry.order and orders.get(entry.name) != entry.order:
             continue  # reported already
         if entry.order:
-            state = entry.name + SUFFIXES[entry.order - 1]
+            state = entry.name + SUFFIXES[entry.order - 1] + entry.behind
             if rates.get(state) == "":
                 rates[state], found.places[f"equations.{state}"] = right, entry.place
-        elif entry.name in parts or entry.name in numbers:
-            found.problems.append(f"{entry.place}: {entry.name} is given in a line before; remove one of the two.")
-        elif _NUMBER.fullmatch(right):
-            numbers[entry.name] = float(right) if re.search("[.eE]", right) else int(right)
-            found.places[f"parameters.{entry.name}"] = entry.place
+        elif entry.left in parts or entry.left in numbers:
+            found.problems.append(f"{entry.place}: {entry.left} is given in a line before; remove one of the two.")
+        elif _NUMBER.fullmatch(right) and not entry.behind.startswith("("):
+            numbers[entry.left] = float(right) if re.search("[.eE]", right) else int(right)
+            found.places[f"parameters.{entry.left}"] = entry.place
         else:
-            parts[entry.name], found.places[f"define.{entry.name}"] = right, entry.place
+            parts[entry.left], found.places[f"define.{entry.left}"] = right, entry.place
     table = {"name": "model", **_plain({key: value for key, value in tables.items() if value is not None})}
-    table["states"] = _states(table.get("states", {}), names, rates, found)
+    table["states"] = _states(table.get("states", {}), names, states, found)
     if every := _parameters(numbers, table.get("parameters", {}), _plain(values or {}), found):
         table["parameters"] = every
     if parts or "define" in table:
@@ -138,6 +157,21 @@ def read_lines(
     table["equations"] = rates
     found.table = {key: table[key] for key in (*KEYS, *table) if key in table}
     return found
+
+
+def _span(entries: list[Entry], found: Lines) -> str:
+    """Return the range of the indices of a state's equations, such as ``[1..20]``; empty for a state without index."""
+    if not entries[0].behind:
+        return ""
+    keys = [read_key(entry.name + entry.behind) for entry in entries]
+    for entry, key in zip(entries, keys, strict=True):
+        if key.problem:
+            found.problems.append(f"{entry.place}: {entry.left}: {key.problem}.")
+    indices = sorted({k for key in keys for k in key.indices or ()}) or [1]
+    if missing := sorted(set(range(indices[0], indices[-1])) - set(indices)):
+        name = entries[0].name
+        found.problems.append(f"{entries[0].place}: there is no equation for {name}[{missing[0]}].")
+    return f"[{indices[0]}..{indices[-1]}]"
 
 
 def expanded(table: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -162,20 +196,20 @@ def _entries(equations: str | Mapping[str, Any], found: Lines) -> Iterator[Entry
         yield from _entries_of_text(equations.translate(_QUOTES), found)
         return
     for key, value in equations.items():
-        match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*('*)\s*", str(key).translate(_QUOTES))
+        match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*(\[[^\[\]]*\]|)\s*('*)\s*", str(key).translate(_QUOTES))
         if match is None:
             found.problems.append(f"equations.{str(key)[:60]}: must be a name, or a name with primes, such as x''.")
         elif isinstance(value, bool) or not isinstance(value, str | float | int):
             found.problems.append(f"equations.{key} = {shown(value)}: must be an expression in quotes.")
         else:
-            yield Entry(match[1], max(1, len(match[2])), str(value), f"equations[{key!r}]")
+            yield Entry(match[1], max(1, len(match[3])), str(value), f"equations[{key!r}]", match[2])
 
 
 def _entries_of_text(text: str, found: Lines) -> Iterator[Entry]:
     for number, line in _whole_lines(text):
         match, place = _LEFT.match(line), f"line {number}"
         if match is not None:
-            yield Entry(match[1], len(match[2]), line[match.end() :].strip(), place)
+            yield Entry(match[1], len(match[3]), line[match.end() :].strip(), place, match[2])
             continue
         fraction, begin = _FRACTION.match(line), _PRIMED.match(line)
         how = f"write {fraction[1]}' = ... for this rate" if fraction else _FORMS
@@ -183,7 +217,7 @@ def _entries_of_text(text: str, found: Lines) -> Iterator[Entry]:
         if fraction is not None:  # the state is known all the same, so that other lines can use it
             yield Entry(fraction[1], 1, "0", place)
         elif begin is not None:
-            yield Entry(begin[1], len(begin[2]), "0", place)
+            yield Entry(begin[1], len(begin[3]), "0", place, begin[2])
 
 
 def _whole_lines(text: str) -> Iterator[tuple[int, str]]:
@@ -207,15 +241,19 @@ def _orders(entries: list[Entry], found: Lines) -> dict[str, int]:
     for entry in entries:
         if not entry.order:
             continue
-        if entry.name in first:
-            before = first[entry.name].place
+        before = first.get(entry.name)
+        if before is not None and not (before.behind and entry.behind and before.order == entry.order):
             found.problems.append(
-                f"{entry.place}: {entry.name} has an equation already ({before}); remove one of the two."
+                f"{entry.place}: {entry.name} has an equation already ({before.place}); remove one of the two."
             )
+        elif before is not None:
+            continue
+        elif entry.behind.startswith("("):
+            found.problems.append(f"{entry.place}: {entry.left}: a rate has no arguments; take them out.")
         elif entry.order > len(SUFFIXES):
-            left = entry.name + "'" * entry.order
             found.problems.append(
-                f"{entry.place}: {left}: an equation has at most {len(SUFFIXES)} primes; name a derivative yourself."
+                f"{entry.place}: {entry.left}: an equation has at most {len(SUFFIXES)} primes; name a derivative "
+                "yourself."
             )
         elif (problem := name_problem(entry.name)) is not None:
             found.problems.append(f"{entry.place}: {entry.name} {problem}.")
@@ -240,11 +278,11 @@ def _unprimed(entry: Entry, names: Mapping[str, list[str]], found: Lines) -> str
     """Return the right side of a line with ``x'`` replaced by the state's name; report primes that are no state."""
 
     def state(match: re.Match[str]) -> str:
-        name, order = match[1], len(match[2])
+        name, order = match[1], len(match[3])
         if order < len(names.get(name, ())):
-            return names[name][order]
+            return names[name][order] + match[2]
         why = (
-            f"there is no equation {name}{match[2]}' = ...; {near_names(name, names, 'states')}"
+            f"there is no equation {name}{match[3]}' = ...; {near_names(name, names, 'states')}"
             if name not in names
             else f"it is the rate that an equation gives; define it in a line of its own, rate = ..., and use {name}"
             f"{chr(39) * len(names[name])} = rate."
@@ -255,13 +293,23 @@ def _unprimed(entry: Entry, names: Mapping[str, list[str]], found: Lines) -> str
     return _PRIMED.sub(state, entry.right)
 
 
-def _states(given: Any, names: Mapping[str, list[str]], rates: Mapping[str, Any], found: Lines) -> dict[str, Any] | Any:
-    """Return the states in the order of their equations, with units; a derivative's unit follows from its state's."""
+def _states(
+    given: Any, names: Mapping[str, list[str]], states: Mapping[str, str], found: Lines
+) -> dict[str, Any] | Any:
+    """Return the states in the order of their equations, with units; a derivative's unit follows from its state's.
+
+    `states` has the range of the indices of each, which is empty for none. An entry under the name of a state holds for
+    all its indices.
+    """
     if not isinstance(given, Mapping):
         return given  # the reader of the table reports it
+    given = {
+        key.removesuffix(states.get(read_key(key).name, "")) if isinstance(key, str) else key: value
+        for key, value in given.items()
+    }
     for name in given:
-        if name not in rates:
-            hint = near_names(str(name)[:60], rates, "states")
+        if name not in states:
+            hint = near_names(str(name)[:60], states, "states")
             found.problems.append(f"states.{str(name)[:60]}: no equation gives its rate; {hint}")
     units: dict[str, Any] = {}
     for own in names.values():
@@ -270,7 +318,7 @@ def _states(given: Any, names: Mapping[str, list[str]], rates: Mapping[str, Any]
         if isinstance(unit, str):
             for k, name in enumerate(own):
                 units[name] = unit if k == 0 or unit == "1" else f"{unit}/s{k if k > 1 else ''}"
-    return {name: given.get(name, units.get(name, "1")) for name in rates}
+    return {name + span: given.get(name, units.get(name, "1")) for name, span in states.items()}
 
 
 def _parameters(numbers: Mapping[str, Any], tables: Any, values: Mapping[str, Any], found: Lines) -> Any:

@@ -14,11 +14,13 @@ from typing import Any
 
 from magpend_core.models.model import Mirror, Quantity, State
 from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
+from magpend_core.models.text.calls import Function
 from magpend_core.models.text.definition import OMEGA, Definition, Impact
-from magpend_core.models.text.grammar import Tree, names
+from magpend_core.models.text.grammar import Tree, name_problem, names
+from magpend_core.models.text.keys import Key, Line, calls, flat, read_key
 from magpend_core.models.text.latex import symbol_of
 from magpend_core.models.text.scene import mirror_problem
-from magpend_core.models.text.tables import shown
+from magpend_core.models.text.tables import FUNCTION, shown
 from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsReader
 from magpend_core.sizes import MAX_STATES
 
@@ -111,7 +113,7 @@ class _Reading(ViewsReader):
         self.text(table, "function", self.place, most=MAX_FUNCTION)  # for readers; never executed
         self._model_name(head["name"], "name" in table)
         states = self._states(table.get("states", {}))
-        if isinstance(table.get("states"), Mapping) and len(table["states"]) > MAX_STATES:
+        if isinstance(table.get("states"), Mapping) and not states:
             return None  # every use of a state would be a problem of its own
         parameters, values = self._parameters(table.get("parameters", {}))
         define = self._defined(self._with_omega(table))
@@ -142,6 +144,7 @@ class _Reading(ViewsReader):
             presets=presets,
             classifier=classifier,
             table=_plain(table),
+            lines=self.lines,
         )
 
     def _model_name(self, name: str, given: bool) -> None:
@@ -184,6 +187,14 @@ class _Reading(ViewsReader):
         self.keys(entry, place, keys)
         return entry
 
+    def _flat(self, given: Any, place: str, most: int, what: str) -> dict[str, Any]:
+        """Return a table with an entry for each name that its keys stand for."""
+        table = self.table(given, place, most, what)
+        for text in table:
+            self._key(text, self.at(place.rpartition(".")[2], text))
+        found = flat(table)
+        return self.table(found, place, most, what) if len(found) > len(table) else found
+
     def _motion(self, entry: Mapping[str, Any], place: str) -> tuple[float, float] | None:
         """Return the least and the largest value of a state in the motion of a run; None if the run gives none."""
         given = entry.get("motion")
@@ -201,7 +212,7 @@ class _Reading(ViewsReader):
 
     def _states(self, given: Any) -> tuple[State, ...]:
         states = []
-        for name, value in self.table(given, self.at("states"), MAX_STATES, "states").items():
+        for name, value in self._flat(given, self.at("states"), MAX_STATES, "states").items():
             place = self.at("states", name)
             if not self._new_name(name, place, "state"):
                 continue
@@ -220,7 +231,7 @@ class _Reading(ViewsReader):
 
     def _parameters(self, given: Any) -> tuple[tuple[Parameter, ...], dict[str, float]]:
         parameters, values = [], {}
-        for name, value in self.table(given, self.at("parameters"), MAX_PARAMETERS, "parameters").items():
+        for name, value in self._flat(given, self.at("parameters"), MAX_PARAMETERS, "parameters").items():
             place = self.at("parameters", name)
             if not self._new_name(name, place, "parameter"):
                 continue
@@ -252,13 +263,67 @@ class _Reading(ViewsReader):
 
     def _defined(self, given: Any) -> dict[str, Tree]:
         table = self.table(given, self.at("define"), MAX_DEFINED, "definitions")
-        table = {name: v for name, v in table.items() if self._new_name(name, self.at("define", name), "definition")}
-        trees = {name: self.expression(v, self.at("define", name), self.known) for name, v in table.items()}
-        found = {name: tree for name, tree in trees.items() if tree is not None}
-        circle = _circle(found)
+        keys = [self._key(text, self.at("define", text)) for text in table]
+        kinds = {key.text: "definition" if key.arguments is None else FUNCTION for key in keys}
+        good = {
+            key.text: all(
+                [self._new_name(name, self.at("define", key.text), kinds[key.text]) for name, _ in key.elements]
+            )
+            for key in keys
+        }
+        self._functions([key for key in keys if key.arguments is not None and good[key.text]], table)
+        found: dict[str, Tree] = {}
+        for key in keys:
+            if key.arguments is None and good[key.text]:
+                found |= self._elements(key, table[key.text], self.at("define", key.text), self.known, self.lines)
+        circle = _circle({name: [n for n, _ in names(tree)] for name, tree in found.items()})
         if circle:
             self.report(self.at("define", circle[0]), f"goes round in a circle: {' needs '.join(circle)}.")
             return {}
+        return found
+
+    def _key(self, text: str, place: str) -> Key:
+        """Read a key; report what is wrong with its index."""
+        key = read_key(text)
+        if key.problem:
+            self.report(place, f"{key.problem}.")
+        return key
+
+    def _functions(self, keys: list[Key], table: Mapping[str, Any]) -> None:
+        """Read the definitions with arguments to `writing`."""
+        nothing = Tree("number", 1, 0.0)
+        for key in keys:
+            arguments = key.arguments or ()
+            for arg in dict.fromkeys(arguments):
+                problem = "is given twice" if arguments.count(arg) > 1 else name_problem(arg)
+                if problem is not None:
+                    self.report(self.at("define", key.text), f"the argument {shown(arg)} {problem}.")
+            self.writing.functions[key.name] = Function(arguments, nothing)
+        for key in keys:
+            known = {**self.known, **dict.fromkeys(key.arguments or (), "argument")}
+            text = table[key.text]
+            body = self.as_written(text, self.at("define", key.text), known)
+            if body is not None:
+                self.writing.functions[key.name] = Function(key.arguments or (), body)
+                self.lines[key.name] = Line(key, str(text), body)
+        own = self.writing.functions
+        if circle := _circle({name: list(calls(f.body, own)) for name, f in own.items()}):
+            self.report(self.at("define", circle[0]), f"calls itself: {' needs '.join(circle)}; write it without.")
+            self.writing.functions = {name: Function(f.arguments, nothing) for name, f in own.items()}
+
+    def _elements(
+        self, key: Key, value: Any, place: str, known: Mapping[str, str], lines: dict[str, Line] | None = None
+    ) -> dict[str, Tree]:
+        """Return the expression of each name that a key stands for, and add the line of each to `lines`."""
+        raw = self.as_written(value, place, {**known, **({key.variable: "index"} if key.variable else {})})
+        found: dict[str, Tree] = {}
+        for name, indices in key.elements if raw is not None else ():
+            tree = self.written_out(raw, value, place, known, indices)
+            if tree is None:
+                break
+            found[name] = tree
+        if lines is not None and raw is not None:
+            lines |= dict.fromkeys(found, Line(key, str(value), raw))
         return found
 
     def _equations(
@@ -266,35 +331,44 @@ class _Reading(ViewsReader):
     ) -> tuple[tuple[State, ...], dict[str, Tree]]:
         table = self.table(given, self.at("equations"), MAX_STATES, "equations")
         own = [s.name for s in states]
-        for name in table:
-            if name not in own:
-                hint = near_names(name[:60], own, "states")
-                self.report(self.at("equations", name), f"there is no such state; {hint}")
-        trees = {}
-        for name in own:
-            if name not in table:
-                if wanted:
-                    self.report(self.at("equations", name), f"missing; give the rate of the state {name}.")
-                continue
-            trees[name] = self.expression(table[name], self.at("equations", name), self.known)
-        found = {name: tree for name, tree in trees.items() if tree is not None}
+        trees: dict[str, Tree] = {}
+        given_by: dict[str, str] = {}
+        for text, value in table.items():
+            place = self.at("equations", text)
+            key = self._key(text, place)
+            elements = [name for name, _ in key.elements]
+            for name in elements:
+                if name not in own:
+                    self.report(place, f"there is no such state; {near_names(name[:60], own, 'states')}")
+                elif name in given_by:
+                    self.report(place, f"{name} has an equation already, {given_by[name]}; remove one of the two.")
+            if set(elements) <= set(own):
+                trees |= self._elements(key, value, place, self.known, self.lines)
+            given_by |= dict.fromkeys(elements, text)
+        for name in own if wanted else ():
+            if name not in given_by:
+                self.report(self.at("equations", name), f"missing; give the rate of the state {name}.")
+        found = {name: trees[name] for name in own if name in trees}
         return _with_dots([_with_rate(s, found.get(s.name), own) for s in states]), found
 
     def _quantities(self, given: Any) -> tuple[tuple[Quantity, ...], dict[str, Tree]]:
-        described, trees = [], {}
+        trees: dict[str, Tree] = {}
+        described = []
         known = dict(self.known)
-        for name, value in self.table(given, self.at("quantities"), MAX_OTHERS, "quantities").items():
-            place = self.at("quantities", name)
+        for text, value in self.table(given, self.at("quantities"), MAX_OTHERS, "quantities").items():
+            place = self.at("quantities", text)
+            key = self._key(text, place)
             # a definition may be shown under its own name
-            if self.known.get(name) != "definition" and not self._new_name(name, place, "quantity"):
+            if not all(
+                [known.get(name) == "definition" or self._new_name(name, place, "quantity") for name, _ in key.elements]
+            ):
                 continue
             entry = self._entry(value, place, _QUANTITY_KEYS, "value")
-            tree = self.expression(entry.get("value", ""), place, known)
+            found = self._elements(key, entry.get("value", ""), place, known)
             unit, symbol = self.text(entry, "unit", place, "1"), self.text(entry, "symbol", place)
-            meaning = self.text(entry, "meaning", place) or name
-            if tree is not None:
-                trees[name] = tree
-                described.append(Quantity(name, unit, meaning, symbol))
+            meaning = self.text(entry, "meaning", place)
+            trees |= found
+            described += [Quantity(name, unit, meaning or name, symbol) for name in found]
         return tuple(described), trees
 
     def _impacts(self, given: Any, states: tuple[str, ...]) -> tuple[Impact, ...]:
@@ -321,22 +395,23 @@ class _Reading(ViewsReader):
         if not isinstance(stick, bool):
             self.report(f"{place}.stick", f"{shown(stick)} must be true or false.")
         of = self.expression(table["of"], f"{place}.of", self.known)
-        values = {}
-        for name, value in self.table(table["set"], f"{place}.set", MAX_STATES, "states").items():
-            if name not in states:
-                hint = near_names(name[:60], states, "states")
-                self.report(f"{place}.set.{name[:60]}", f"there is no such state; {hint}")
+        values: dict[str, Tree] = {}
+        for text, value in self.table(table["set"], f"{place}.set", MAX_STATES, "states").items():
+            key = self._key(text, f"{place}.set.{text[:60]}")
+            if unknown := [name for name, _ in key.elements if name not in states]:
+                hint = near_names(unknown[0][:60], states, "states")
+                self.report(f"{place}.set.{text[:60]}", f"there is no such state; {hint}")
                 continue
-            tree = self.expression(value, f"{place}.set.{name}", self.known)
-            if tree is not None:
-                values[name] = tree
+            values |= self._elements(key, value, f"{place}.set.{text}", self.known)
         return None if of is None else Impact(of, 1 if direction == "up" else -1, values, stick is True)
 
 
-def _circle(define: Mapping[str, Tree]) -> list[str]:
-    """Return the names along a circular definition, the first one again at the end; empty if there is none."""
+def _circle(needs: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return the names along a circle of definitions that need one another, the first one again at the end; empty if
+    there is none.
+    """
     complete: set[str] = set()
-    for first in define:
+    for first in needs:
         path: list[str] = []
         pending: list[tuple[str, bool]] = [(first, False)]
         while pending:
@@ -348,7 +423,7 @@ def _circle(define: Mapping[str, Tree]) -> list[str]:
             elif name not in complete:
                 path.append(name)
                 pending.append((name, True))
-                inner = dict.fromkeys(n for n, _ in names(define[name]) if n in define)
+                inner = dict.fromkeys(n for n in needs[name] if n in needs)
                 pending += [(n, False) for n in inner]
     return []
 
@@ -364,7 +439,9 @@ def _with_dots(states: list[State]) -> tuple[State, ...]:
     """Give each state that is named as the rate of another (x_dot, xdot, dx or v of x) a symbol with a dot."""
     symbols = {s.name: s.symbol for s in states if s.symbol}
     for one in states:
-        names = (f"{one.name}_dot", f"{one.name}dot", f"d{one.name}", "v", one.name.replace("_dot", "_ddot"))
+        stem = one.name.rstrip("0123456789")
+        element = f"{stem}_dot{one.name.removeprefix(stem)}"
+        names = (f"{one.name}_dot", f"{one.name}dot", f"d{one.name}", "v", one.name.replace("_dot", "_ddot"), element)
         if one.rate in names and one.rate not in symbols:
             head, mark, index = symbol_of(one.name, symbols).partition("_")
             symbols[one.rate] = rf"\dot{{{head}}}{mark}{index}"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from magpend_core.models.parameters import has_controls, near_names
+from magpend_core.models.text.calls import Writing
 from magpend_core.models.text.grammar import GrammarError, Tree, name_problem, names, parse, parse_condition, unknown
 
 MAX_TEXT = 2000
@@ -25,15 +26,22 @@ def shown(value: object, around: int = 1) -> str:
     return f'"{text}"' if isinstance(value, str) else text
 
 
+FUNCTION = "function"
+"""Meaning of the name of a function of the text."""
+
 MOST_PROBLEMS = 8
 """Problems of one expression that are named."""
 
 
 class Reader:
-    """A reader of table entries. It appends problems to `problems` and returns a harmless value for a bad entry."""
+    """A reader of table entries. It appends problems to `problems` and returns a harmless value for a bad entry.
+
+    Expressions may call the functions in `writing`; their trees have calls, indices and sums written out.
+    """
 
     def __init__(self) -> None:
         self.problems: list[str] = []
+        self.writing = Writing()
 
     def report(self, place: str, sentence: str) -> None:
         """Append a problem to `problems`, with the path of its key."""
@@ -118,23 +126,48 @@ class Reader:
         """Parse a condition that uses only known names; report problems and return None for any other value."""
         return self._tree(value, place, known, parse_condition)
 
-    def _tree(self, value: Any, place: str, known: Mapping[str, str], read: Callable[[Any], Tree]) -> Tree | None:
+    def _tree(self, value: Any, place: str, known: Mapping[str, str], read: Callable[..., Tree]) -> Tree | None:
+        tree = self.as_written(value, place, known, read)
+        return None if tree is None else self.written_out(tree, value, place, known)
+
+    def written_out(
+        self, tree: Tree, value: Any, place: str, known: Mapping[str, str], indices: Mapping[str, int] | None = None
+    ) -> Tree | None:
+        """Return an expression with its calls, indices and sums written out; report a problem and return None for any
+        other.
+        """
+        try:
+            return self.writing.out(tree, known, indices)
+        except GrammarError as error:
+            self.report(place, f"{shown(value)}: {error}.")
+            return None
+
+    def as_written(
+        self, value: Any, place: str, known: Mapping[str, str], read: Callable[..., Tree] = parse
+    ) -> Tree | None:
+        """Parse an expression that uses only known names, and leave its calls as they are."""
         tree: Tree | None = None
         found: tuple[tuple[str, int], ...] = ()
         wrong: list[tuple[str, str]] = []
         try:
-            tree = read(value)
+            tree = read(value, {name: len(f.arguments) for name, f in self.writing.functions.items()}, known)
             found = tuple(names(tree))
         except GrammarError as error:
             wrong = [(shown(value), problem) for problem in error.problems]
             found = error.names
-        bad = {name: at for name, at in reversed(found) if name not in known}
-        wrong += [(shown(value, at), unknown(name, at, known, "name")) for name, at in reversed(bad.items())]
+        bad = {name: at for name, at in reversed(found) if known.get(name, FUNCTION) == FUNCTION}
+        wrong += [(shown(value, at), _unknown(name, at, known)) for name, at in reversed(bad.items())]
         for text, problem in wrong[:MOST_PROBLEMS]:
             self.report(place, f"{text}: {_closed(problem)}")
         if len(wrong) > MOST_PROBLEMS:
             self.report(place, f"{shown(value)}: {len(wrong) - MOST_PROBLEMS} more problems.")
         return None if wrong else tree
+
+
+def _unknown(name: str, at: int, known: Mapping[str, str]) -> str:
+    if name in known:
+        return f"{name!r} at character {at} is a function; write its arguments in brackets"
+    return unknown(name, at, known, "name")
 
 
 def _closed(sentence: str) -> str:

@@ -8,6 +8,7 @@ from magpend_core.models.model import Mirror, Preset
 from magpend_core.models.parameters import Parameter, near_names
 from magpend_core.models.text.definition import ClassifierText, DrawingText, needed
 from magpend_core.models.text.grammar import BUILT_IN, Tree
+from magpend_core.models.text.keys import Line, flat
 from magpend_core.models.text.tables import Reader, shown
 from magpend_core.sizes import MAX_STATES
 
@@ -17,12 +18,15 @@ DEFAULT_PRESET = "default"
 
 
 class ViewsReader(Reader):
-    """Reader of the optional tables; `place` is their key path, and `known` maps each defined name to its kind."""
+    """Reader of the optional tables; `place` is their key path, `known` maps each defined name to its kind, and `lines`
+    the names of definitions, functions and states to their lines.
+    """
 
     def __init__(self, place: str) -> None:
         super().__init__()
         self.place = place
         self.known: dict[str, str] = dict.fromkeys(BUILT_IN, "built-in name")
+        self.lines: dict[str, Line] = {}
 
     def at(self, *keys: str) -> str:
         """Return the full path of a key within the model's tables, for messages."""
@@ -93,7 +97,7 @@ class ViewsReader(Reader):
         place = self.at("mirror")
         table = self.table(given, place, 10, "keys")
         self.keys(table, place, ("signs", "half_period"))
-        signs = self.table(table.get("signs", {}), f"{place}.signs", MAX_STATES, "states")
+        signs = flat(self.table(table.get("signs", {}), f"{place}.signs", MAX_STATES, "states"))
         for name, sign in signs.items():
             if name not in states:
                 self.report(

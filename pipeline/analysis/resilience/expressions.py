@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.models.text.calls import Writing
 from magpend_core.models.text.grammar import GrammarError, Tree, names, parse, unknown
 from magpend_core.models.text.numeric import value_of
 
@@ -30,7 +31,7 @@ def read_expression(key: str, text: str, known: Iterable[str]) -> Tree:
     for name, at in names(tree):
         if name not in known:
             raise ValueError(f"{key} = {text!r}: {unknown(name, at, known, 'name')}.")
-    return tree
+    return Writing().out(tree, known)
 
 
 def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -> float:
