@@ -208,7 +208,7 @@ def _dependence_problems(model: Model, disturbance: Disturbance) -> list[str]:
     needs: list[str] = []
     for name, value in disturbance.expressions.items():
         place, needed = f"strengths.{name} = {value!r}", _needed(model, name)
-        if timed := [n for n in ("t", "f", "phase") if n in needed]:
+        if timed := sorted(model.definition.timed & set(needed)):  # type: ignore[attr-defined]
             problems.append(f"{place}: depends on {timed[0]}; strengths are expressions of states and parameters.")
         others = [n for n in noisy_states if n != name and n in needed]
         if others:

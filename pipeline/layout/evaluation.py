@@ -100,11 +100,11 @@ def _rates(model: TextModel, states: np.ndarray, point: Mapping[str, Any], late:
     rows = np.resize(states, (len(SHARES), states.shape[1])).T
     known: dict[str, Any] = {
         "pi": np.pi,
-        **{name: float(point[name]) for name in model.parameter_names},
-        **dict(zip(model.state_names, rows, strict=True)),
         "f": frequency,
         "phase": SHARES,
         "t": (SHARES + late) / frequency,
+        **{name: float(point[name]) for name in model.parameter_names},
+        **dict(zip(model.state_names, rows, strict=True)),
     }
     with np.errstate(all="ignore"):
         values = rates_of(definition, known)
@@ -139,7 +139,7 @@ def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str,
         columns[name] = np.repeat([float(p[name]) for p in points], n)
     zero = np.zeros(n * len(points))
     frequency = [p.get(FREQUENCY) or 1.0 for p in points]
-    columns |= {"t": zero, "phase": zero, "f": np.repeat(frequency, n)}
+    columns = {"t": zero, "phase": zero, "f": np.repeat(frequency, n)} | columns
     faults = domain_faults(model.definition, columns)
     parts = [{name: v[i * n : (i + 1) * n] for name, v in columns.items()} for i in range(len(points))]
     # an axis may end at a pole; cells at other parameters then have values

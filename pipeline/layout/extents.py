@@ -107,9 +107,9 @@ def _measured(spec: Spec, model: TextModel) -> dict[str, tuple[float, tuple[floa
         columns[name] = np.repeat(
             [float(p[name] or 1.0) if name == FREQUENCY else p[name] for p in points], len(chosen)
         )
-    columns["f"] = columns.pop(FREQUENCY)
+    frequency = columns.pop(FREQUENCY)
     n_periods = spec.integration.n_transient + spec.integration.n_keep
-    motion, seconds = _Motion(model.definition, columns), n_periods / columns["f"]
+    motion, seconds = _Motion(model.definition, frequency, columns), n_periods / frequency
     with np.errstate(all="ignore"):
         times, path = motion.path(y, seconds) if model.clock.is_continuous else motion.iterated(y, n_periods)
         own = [(natural_size(*_size(times, np.abs(x))), _extent(times, x)) for x in path.transpose(1, 0, 2)]
@@ -163,13 +163,14 @@ class _Motion:
     of its own.
     """
 
-    def __init__(self, definition: Definition, columns: Mapping[str, Any]) -> None:
-        self.definition, self.columns = definition, columns
+    def __init__(self, definition: Definition, frequency: np.ndarray, columns: Mapping[str, Any]) -> None:
+        self.definition, self.frequency, self.columns = definition, frequency, columns
 
     def _known(self, t: np.ndarray, y: np.ndarray) -> dict[str, Any]:
-        phase = t * self.columns["f"]
+        phase = t * self.frequency
         states = dict(zip(self.definition.equations, y, strict=True))
-        return {**self.columns, **states, "t": t, "phase": phase - np.floor(phase)}
+        timed = {"f": self.frequency, "t": t, "phase": phase - np.floor(phase)}
+        return {**timed, **self.columns, **states}
 
     def _rates(self, t: np.ndarray, y: np.ndarray) -> np.ndarray:
         rates = rates_of(self.definition, self._known(t, y))
@@ -186,7 +187,7 @@ class _Motion:
         first = 12
         per_period = 12  # least number of steps per period of a drive
         t, slope = np.zeros(y.shape[1]), self._rates(np.zeros(y.shape[1]), y)
-        longest = 1.0 / (self.columns["f"] * per_period) if self.definition.has_drive else ends / per_period
+        longest = 1.0 / (self.frequency * per_period) if self.definition.has_drive else ends / per_period
         least = tolerance * np.ptp(y, axis=1, keepdims=True)  # a cell that begins at rest hardly moves
         pace = np.where(least > 0.0, np.abs(slope) * tolerance / least, 0.0).max(axis=0)
         h = np.minimum(longest, tolerance * np.where(pace > 0.0, 1.0 / pace, longest))

@@ -79,8 +79,8 @@ def one_sided(model: TextModel, values: Mapping[str, float]) -> np.ndarray:
 
 
 def _rates(model: TextModel, values: Mapping[str, float], frequency: float, t: Any, y: np.ndarray) -> list[Any]:
-    known: dict[str, Any] = {"pi": np.pi, **values, **dict(zip(model.state_names, y, strict=True))}
-    known |= {"f": frequency, "t": t, "phase": t * frequency - np.floor(t * frequency)}
+    known: dict[str, Any] = {"pi": np.pi, "f": frequency, "t": t, "phase": t * frequency - np.floor(t * frequency)}
+    known |= {**values, **dict(zip(model.state_names, y, strict=True))}
     with np.errstate(all="ignore"):
         return list(rates_of(model.definition, known).values())
 

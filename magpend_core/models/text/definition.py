@@ -11,7 +11,7 @@ from typing import Any
 from magpend_core.models.clock import DRIVEN, MAP, STROBED, Clock
 from magpend_core.models.model import Mirror, Preset, Quantity, State
 from magpend_core.models.parameters import Parameter
-from magpend_core.models.text.grammar import Tree, names
+from magpend_core.models.text.grammar import TIMED, Tree, names
 from magpend_core.models.text.keys import Line, calls
 from magpend_core.models.text.writing import written
 
@@ -148,9 +148,16 @@ class Definition:
         return MAP if self.is_map else DRIVEN if self.has_drive else STROBED
 
     @property
+    def timed(self) -> frozenset[str]:
+        """The names by which time and the drive's frequency enter expressions; a text without them may use such a name
+        for something else.
+        """
+        return frozenset(TIMED) - {s.name for s in self.states} - {p.name for p in self.parameters} - self.define.keys()
+
+    @property
     def has_drive(self) -> bool:
         """Whether an expression of the equations or the impacts depends on time or on the drive's frequency."""
-        return bool({"t", "f", "phase"} & set(self.used(self.dynamics)))
+        return not self.timed.isdisjoint(self.used(self.dynamics))
 
     def remarks(self) -> list[str]:
         """Return a sentence for each parameter and each definition that no expression uses, and for a state with the

@@ -12,6 +12,7 @@ from magpend_core.models.parameters import POSITIVE
 from magpend_core.models.text.contacts import Jump, along, with_contacts
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.derivatives import derivatives
+from magpend_core.models.text.grammar import TIMED as TIMED_NAMES
 from magpend_core.models.text.grammar import Tree
 from magpend_core.models.text.graph import CONSTANT, STATED, TIMED, Graph, Node, in_order
 from magpend_core.models.text.layers import GENERIC, Steep, core_of, place_of, steep_places
@@ -272,7 +273,11 @@ class Builder:
         self.definition = definition
         self.graph = graph = Graph()
         time, frequency = graph.leaf("time"), graph.leaf("frequency")
-        self.names = {"t": time, "f": frequency, "pi": graph.number(math.pi), "phase": graph.mul(time, frequency)}
+        phase = graph.mul(time, frequency)
+        self.names = {"pi": graph.number(math.pi)}
+        self.names |= {
+            k: v for k, v in zip(TIMED_NAMES, (time, frequency, phase), strict=True) if k in definition.timed
+        }
         for i, state in enumerate(definition.states):
             self.names[state.name] = graph.leaf("state", i)
         for i, parameter in enumerate(definition.parameters):

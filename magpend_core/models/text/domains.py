@@ -77,7 +77,7 @@ def _constant_faults(definition: Definition, values: Mapping[str, Any]) -> list[
         places[f"impacts[{i}].of"] = impact.of
         places |= {f"impacts[{i}].set.{name}": tree for name, tree in impact.set.items()}
     places |= {f"quantities.{name}": tree for name, tree in definition.quantities.items()}
-    changing = {"t", "phase", *(s.name for s in definition.states)}
+    changing = {"t", *({"phase"} & definition.timed), *(s.name for s in definition.states)}
     fixed = {name: np.asarray(v, np.float64) for name, v in values.items() if name not in changing}
     known: dict[str, Any] = {"pi": np.pi, **fixed}
     used = [name for name in definition.used(places.values()) if name in definition.define]

@@ -318,7 +318,13 @@ class _Call:
         first = self.trials[0]
         try:
             with np.errstate(all="ignore"):
-                self.call(self.function, first.t, first.y.copy(), first.values)
+                try:
+                    self.call(self.function, first.t, first.y.copy(), first.values)
+                except (AttributeError, TypeError):
+                    if self.names is None or len(self.names) != 1:
+                        raise
+                    self.names = None  # f(t, y, p) may take all parameters, although one of them is called p
+                    self.call(self.function, first.t, first.y.copy(), first.values)
         except ModelError:
             raise
         except (ArithmeticError, ValueError) as error:
@@ -434,8 +440,8 @@ class _Call:
             if rates is None:
                 continue
             frequency = 1.0 if drive is None or self.drive is None else 1.0 / drive.period(trial.values[self.drive])
-            known = {**trial.values, **dict(zip(self.states, trial.y, strict=True)), "pi": math.pi, "f": frequency}
-            by_text = rates_of(definition, {**known, "t": trial.t, "phase": trial.t * frequency % 1.0})
+            known = {"pi": math.pi, "f": frequency, "t": trial.t, "phase": trial.t * frequency % 1.0, **trial.values}
+            by_text = rates_of(definition, known | dict(zip(self.states, trial.y, strict=True)))
             rows.append(trial)
             found.append([float(by_text[key]) for key in self.states])
             expected.append(rates)

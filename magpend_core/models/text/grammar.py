@@ -12,7 +12,7 @@ import itertools
 import keyword
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,8 +43,11 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
 }
 """Least and greatest number of arguments by name; ``ln`` is read as ``log``."""
 
-BUILT_IN = ("t", "f", "phase", "pi")
-"""Time since the section [s], drive frequency [Hz], t f in [0, 1), and pi."""
+TIMED = ("t", "f", "phase")
+"""Time since the section [s], drive frequency [Hz], and t f in [0, 1)."""
+
+BUILT_IN = (*TIMED, "pi")
+"""Names with a meaning in all expressions."""
 
 ELSEWHERE = {
     "arctan": "atan",
@@ -242,13 +245,13 @@ def names(tree: Tree) -> Iterator[tuple[str, int]]:
         yield from (found for found in names(tree.args[2]) if found[0] != tree.value)
 
 
-def name_problem(name: object) -> str | None:
-    """Return what is wrong with a name given by the user, or None."""
+def name_problem(name: object, free: Container[str] = ()) -> str | None:
+    """Return what is wrong with a name given by the user, or None; built-in names among `free` are good."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         return "must begin with a letter and go on with letters, digits and underscores"
     if len(name) > MAX_NAME:
         return f"has {len(name)} characters; {MAX_NAME} are the most"
-    if name in FUNCTIONS or name in BUILT_IN:
+    if name in FUNCTIONS or (name in BUILT_IN and name not in free):
         return "has a meaning of its own in expressions; choose another name"
     if keyword.iskeyword(name) or name in ("nan", "inf"):
         return f"is a word of Python; choose another name, such as {name}_"

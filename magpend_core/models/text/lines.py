@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.models.parameters import ParameterError, near_names
-from magpend_core.models.text.grammar import ELSEWHERE, name_problem
+from magpend_core.models.text.grammar import BUILT_IN, ELSEWHERE, name_problem
 from magpend_core.models.text.keys import read_key
 from magpend_core.models.text.reading import KEYS, read_definition
 from magpend_core.models.text.tables import shown
@@ -255,7 +255,7 @@ def _orders(entries: list[Entry], found: Lines) -> dict[str, int]:
                 f"{entry.place}: {entry.left}: an equation has at most {len(SUFFIXES)} primes; name a derivative "
                 "yourself."
             )
-        elif (problem := name_problem(entry.name)) is not None:
+        elif (problem := name_problem(entry.name, BUILT_IN)) is not None:
             found.problems.append(f"{entry.place}: {entry.name} {problem}.")
         else:
             first[entry.name] = entry

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +16,12 @@ from magpend_core.models.model import Mirror, Quantity, State
 from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
 from magpend_core.models.text.calls import Function
 from magpend_core.models.text.definition import OMEGA, Definition, Impact
-from magpend_core.models.text.grammar import Tree, name_problem, names
+from magpend_core.models.text.grammar import BUILT_IN, TIMED, Tree, name_problem, names
 from magpend_core.models.text.keys import Key, Line, calls, flat, read_key
 from magpend_core.models.text.latex import symbol_of
 from magpend_core.models.text.scene import mirror_problem
 from magpend_core.models.text.tables import FUNCTION, shown
-from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsReader
+from magpend_core.models.text.views import BUILT_IN_NAME, MAX_OTHERS, MAX_PARAMETERS, ViewsReader
 from magpend_core.sizes import MAX_STATES
 
 MAX_DEFINED = 200
@@ -99,7 +99,17 @@ def read_definition(table: Any, place: str = "model") -> tuple[Definition | None
 
 
 class _Reading(ViewsReader):
-    """Reader that goes once through the tables of a model given as text."""
+    """Reader that goes once through the tables of a model given as text.
+
+    Attributes
+    ----------
+    taken : dict of str to str
+        Why a name of the drive cannot be given to something else.
+    """
+
+    def __init__(self, place: str) -> None:
+        super().__init__(place)
+        self.taken: dict[str, str] = {}
 
     def definition(self, given: Any) -> Definition | None:
         table = self.table(given, self.place, len(KEYS) + 20, "keys")
@@ -112,6 +122,7 @@ class _Reading(ViewsReader):
         head = {key: self.text(table, key, self.place) for key in ("name", "title", "source", "section")}
         self.text(table, "function", self.place, most=MAX_FUNCTION)  # for readers; never executed
         self._model_name(head["name"], "name" in table)
+        self._free_names(table)
         states = self._states(table.get("states", {}))
         if isinstance(table.get("states"), Mapping) and not states:
             return None  # every use of a state would be a problem of its own
@@ -147,6 +158,22 @@ class _Reading(ViewsReader):
             lines=self.lines,
         )
 
+    def _free_names(self, table: Mapping[str, Any]) -> None:
+        """Forget the meaning of f and phase as the drive's if the text defines the name, and no expression has time."""
+        tables = [table.get(key) for key in ("define", "equations", "quantities", "impacts", "drawing", "classifier")]
+        words = {word for text in _texts(tables) for word in re.findall(r"[A-Za-z_]\w*", text)}
+        keys = [key for name in ("states", "parameters", "define") for key in _keys_of(table.get(name))]
+        own = {"f", "phase"} & {read_key(key).name for key in keys}
+        timed = words & (set(TIMED) - own)
+        for name in own:
+            if timed:
+                self.taken[name] = (
+                    f"belongs to the drive in equations with {', '.join(sorted(timed))}; choose another name, such as "
+                    f"{name}_, or take it out if it is the drive's: its frequency is given as frequency_hz"
+                )
+            else:
+                del self.known[name]
+
     def _model_name(self, name: str, given: bool) -> None:
         plain = name.replace("-", "").replace("_", "")
         if given and not (plain.isascii() and plain.isalnum() and len(name) <= 60 and name[0].isalpha()):
@@ -162,7 +189,7 @@ class _Reading(ViewsReader):
             return False
         for key, trees in tables.items():
             for name, tree in trees.items():
-                for timed in [n for n, _ in names(tree) if n in ("t", "f", "phase")][:1]:
+                for timed in [n for n, _ in names(tree) if n in TIMED and self.known[n] == BUILT_IN_NAME][:1]:
                     self.report(self.at(key, name), f"needs {timed!r}; a map has no time: count iterations by a state.")
         if impacts:
             self.report(self.at("impacts"), 'a map has none between its iterations; write "where" in its equations.')
@@ -173,6 +200,9 @@ class _Reading(ViewsReader):
     def _new_name(self, name: str, place: str, kind: str) -> bool:
         if name in OF_RUNS:
             self.report(place, f"{name!r} names something else in runs; choose another name, such as {name}_.")
+            return False
+        if self.known.get(name) == BUILT_IN_NAME and name in self.taken:
+            self.report(place, f"{name} {self.taken[name]}.")
             return False
         if not self.name(name, place, self.known):
             return False
@@ -295,7 +325,7 @@ class _Reading(ViewsReader):
         for key in keys:
             arguments = key.arguments or ()
             for arg in dict.fromkeys(arguments):
-                problem = "is given twice" if arguments.count(arg) > 1 else name_problem(arg)
+                problem = "is given twice" if arguments.count(arg) > 1 else name_problem(arg, BUILT_IN)
                 if problem is not None:
                     self.report(self.at("define", key.text), f"the argument {shown(arg)} {problem}.")
             self.writing.functions[key.name] = Function(arguments, nothing)
@@ -317,12 +347,14 @@ class _Reading(ViewsReader):
         """Return the expression of each name that a key stands for, and add the line of each to `lines`."""
         raw = self.as_written(value, place, {**known, **({key.variable: "index"} if key.variable else {})})
         found: dict[str, Tree] = {}
-        for name, indices in key.elements if raw is not None else ():
+        if raw is None:
+            return found
+        for name, indices in key.elements:
             tree = self.written_out(raw, value, place, known, indices)
             if tree is None:
                 break
             found[name] = tree
-        if lines is not None and raw is not None:
+        if lines is not None:
             lines |= dict.fromkeys(found, Line(key, str(value), raw))
         return found
 
@@ -384,9 +416,9 @@ class _Reading(ViewsReader):
     def _impact(self, given: Any, place: str, states: tuple[str, ...]) -> Impact | None:
         table = self.table(given, place, 10, "keys")
         self.keys(table, place, ("of", "direction", "set", "stick"))
-        for key in ("of", "direction", "set"):
-            if key not in table:
-                self.report(f"{place}.{key}", "missing; an impact has of, direction and set.")
+        for word in ("of", "direction", "set"):
+            if word not in table:
+                self.report(f"{place}.{word}", "missing; an impact has of, direction and set.")
                 return None
         direction = table["direction"]
         if not isinstance(direction, str) or direction not in ("up", "down"):
@@ -404,6 +436,22 @@ class _Reading(ViewsReader):
                 continue
             values |= self._elements(key, value, f"{place}.set.{text}", self.known)
         return None if of is None else Impact(of, 1 if direction == "up" else -1, values, stick is True)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield the texts in tables and lists that may be expressions."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _texts(inner) if key not in ("unit", "meaning", "symbol") else ()
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            yield from _texts(inner)
+
+
+def _keys_of(table: Any) -> list[str]:
+    return [key for key in table if isinstance(key, str)] if isinstance(table, Mapping) else []
 
 
 def _circle(needs: Mapping[str, Iterable[str]]) -> list[str]:

@@ -36,7 +36,7 @@ def values_of(definition: Definition, trees: Iterable[Tree], given: Mapping[str,
     trees = list(trees)
     known = {"pi": math.pi, **given}
     if "t" in known and "f" in known:
-        known["phase"] = known["t"] * known["f"]
+        known.setdefault("phase", known["t"] * known["f"])
     for name in definition.used(trees):
         if name not in known:
             known[name] = value_of(definition.define[name], known)
@@ -131,6 +131,6 @@ def mirror_problem(definition: Definition) -> str | None:
 
 def _rates(definition: Definition, states: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Compute the rates at states (n, n_states) and times (n,), with drive periods of 1 s; returns (n, n_states)."""
-    given = {**by_name(definition, states, definition.presets[0].values), "t": times, "f": 1.0}
+    given = {"t": times, "f": 1.0, **by_name(definition, states, definition.presets[0].values)}
     values = values_of(definition, definition.equations.values(), given)
     return np.stack([np.broadcast_to(np.asarray(v, np.float64), times.shape) for v in values], axis=1)

@@ -8,7 +8,16 @@ from typing import Any
 
 from magpend_core.models.parameters import has_controls, near_names
 from magpend_core.models.text.calls import Writing
-from magpend_core.models.text.grammar import GrammarError, Tree, name_problem, names, parse, parse_condition, unknown
+from magpend_core.models.text.grammar import (
+    BUILT_IN,
+    GrammarError,
+    Tree,
+    name_problem,
+    names,
+    parse,
+    parse_condition,
+    unknown,
+)
 
 MAX_TEXT = 2000
 """Characters of a title, a unit, a phrase."""
@@ -111,7 +120,7 @@ class Reader:
 
     def name(self, value: Any, place: str, taken: Mapping[str, str]) -> bool:
         """Return whether a name may be defined; report the problem if not. `taken` maps used names to meanings."""
-        problem = name_problem(value)
+        problem = name_problem(value, () if value in taken else BUILT_IN)
         if problem is None and value in taken:
             problem = f"is the name of a {taken[value]} already; choose another"
         if problem is not None:

@@ -7,12 +7,14 @@ from typing import Any
 from magpend_core.models.model import Mirror, Preset
 from magpend_core.models.parameters import Parameter, near_names
 from magpend_core.models.text.definition import ClassifierText, DrawingText, needed
-from magpend_core.models.text.grammar import BUILT_IN, Tree
+from magpend_core.models.text.grammar import BUILT_IN, TIMED, Tree
 from magpend_core.models.text.keys import Line, flat
 from magpend_core.models.text.tables import Reader, shown
 from magpend_core.sizes import MAX_STATES
 
 MAX_PARAMETERS, MAX_OTHERS = 120, 60
+BUILT_IN_NAME = "built-in name"
+"""Meaning of the names of `BUILT_IN`."""
 DEFAULT_PRESET = "default"
 """Name of the preset with the values that stand in the table of parameters."""
 
@@ -25,7 +27,7 @@ class ViewsReader(Reader):
     def __init__(self, place: str) -> None:
         super().__init__()
         self.place = place
-        self.known: dict[str, str] = dict.fromkeys(BUILT_IN, "built-in name")
+        self.known: dict[str, str] = dict.fromkeys(BUILT_IN, BUILT_IN_NAME)
         self.lines: dict[str, Line] = {}
 
     def at(self, *keys: str) -> str:
@@ -40,7 +42,7 @@ class ViewsReader(Reader):
             return False
         wanted = list(needed(tree, define))
         for name in wanted:
-            if name in ("t", "f", "phase"):
+            if name in TIMED and self.known.get(name) == BUILT_IN_NAME:
                 self.report(place, f"needs {name!r}, which is not known here; use states and parameters.")
                 return False
             if only is not None and self.known.get(name) == "state" and name not in only:

@@ -86,7 +86,7 @@ def needs_sweep(run: OpenRun, options: ResilienceOptions) -> None:
     _chosen(run, options)
     states = _by_name(run, start_states(cube, split_dims(cube["status"])[1]))
     for point in parameter_points(run.spec):
-        density_at(options.density, {**point, "f": point[FREQUENCY]}, states)
+        density_at(options.density, {"f": point[FREQUENCY], **point}, states)
     _asked_quantity(run, options)
 
 
@@ -130,7 +130,7 @@ def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
     for points in slabs(cube, Dynamics.of(cube), SECTION_BYTES):
         for index, there in destinations_at(cube, attractors, points):
             assert there.point.parameters is not None
-            known, own = {**there.point.parameters, "f": there.point.frequency}, labels[index].ravel()
+            known, own = {"f": there.point.frequency, **there.point.parameters}, labels[index].ravel()
             weights = density_at(options.density, known, by_name)
             result.count(index, own, weights)
             result.time(index, there.follow(states[timed], options.near), weights[timed])

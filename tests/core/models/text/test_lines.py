@@ -72,7 +72,13 @@ def test_load_model__reads_primes_in_a_table(equations):
         ("x' = -x", {"titel": "me"}, r"titel = .*: the value of a parameter is a number; did you mean title"),
         ("x''''' = -x", {}, r"at most 4 primes"),
         ("x' = sinn(x)", {}, r"line 1, equations.x: .*unknown function 'sinn' .* did you mean sin"),
-        ("f' = -f", {}, r"line 1: f has a meaning of its own"),
+        ("sin' = -x", {}, r"line 1: sin has a meaning of its own"),
+        (
+            "f' = -f*cos(2*pi*t)",
+            {},
+            r"states.f: f belongs to the drive in equations with t; choose .* f_, or take it out",
+        ),
+        ("t' = 1", {}, r"states.t: has a meaning of its own"),
     ],
 )
 def test_read_lines__names_line_key_and_remedy(text, values, expected):

@@ -436,3 +436,54 @@ def test_remarks__name_angles_that_are_not_declared(model, angles):
     assert said == list(model.angle_remarks)
     assert [line.split(":")[0] for line in said] == [f"model.states.{name}" for name in angles]
     assert all(f"{name} = {{ on_circle = true }}" in line for name, line in zip(angles, said, strict=True))
+
+
+def test_autonomous__may_use_the_drives_names():
+    """A parameter f of a flow without a drive is a parameter like any other, in all that reads the text."""
+    table = {
+        "name": "named",
+        "states": {"x": {}, "y": {}},
+        "parameters": {"f": 0.5, "phase": 2.0},
+        "equations": {"x": "f*x - y - x**3", "y": "x + phase*y - y**3"},
+        "quantities": {"q": "f*x"},
+        "mirror": {"signs": {"x": -1, "y": -1}},
+        "classifier": {"words": {"up": "phase*x > f"}},
+    }
+    model, plain = (
+        read_model(table),
+        read_model(
+            json.loads(
+                json.dumps(table).replace("phase", "ph").replace("f*", "g*").replace('"f"', '"g"').replace("> f", "> g")
+            )
+        ),
+    )
+    assert model.clock == STROBED
+    assert model.remarks == ()
+    assert model.source.text == plain.source.text
+    states = np.array([[[0.3, -0.7]], [[1.3, 0.2]]])
+    labels = [
+        m.classifier.classify(states, None, None, dict(zip(m.parameter_names, (0.5, 2.0), strict=True)))
+        for m in (model, plain)
+    ]
+    np.testing.assert_array_equal(*labels)
+    iterated = {**table, "kind": "map", "parameters": {"f": 0.5}, "equations": {"x": "f*x", "y": "f"}}
+    del iterated["classifier"]
+    assert read_model({**iterated, "mirror": {"signs": {}}}).parameter_names == ("f",)
+    defined = {
+        "name": "a",
+        "states": {"f": {}, "y": {}},
+        "define": {"phase": "2*f"},
+        "equations": {"f": "y", "y": "-phase"},
+    }
+    assert read_model(defined).clock == STROBED
+
+
+@pytest.mark.parametrize("drive", ["cos(2*pi*t)", "square(phase, 0.5)"])
+def test_driven__says_why_f_is_taken(drive):
+    table = {"name": "a", "states": {"x": {}}, "parameters": {"f": 1.0}, "equations": {"x": f"{drive} - x"}}
+    (problem,) = problems_of(table)
+    assert "model.parameters.f: f belongs to the drive in equations with" in problem
+    assert (
+        "choose another name, such as f_, or take it out if it is the drive's: its frequency is given as frequency_hz"
+        in problem
+    )
