@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 
 MAX_STATES = 64
-"""Largest number of states of a model as text, and of any system with tangent vectors."""
+"""Largest number of states of a system with tangent vectors; a model as text with more has no Jacobian."""
+
+MOST_STATES = 1024
+"""Largest number of states of a model as text."""
 
 WRITTEN_OUT = 6
 """Largest number of states of a system whose products of Jacobian and tangent vectors are written out.
@@ -24,8 +27,8 @@ def too_many_states(name: str, n_states: int) -> str | None:
     if n_states <= MAX_STATES:
         return None
     return (
-        f"{name} has {n_states} states; Lyapunov exponents, multipliers and orbits are computed for at most "
-        f"{MAX_STATES}."
+        f"{name} has {n_states} states; attractors, branches, equilibria, multipliers and Lyapunov exponents need "
+        f"tangents, which are computed for at most {MAX_STATES} states. Cells, quantities and trajectories need none."
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from magpend_core import Status, jacobian, lyapunov_exponents, rates
+from magpend_core import Status, jacobian, lyapunov_exponents, rates, sections
 from magpend_core import lyapunov as exponents
 from magpend_core.engine.checks import SystemCheckError, check_system
 from magpend_core.engine.jit import inline
@@ -17,7 +17,7 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models import ModelError, load_model
 from magpend_core.orbits import section_map
-from magpend_core.sizes import MAX_STATES, WRITTEN_OUT
+from magpend_core.sizes import MAX_STATES, MOST_STATES, WRITTEN_OUT
 from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
 from tests.core.cells import scipy_end
 from tests.core.flows import flow, lorenz96, table
@@ -217,12 +217,26 @@ def test_lyapunov__a_system_of_two_states_may_declare_its_entries():
     assert found.divergence == pytest.approx(0.0, abs=1e-12)
 
 
-def test_read_model__sixty_four_states_are_the_most():
-    assert len(load_model(lorenz96(MAX_STATES)).states) == MAX_STATES
+def test_read_model__takes_up_to_1024_states_and_no_more():
+    large = load_model(lorenz96(MAX_STATES + 1))
+    assert large.derived.jacobian == ()
+    assert large.system.jacobian is None
+    assert len(load_model(lorenz96(MAX_STATES)).derived.jacobian) == MAX_STATES**2
     with pytest.raises(ModelError) as refused:
-        load_model(lorenz96(MAX_STATES + 1))
+        load_model(lorenz96(MOST_STATES + 1))
     # one sentence, though all equations name states
-    assert refused.value.problems == ["model.states: has 65 states; 64 are the most."]
+    assert refused.value.problems == ["model.states: has 1025 states; 1024 are the most."]
+
+
+@pytest.mark.slow
+def test_sections__of_a_hundred_states_are_those_of_scipy():
+    model = load_model(lorenz96(100, 3.0))
+    start = np.random.default_rng(5).uniform(-1.0, 1.0, 100)
+    found = sections(model.load(), [0.5], start[None], n_transient=0, n_keep=1, rtol=1e-11, atol=1e-11)
+    wanted = scipy_end(lambda t, y: _rates(y) - 5.0, start, 2.0)
+    np.testing.assert_allclose(found.section[0, 0], wanted, atol=1e-9)
+    with pytest.raises(ValueError, match=r"lorenz96_.* has 100 states; attractors, .* need tangents, which"):
+        lyapunov_exponents(model.load().pack()[None], np.ones(1), start[None], system=model.system)
 
 
 def test_lyapunov__refuses_more_states_before_anything_is_computed(monkeypatch):
@@ -231,7 +245,10 @@ def test_lyapunov__refuses_more_states_before_anything_is_computed(monkeypatch):
         CHAIN, name="large", state_names=names, is_angle=(), units=(), scales=(), sizes=(), escape=()
     )
     monkeypatch.setattr(exponents, "integrate", lambda *args, **options: pytest.fail("integrated"))
-    words = "large has 65 states; Lyapunov exponents, multipliers and orbits are computed for at most 64"
+    words = (
+        "large has 65 states; attractors, branches, equilibria, multipliers and Lyapunov exponents need tangents, "
+        "which are computed for at most 64 states"
+    )
     with pytest.raises(ValueError, match=words):
         lyapunov_exponents(np.zeros((1, 0)), np.ones(1), np.zeros((1, len(names))), system=large)
     model = SimpleNamespace(name="large", states=names)

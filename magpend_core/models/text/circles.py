@@ -9,6 +9,7 @@ import numpy as np
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.grammar import Tree
 from magpend_core.models.text.numeric import value_of
+from magpend_core.sizes import MAX_STATES
 
 N_SAMPLES = 64
 """Random states, times and parameter values at which the dynamics are compared."""
@@ -24,10 +25,11 @@ def undeclared_angles(definition: Definition) -> tuple[str, ...]:
     """Return the names of the states that no text declares as angles, and to which 2 pi can be added without effect.
 
     The rates, the surfaces of the impacts and the states after them are compared at random states, times and
-    parameter values. A state on which none of them depends is not returned: it may be a clock or an integral.
+    parameter values. A state on which none of them depends is not returned: it may be a clock or an integral. Systems
+    with more than `sizes.MAX_STATES` states are not examined.
     """
     of_states = [s.name for s in definition.states if not s.on_circle]
-    if not of_states:
+    if not of_states or len(definition.states) > MAX_STATES:
         return ()
     names = _samples(definition, of_states)
     for name in definition.used(definition.dynamics):

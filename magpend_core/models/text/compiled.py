@@ -42,7 +42,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         forcing_is_time=forcing is not None and forcing.op == "time",
         rhs=functions["rhs"],
         is_map=definition.is_map,
-        jacobian=functions["jacobian"],
+        jacobian=functions["jacobian"] if derived.jacobian else None,
         jacobian_entries=source.jacobian_entries,
         is_angle=tuple(s.on_circle for s in states),
         units=tuple(s.scale for s in states),

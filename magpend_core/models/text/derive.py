@@ -19,6 +19,7 @@ from magpend_core.models.text.layers import GENERIC, Steep, core_of, place_of, s
 from magpend_core.models.text.numeric import node_values
 from magpend_core.models.text.sliding import Sliding, sliding_of
 from magpend_core.models.text.switching import Instant, Sides, Switch
+from magpend_core.sizes import MAX_STATES
 
 NARROW = 0.1
 """A corner in a layer narrower than this, in units of the state's scale, is left to the layer."""
@@ -60,7 +61,7 @@ class Derived:
     rates : tuple of Node
         Time derivative of each state.
     jacobian : tuple of Node
-        Derivatives of the rates by the states, row by row.
+        Derivatives of the rates by the states, row by row; none of more than `sizes.MAX_STATES` states.
     forcing : Node or None
         The one number by which time enters `rates` and `jacobian`; the time itself if there is no other, None
         if there is none.
@@ -124,9 +125,7 @@ def derive(definition: Definition) -> Derived:
     free = tuple(sliding.lowered(smooth))
     jumps = [_jump(builder, sides, sliding, i) for i in range(len(definition.impacts))]
     rates, jumps, sticks = with_contacts(graph, free, jumps, [i.stick for i in definition.impacts])
-    states = [graph.leaf("state", i) for i in range(len(rates))]
-    columns = [derivatives(graph, rates, {s: graph.one}) for s in states]
-    jacobian = tuple(columns[j][i] for i in range(len(rates)) for j in range(len(rates)))
+    jacobian = _jacobian(graph, rates)
     own = sides.rewritten([builder.node(tree) for tree in definition.quantities.values()], more=False)
     steep = steep_places(graph, smooth, scales)
     layers = [_layer(graph, s, sliding) for s in steep if _is_layer(s)]
@@ -150,12 +149,20 @@ def derive(definition: Definition) -> Derived:
     )
 
 
+def _jacobian(graph: Graph, rates: tuple[Node, ...]) -> tuple[Node, ...]:
+    """Return the derivatives of rates by the states, row by row; none of a system too large for tangents."""
+    n = len(rates)
+    if n > MAX_STATES:
+        return ()
+    columns = [derivatives(graph, rates, {graph.leaf("state", i): graph.one}) for i in range(n)]
+    return tuple(columns[j][i] for i in range(n) for j in range(n))
+
+
 def _of_map(builder: Builder) -> Derived:
     """Derive the Jacobian of a map. Corners and jumps stay as they are: no step of a map goes across them."""
     graph, own = builder.graph, builder.definition
     images = tuple(builder.node(tree) for tree in own.equations.values())
-    columns = [derivatives(graph, images, {graph.leaf("state", i): graph.one}) for i in range(len(images))]
-    jacobian = tuple(columns[j][i] for i in range(len(images)) for j in range(len(images)))
+    jacobian = _jacobian(graph, images)
     quantities = tuple(builder.node(tree) for tree in own.quantities.values())
     sliding = sliding_of(graph, images, ())
     return Derived(graph, images, jacobian, quantities, None, (), (), (), (), sliding, (), (), ())

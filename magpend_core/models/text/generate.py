@@ -255,7 +255,7 @@ def source_of(derived: Derived) -> Source:
 
 def _entries(derived: Derived) -> tuple[int, ...] | None:
     """Return the positions of those entries of a large Jacobian that can differ from 0; None for a small Jacobian."""
-    if len(derived.rates) <= WRITTEN_OUT:
+    if len(derived.rates) <= WRITTEN_OUT or not derived.jacobian:
         return None
     found = tuple(i for i, node in enumerate(derived.jacobian) if not node.is_number(0.0))
     return found or (0,)

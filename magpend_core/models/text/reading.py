@@ -22,7 +22,7 @@ from magpend_core.models.text.latex import symbol_of
 from magpend_core.models.text.scene import mirror_problem
 from magpend_core.models.text.tables import FUNCTION, shown
 from magpend_core.models.text.views import BUILT_IN_NAME, MAX_OTHERS, MAX_PARAMETERS, ViewsReader
-from magpend_core.sizes import MAX_STATES
+from magpend_core.sizes import MOST_STATES
 
 MAX_DEFINED = 200
 ESCAPE = 1e9
@@ -242,7 +242,7 @@ class _Reading(ViewsReader):
 
     def _states(self, given: Any) -> tuple[State, ...]:
         states = []
-        for name, value in self._flat(given, self.at("states"), MAX_STATES, "states").items():
+        for name, value in self._flat(given, self.at("states"), MOST_STATES, "states").items():
             place = self.at("states", name)
             if not self._new_name(name, place, "state"):
                 continue
@@ -361,7 +361,7 @@ class _Reading(ViewsReader):
     def _equations(
         self, given: Any, states: tuple[State, ...], wanted: bool
     ) -> tuple[tuple[State, ...], dict[str, Tree]]:
-        table = self.table(given, self.at("equations"), MAX_STATES, "equations")
+        table = self.table(given, self.at("equations"), MOST_STATES, "equations")
         own = [s.name for s in states]
         trees: dict[str, Tree] = {}
         given_by: dict[str, str] = {}
@@ -428,7 +428,7 @@ class _Reading(ViewsReader):
             self.report(f"{place}.stick", f"{shown(stick)} must be true or false.")
         of = self.expression(table["of"], f"{place}.of", self.known)
         values: dict[str, Tree] = {}
-        for text, value in self.table(table["set"], f"{place}.set", MAX_STATES, "states").items():
+        for text, value in self.table(table["set"], f"{place}.set", MOST_STATES, "states").items():
             key = self._key(text, f"{place}.set.{text[:60]}")
             if unknown := [name for name, _ in key.elements if name not in states]:
                 hint = near_names(unknown[0][:60], states, "states")

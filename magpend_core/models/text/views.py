@@ -10,7 +10,7 @@ from magpend_core.models.text.definition import ClassifierText, DrawingText, nee
 from magpend_core.models.text.grammar import BUILT_IN, TIMED, Tree
 from magpend_core.models.text.keys import Line, flat
 from magpend_core.models.text.tables import Reader, shown
-from magpend_core.sizes import MAX_STATES
+from magpend_core.sizes import MOST_STATES
 
 MAX_PARAMETERS, MAX_OTHERS = 120, 60
 BUILT_IN_NAME = "built-in name"
@@ -99,7 +99,7 @@ class ViewsReader(Reader):
         place = self.at("mirror")
         table = self.table(given, place, 10, "keys")
         self.keys(table, place, ("signs", "half_period"))
-        signs = flat(self.table(table.get("signs", {}), f"{place}.signs", MAX_STATES, "states"))
+        signs = flat(self.table(table.get("signs", {}), f"{place}.signs", MOST_STATES, "states"))
         for name, sign in signs.items():
             if name not in states:
                 self.report(

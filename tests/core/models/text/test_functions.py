@@ -399,3 +399,21 @@ def test_model__drive_belongs_to_functions():
         magpend.model(duffing)
     with pytest.raises(magpend.SpecError, match="parameter of a function"):
         magpend.model("x' = -x", drive="omega")
+
+
+def test_model__a_parameter_may_be_called_as_the_argument():
+    """A function's one argument p is a parameter of this name, or all parameters, as the function uses it."""
+
+    def all_of_them(t, y, p):
+        return [y[1], -p.a * y[0] - p.p * y[1]]
+
+    def in_order(t, y, p):
+        a, b = p
+        return [y[1], -a * y[0] - b * y[1]]
+
+    assert equations(all_of_them, a=1.0, p=0.2)["v"] == "-a*x - p*v"
+    assert equations(in_order, p=1.0, a=0.2)["v"] == "-p*x - a*v"
+    assert equations(lambda t, y, p: [y[1], -p * y[0]], p=0.2)["v"] == "-p*x"
+    assert equations(lambda t, y, f, p: [y[1], -p * y[0] + f], p=0.2, f=1.0)["v"] == "-p*x + f"
+    with pytest.raises(ModelError, match="'b' is no parameter"):
+        equations(lambda t, y, p: [y[1], p.b], a=1.0, p=0.2)
