@@ -8,7 +8,7 @@ from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import of_flow, sectioned
 from magpend_core.orbits import orbit_exponents, section_map
 from tests.core.cells import polish, run_cells, scipy_end
-from tests.core.flows import HOPF, LORENZ, PAIR, ROSSLER, VAN_DER_POL, flow
+from tests.core.flows import HOPF, LORENZ, PAIR, ROSSLER, VAN_DER_POL, flow, table
 
 VAN_DER_POL_PERIOD = 6.663286859323130
 """At mu = 1, to 30 digits 6.66328685932313018969968203053 (Amore, Boyd and Fernandez, arXiv:1707.02890)."""
@@ -62,6 +62,28 @@ def test_polish_orbits__complex_multipliers():
     pair = np.exp((-0.1 + 0.7j) * period)
     expected = [pair, pair.conj(), np.exp(-2.0 * period), 0.0]
     assert np.abs(found.multipliers[0][:, None] - expected).min(axis=1).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_polish_orbits__impacts_that_set_a_parameter_make_a_cycle():
+    """x' = g (m - x) between -1 and 1, with m = 2 upwards and -2 downwards, has the period 2 ln(3)/g, and forgets m."""
+    impacts = [
+        {"of": "x - 1", "direction": "up", "set": {"m": "-2"}},
+        {"of": "x + 1", "direction": "down", "set": {"m": "2"}},
+    ]
+    relay = table("relay", {"x": "g*(m - x)", "m": "0"}, {"g": 0.7}, impacts=impacts)
+    found = polish(seen(relay, "x"), [[0.0, 1.8]])
+    assert found.seconds[0] == pytest.approx(2.0 * np.log(3.0) / 0.7, rel=1e-11)
+    np.testing.assert_allclose(found.section[0], [0.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(found.multipliers[0], 0.0, atol=1e-12)
+    assert found.is_stable[0]
+    # where impacts add to m, each m gives a cycle of its own
+    impacts[1]["set"] = {"m": "4 + m"}
+    impacts[0]["set"] = {"m": "m - 4"}
+    keeps = seen(table("keeps", relay["equations"], {"g": 0.7}, impacts=impacts), "x")
+    found = polish(keeps, [[0.0, 2.3]])
+    np.testing.assert_allclose(found.section[0], [0.0, 2.3], atol=1e-9)
+    np.testing.assert_allclose(found.multipliers[0], [1.0, 0.0], atol=1e-9)
 
 
 def test_section_map__differences():

@@ -339,6 +339,9 @@ def test_read_model__stands_a_thousand_mutations():
     """One kind of error or a model, within milliseconds, whatever is exchanged in a good text."""
     chance = random.Random(11)
     good = changed(PENDULUM, "impacts", value=[{"of": "th - 1", "direction": "up", "set": {"w": "-w"}}])
+    good["states"] |= {"z[1..4]": {"unit": "m"}}
+    good["define"] |= {"gate(u, n)": "1/(1 + u**n)", "mean[i=1..2]": "sum(j=1..4, z[j])/i"}
+    good["equations"] |= {"z[i=2..4]": "gate(z[i-1], i) - z[i] + mean[mod(i, 2) + 1]", "z1": "-z1"}
     refused, slowest = 0, 0.0
     for i in range(1000):
         table = good
