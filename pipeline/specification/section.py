@@ -91,6 +91,11 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
         return None
     if table.of not in model.state_names:
         hint = near_names(table.of, model.state_names, "states")
+        if not table.of.isidentifier():
+            hint = (
+                "a section is a level of one state. Make the expression a state in place of one in it: for s = x + y, "
+                'define = { x = "s - y" }, as the rate of s the sum of both rates, and of = "s".'
+            )
         problems.append(f"section.of = {table.of!r}: is not a state of {model.name}; {hint}")
         return None
     return table

@@ -64,6 +64,17 @@ def test_polish_orbits__complex_multipliers():
     assert np.abs(found.multipliers[0][:, None] - expected).min(axis=1).max() < 1e-9
 
 
+def test_polish_orbits__the_level_of_an_expression_as_a_state():
+    """The normal form's cycle has the same period and multiplier where the section is x + y = 1/10."""
+    define = {"x": "s - y + 0.1", "g": "mu - x**2 - y**2", "dx": "g*x - 2*y", "dy": "2*x + g*y"}
+    slanted = table("slanted", {"s": "dx + dy", "y": "dy"}, {"mu": 0.25}, define=define, quantities={"x": "x"})
+    found = polish(seen(slanted, "s"), [[0.0, -0.2]])
+    assert found.seconds[0] == pytest.approx(np.pi, rel=1e-11)
+    y = found.section[0, 1]
+    assert (0.1 - y) ** 2 + y**2 == pytest.approx(0.25, rel=1e-11)
+    np.testing.assert_allclose(found.multipliers[0], [np.exp(-0.5 * np.pi), 0.0], atol=1e-10)
+
+
 @pytest.mark.slow
 def test_polish_orbits__impacts_that_set_a_parameter_make_a_cycle():
     """x' = g (m - x) between -1 and 1, with m = 2 upwards and -2 downwards, has the period 2 ln(3)/g, and forgets m."""
