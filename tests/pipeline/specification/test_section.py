@@ -93,8 +93,8 @@ FREQUENCY = "a section by crossing needs no frequency; drop one of the two."
         (
             {"section": {"of": "x + v"}},
             "section.of = 'x + v': is not a state of van_der_pol; a section is a level of one state. Make the "
-            'expression a state in place of one in it: for s = x + y, define = { x = "s - y" }, as the rate of s the sum '
-            'of both rates, and of = "s".',
+            'expression a state in place of one in it: for s = x + y, define = { x = "s - y" }, as the rate of s the '
+            'sum of both rates, and of = "s".',
         ),
         ({"section": {"of": "x", "direction": "left"}}, "section.direction = 'left': must be 'up' or 'down'."),
         ({"section": {"of": "x", "longest": 0.0}}, "section.longest = 0.0: must be greater than 0.0."),
