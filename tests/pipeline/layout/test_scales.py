@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from magpend_core.models import load_model
+from pipeline.layout.evaluation import check_starts
 from pipeline.layout.extents import with_sizes
+from pipeline.layout.small_states import one_sided
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 
@@ -117,3 +120,29 @@ def test_with_sizes__wide_starts_do_not_hide_a_small_attractor():
 def test_motion_of_a_state__is_checked(given, message):
     with pytest.raises(SpecError, match=message):
         spec_of("well", motion=given)
+
+
+def test_parameter__called_as_the_drives_frequency_is_the_parameter():
+    """The motion, the domains of the starts and the signs of states have the parameter f, not the frequency 0.1 Hz."""
+    found = []
+    for name in ("f", "g"):
+        spec = Spec.parse(
+            {
+                "kind": "sweep",
+                "model": {
+                    "name": "named",
+                    "states": {"x": {}, "v": {}},
+                    "parameters": {name: 3.0},
+                    "equations": {"x": "v", "v": f"{name}*(1 - x**2)*v - x + 0*log({name} - 0.2)"},
+                },
+                "initial_conditions": {"kind": "grid", "x": {"start": 0.1, "stop": 2.0, "num": 4}},
+                "integration": {"n_transient": 20},
+                "parameters": {"frequency_hz": 0.1},
+            }
+        )
+        check_starts(spec)
+        found.append([s.motion for s in with_sizes(spec).model.states])
+    assert found[0] == found[1]
+    assert found[0][1][1] > 4.0
+    one = {"name": "one", "states": {"x": {}}, "parameters": {"f": 0.3}, "equations": {"x": "f - 0.3 - x"}}
+    assert one_sided(load_model(one), {"f": 0.3}).tolist() == [True]

@@ -4,6 +4,7 @@ import copy
 import json
 import pickle
 import random
+import re
 import time
 from typing import Any
 
@@ -447,19 +448,13 @@ def test_autonomous__may_use_the_drives_names():
         "name": "named",
         "states": {"x": {}, "y": {}},
         "parameters": {"f": 0.5, "phase": 2.0},
-        "equations": {"x": "f*x - y - x**3", "y": "x + phase*y - y**3"},
+        "equations": {"x": "f*x - y - x**3 + (f - 0.5)*y**2", "y": "x + phase*y - y**3 + (phase - 2)*x**2"},
         "quantities": {"q": "f*x"},
         "mirror": {"signs": {"x": -1, "y": -1}},
         "classifier": {"words": {"up": "phase*x > f"}},
     }
-    model, plain = (
-        read_model(table),
-        read_model(
-            json.loads(
-                json.dumps(table).replace("phase", "ph").replace("f*", "g*").replace('"f"', '"g"').replace("> f", "> g")
-            )
-        ),
-    )
+    renamed = re.sub(r"\bf\b", "g", re.sub(r"\bphase\b", "h", json.dumps(table)))
+    model, plain = read_model(table), read_model(json.loads(renamed))
     assert model.clock == STROBED
     assert model.remarks == ()
     assert model.source.text == plain.source.text
