@@ -170,12 +170,6 @@ class Traced(NDArrayOperatorsMixin):
 
     __int__ = __round__ = __trunc__ = __float__
 
-    def __floor__(self) -> Traced:
-        return _floor(self)
-
-    def __ceil__(self) -> Traced:
-        return _ceil(self)
-
 
 class TracedArray(np.ndarray):
     """An array of `Traced` numbers and plain ones."""
@@ -347,6 +341,8 @@ _sign, _abs, _min, _max = (_calls(function) for function in ("sign", "abs", "min
 _floor, _ceil = _calls("floor"), _calls("ceil")
 _less, _greater = _compares("<", lambda a, b: a < b), _compares(">", lambda a, b: a > b)
 
+_ELEMENTARY = ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")
+
 RULES: dict[str, Callable[..., Any]] = {
     "add": _add,
     "subtract": _subtract,
@@ -359,7 +355,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "float_power": _power,
     "square": lambda x: _power(x, 2.0),
     "reciprocal": lambda x: _divide(1.0, x),
-    **{f: _calls(f) for f in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign")},
+    **{f: _calls(f) for f in (*_ELEMENTARY, "sign")},
     **{f"arc{f}": _calls(f"a{f}") for f in ("sin", "cos", "tan", "tan2")},
     "absolute": _abs,
     "fabs": _abs,
@@ -398,22 +394,9 @@ def _method(function: str) -> Callable[[Traced], Any]:
 
 
 # numpy calls these on the numbers of arrays that are no `TracedArray`
-for _name in (
-    "sin",
-    "cos",
-    "tan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "exp",
-    "log",
-    "sqrt",
-    "arcsin",
-    "arccos",
-    "arctan",
-    "conjugate",
-):
+for _name in (*_ELEMENTARY, "arcsin", "arccos", "arctan", "conjugate", "floor", "ceil"):
     setattr(Traced, _name, _method(_name))
+Traced.__floor__, Traced.__ceil__ = _method("floor"), _method("ceil")  # type: ignore[attr-defined]
 
 
 # ---- numpy's functions -----------------------------------------------------------------------------
@@ -608,29 +591,9 @@ def _math_log(x: Any, *base: Any) -> Any:
     return np.log(x) / np.log(base[0]) if base else np.log(x)
 
 
-_SAME = (
-    "sin",
-    "cos",
-    "tan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "exp",
-    "sqrt",
-    "hypot",
-    "fabs",
-    "expm1",
-    "log1p",
-    "log2",
-    "log10",
-    "degrees",
-    "radians",
-    "fmod",
-    "exp2",
-    "cbrt",
-)
+_OTHERS = ("hypot", "fabs", "expm1", "log1p", "log2", "log10", "degrees", "radians", "fmod", "exp2", "cbrt")
 _MATH = {
-    **{f: getattr(np, f) for f in _SAME},
+    **{f: getattr(np, f) for f in (*_ELEMENTARY, *_OTHERS)},
     "asin": np.arcsin,
     "acos": np.arccos,
     "atan": np.arctan,
