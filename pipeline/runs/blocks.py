@@ -165,7 +165,7 @@ def in_blocks(run: PlacedRun, analysis: Analysis, options: Options) -> xr.Datase
         run.echo(f"{analysis.name}: {done} of {n} blocks done before")
     report(what, done, n)
     with stoppable(run.name):
-        if analysis.parts and where.scheduler != chosen.scheduler:  # no place was chosen
+        if where.scheduler != chosen.scheduler:  # no place was chosen
             missing = _begun_here(task, missing, what, n)
         results = execute.run_tasks(task, missing, workers=run.workers, scheduler=where, echo=run.echo)
         with contextlib.closing(results):
