@@ -77,10 +77,7 @@ class PassageSettings:
     least_length: float = 10.0
     least_values: int = 4  # numbers of values that are fitted, the nearest ones
     most_values: int = 6
-    # trajectories at each value that are looked at first, and number of laminar phases, in units of the least one, at
-    # which their length is known so well that others are integrated only where it is not too long
-    looked_at: int = 8
-    enough: int = 4
+    looked_at: int = 8  # trajectories at each value that are looked at first
     groups: int = 8  # groups of trajectories whose spread gives the error of a length
     agrees: float = 0.12  # largest deviation of an exponent from the expected one beyond its error, and largest error
     largest_error: float = 0.15
@@ -162,7 +159,7 @@ def passage_of(
     starts = points[np.linspace(0, len(points) - 1, effort.many).astype(int)]
     gate, power = _gate(points, ghost, geometry), POWERS[kind]
     few = _sections(family, values, starts[: settings.looked_at], effort.n_sections)
-    may_serve = _may_serve(phases(few, ghost, gate, distances, geometry, power, settings), effort, settings)
+    may_serve = _may_serve(phases(few, ghost, gate, distances, geometry, power, settings), effort)
     if may_serve.sum() < settings.least_values:
         return _judged(ds, None, None, kind, told, value, is_torus, settings)
     values, distances, sections = values[may_serve], distances[may_serve], few[may_serve]
@@ -231,12 +228,10 @@ def _sections(family: Family, values: np.ndarray, starts: np.ndarray, n: int) ->
     return np.asarray(found.section[:, 0].reshape(len(values), len(starts), n, -1))
 
 
-def _may_serve(found: Phases, effort: Effort, settings: PassageSettings) -> np.ndarray:
-    """Return at which values a fit may use the length, judged by a part of the trajectories: not where enough laminar
-    phases show that it is too long.
-    """
-    is_known = found.number >= settings.enough * effort.n_phases
-    return np.asarray(~is_known | (found.length <= effort.longest * effort.n_sections))
+def _may_serve(found: Phases, effort: Effort) -> np.ndarray:
+    """Return at which values a part of the trajectories shows no length that is too long by more than its error."""
+    least = np.where(found.number >= effort.n_phases, found.length * (1.0 - found.error), 0.0)
+    return np.asarray(least <= effort.longest * effort.n_sections)
 
 
 def phases(
