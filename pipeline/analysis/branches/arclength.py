@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.predicting import ALIKE, MOST_POINTS, predict
+from pipeline.analysis.branches.predicting import ALIKE, MOST_PREDICTING, predict
 from pipeline.analysis.branches.problems import OrbitProblem, Problem, Value
 
 
@@ -208,7 +208,7 @@ def trace(
 
 def _before_turns(points: list[Point]) -> list[Point]:
     """Return the last points along which the curve keeps its direction."""
-    n, last = 1, points[-MOST_POINTS:]
+    n, last = 1, points[-MOST_PREDICTING:]
     while n < len(last) and last[-n - 1].tangent @ last[-1].tangent > ALIKE:
         n += 1
     return last[-n:]
@@ -218,7 +218,7 @@ def guess_of_orbit(problem: OrbitProblem, points: Sequence[Point], direction: np
     """Predict the orbit at a coordinate along a direction, measured from the last of some points; tell its equations
     what its section points will be there.
     """
-    last = points[-MOST_POINTS:]
+    last = points[-MOST_PREDICTING:]
     images = last[-1].value.images
     more = np.array([problem.family.along(images, p.value.images).ravel() for p in last])
     u, tangents = np.array([p.u for p in last]), np.array([p.tangent for p in last])

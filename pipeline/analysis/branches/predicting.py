@@ -11,7 +11,7 @@ import numpy as np
 
 Array = np.ndarray
 
-MOST_POINTS = 8
+MOST_PREDICTING = 8
 """Most points of a curve through which a polynomial leads."""
 
 TANGENT_ERROR = 1e-6
@@ -42,7 +42,7 @@ def predict(u: Array, tangents: Array, direction: Array, at: float, more: Array)
     """
     s, speeds = (u - u[-1]) @ direction, tangents @ direction
     near = np.argsort(np.abs(s - at), kind="stable")
-    near = near[speeds[near] > ALIKE][:MOST_POINTS]
+    near = near[speeds[near] > ALIKE][:MOST_PREDICTING]
     if not len(near):  # no smooth function there
         return u[-1] + at * direction, more[-1]
     s, u, slopes = s[near], u[near], tangents[near] / speeds[near, None]
