@@ -60,6 +60,7 @@ GROUPS = {
     ),
     "Models and parameters": (
         "load_model",
+        "import_object",
         "import_model",
         "model_names",
         "Model",

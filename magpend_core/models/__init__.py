@@ -17,7 +17,7 @@ from weakref import WeakValueDictionary
 from magpend_core.crossing import Crossing
 from magpend_core.disturbance import Disturbance
 from magpend_core.models import imported, model
-from magpend_core.models.imported import import_model as import_model
+from magpend_core.models.imported import import_object as import_object
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.model import ModelError as ModelError
 from magpend_core.models.noisy import noisy
@@ -58,7 +58,7 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
     ----------
     reference
         Name of a model that ships; or what `Model.reference` gives, as a table or as its JSON text: a model
-        as text, or the description of a Python object (see `import_model`). A model is returned as it is.
+        as text, or the description of a Python object (see `import_object`). A model is returned as it is.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
         raise ModelError(
             [
                 f"model {reference!r} is a Python object, which is imported where a specification names it, by "
-                f"--import-model {reference}, or by magpend.import_model."
+                f"--import-object {reference}, or by magpend.import_object."
             ]
         )
     if reference in _models():

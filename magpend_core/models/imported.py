@@ -2,7 +2,7 @@
 
 A run keeps a description: names, units, bounds, presets, and the digest of the files that decide the
 equations. Opening or drawing needs no more, and imports nothing. What integrates needs the object itself,
-which `import_model` imports once per process; the description then stands for it wherever it is read.
+which `import_object` imports once per process; the description then stands for it wherever it is read.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def is_object_path(text: str) -> bool:
     return _PATH.fullmatch(text) is not None
 
 
-def import_model(path: str, folder: str | Path | None = None) -> Model:
+def import_object(path: str, folder: str | Path | None = None) -> Model:
     """Import a model from ``package.module:NAME``. This runs the module's code: call it only for an object that the
     user named.
 
@@ -134,7 +134,7 @@ class DescribedModel(Model):
         path = self.text[KEY]
         known = _imported.get(path)
         if known is None:
-            why = f"opening a run imports nothing; if you trust it, give --import-model {path}"
+            why = f"opening a run imports nothing; if you trust it, give --import-object {path}"
         else:
             why = (
                 f"the object that was imported has the digest {known.digest}, the run's had {self.digest}: "

@@ -73,8 +73,28 @@ def new(
     console.note(f"look at it with: magpend model show {file}; run it with: magpend run {file} --smoke")
 
 
-for _command in (show, new):
-    add_command(model_app, _command)
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File of XPPAUT (.ode).")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="NAME.toml", help="File to write; by default named after FILE.")
+    ] = None,
+) -> None:
+    """Write the model of another program's file as a specification that runs. Nothing in the file is executed.
+
+    The specification has the model as text, with the file's parameters, initial values and comments, and a first
+    section, starts and range of a parameter. What was renamed or left out is printed. If a part of the model cannot be
+    carried over, nothing is written, and each such part is told with its line and reason.
+    """
+    from pipeline.importing.importing import write_import
+
+    target, notes = write_import(file, out)
+    console.note(*notes)
+    console.result(f"specification: {target}")
+    console.note(f"look at it with: magpend model show {target}; run it with: magpend run {target}")
+
+
+for _command, _name in ((show, "show"), (new, "new"), (import_, "import")):
+    add_command(model_app, _command, _name)
 
 
 def _lines(model: Model, found: Description) -> list[str]:

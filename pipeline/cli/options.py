@@ -45,7 +45,7 @@ DPI = Annotated[
 ]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
-_IMPORTED = "import_model"
+_IMPORTED = "import_object"
 
 
 def speaking(command: Command) -> Command:
@@ -58,9 +58,9 @@ def speaking(command: Command) -> Command:
         outputs.allow(given["force"] if has_force else given.pop("force"))
         console.configure(**{name: given.pop(name) for name in _VOICES})
         if (path := given.pop(_IMPORTED)) is not None:
-            from magpend_core.models import import_model
+            from magpend_core.models import import_object
 
-            import_model(path, ".")
+            import_object(path, ".")
         with console.progress(command.__name__):
             command(*args, **given)
 

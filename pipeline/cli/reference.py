@@ -82,7 +82,7 @@ def commands() -> str:
 _EVERYWHERE = 10
 """Number of commands from which on an option says nothing about a command."""
 
-_COMMON = ("help", "quiet", "verbose", "log", "force", "import_model")
+_COMMON = ("help", "quiet", "verbose", "log", "force", "import_object")
 """Options of every command, which the page describes above its tables."""
 
 

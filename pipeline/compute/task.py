@@ -16,7 +16,7 @@ import numpy as np
 
 from magpend_core import Status
 from magpend_core.engine.threads import using_threads
-from magpend_core.models import import_model
+from magpend_core.models import import_object
 from pipeline.compute.integrate import WALKED, Integrate, going_on, integrate
 from pipeline.compute.refinement import infer
 from pipeline.compute.threads import writing_results
@@ -37,7 +37,7 @@ _PREPARING = threading.Lock()
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> RunInfo:
     """Read the run of a task, once per process; raise `RefusedError` if this worker would compute other results."""
     if origin is not None:
-        import_model(*origin)
+        import_object(*origin)
     info = read_run(directory)
     different = differences(numbered(info.identity), info.plan.identity)
     if digest != info.digest or different:

@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.threads import number_of_threads, using_threads
-from magpend_core.models import import_model
+from magpend_core.models import import_object
 from magpend_core.models.imported import origin
 from magpend_core.models.model import Model
 from magpend_core.precision import Precision
@@ -218,7 +218,7 @@ def compute_block(
     `threads` is the number of threads of the engine; None takes that of the context.
     """
     if origin is not None:
-        import_model(*origin)
+        import_object(*origin)
     run, known = _opened(opened, directory, digest)
     analysis = ANALYSES[key["derived_product"]]
     if key_of(current(run, analysis.name, options.plain()), analysis, options) != key:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from magpend_core.models import ModelError, import_model, model_names
+from magpend_core.models import ModelError, import_object, model_names
 from magpend_core.models import load_model as named_model
 from magpend_core.models.imported import KEY, is_object_path
 from magpend_core.models.model import Model
@@ -65,7 +65,7 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
         if is_equations(reference):
             return named_model({"equations": reference})
         if folder is not None and is_object_path(reference):
-            return import_model(reference, folder)
+            return import_object(reference, folder)
         if is_model_file(reference):
             return _of_file(reference, folder, at)
         return named_model(reference)

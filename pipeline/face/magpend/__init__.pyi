@@ -7,7 +7,7 @@ from magpend._runs import table as table
 from magpend_core.engine.system import System as System
 from magpend_core.lyapunov import LyapunovExponents as LyapunovExponents
 from magpend_core.lyapunov import lyapunov_exponents as lyapunov_exponents
-from magpend_core.models import import_model as import_model
+from magpend_core.models import import_object as import_object
 from magpend_core.models import load_preset as load_preset
 from magpend_core.models import model_names as model_names
 from magpend_core.models import preset_names as preset_names
@@ -50,6 +50,7 @@ from pipeline.analysis.series.analysis import series_of as series_of
 from pipeline.analysis.spectrum.estimate import spectrum_of as spectrum_of
 from pipeline.compute.simulate import simulate as simulate
 from pipeline.explorer.notebook import explorer as explorer
+from pipeline.importing.importing import import_model as import_model
 from pipeline.plots import DataFigure as DataFigure
 from pipeline.plots import Frame as Frame
 from pipeline.plots import draw_figure as draw_figure

@@ -137,13 +137,13 @@ def test_open_run__stranger_s_object_is_never_imported(own, stored, tmp_path, ma
     assert "section" in out
     code, _, said = main("analyse", "attractors", stored)
     assert code == 2
-    assert "--import-model trap:MINE" in said
+    assert "--import-object trap:MINE" in said
     for form in ("trap:MINE", "shared.toml"):  # a name where a run keeps a whole
         rewritten(stored, lambda spec, form=form: spec.update(model=form))
         assert main("status", stored)[0] == 5
     assert not trace.exists()
     assert "trap" not in sys.modules
-    code, _, said = main("status", stored, "--import-model", "trap:MINE")
+    code, _, said = main("status", stored, "--import-object", "trap:MINE")
     assert trace.exists()  # a person has named it
     sys.modules.pop("trap", None)
 
@@ -169,7 +169,7 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, ma
         atol=1e-12,
     ).y.T
     assert cell.section.values == pytest.approx(found, abs=2e-5)
-    named = "--import-model", "mine:MINE"
+    named = "--import-object", "mine:MINE"
     trace.unlink()
     assert main("analyse", "attractors", elsewhere / "run")[0] == 2
     assert not trace.exists()

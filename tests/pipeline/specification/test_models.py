@@ -8,7 +8,7 @@ import tomllib
 
 import pytest
 
-from magpend_core.models import import_model, imported, load_model
+from magpend_core.models import import_object, imported, load_model
 from magpend_core.models.imported import DescribedModel, origin
 from magpend_core.models.parameters import ParameterError
 from magpend_core.models.preset_writing import write_preset
@@ -146,12 +146,12 @@ def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, modu
     assert name not in sys.modules
     for field in ("name", "title", "states", "parameters", "presets", "section", "mirror", "digest"):
         assert getattr(model, field) == getattr(spec.model, field)
-    with pytest.raises(ParameterError, match=f"--import-model {name}:MINE"):
+    with pytest.raises(ParameterError, match=f"--import-object {name}:MINE"):
         _ = model.system
     assert load_model(model.reference) is model  # so that parameters compare
 
 
-def test_import_model__digest_is_that_of_the_module(own, tmp_path, module, monkeypatch):
+def test_import_object__digest_is_that_of_the_module(own, tmp_path, module, monkeypatch):
     """What is commented does not count, what is computed does."""
     name, _ = module
     digests, path_before = [], [*sys.path]
@@ -162,7 +162,7 @@ def test_import_model__digest_is_that_of_the_module(own, tmp_path, module, monke
         monkeypatch.setattr(imported, "_imported", {})
         monkeypatch.setattr(sys, "path", [*path_before])
         sys.modules.pop(name, None)
-        digests.append(import_model(f"{name}:MINE", path.parent).digest)
+        digests.append(import_object(f"{name}:MINE", path.parent).digest)
         assert sys.modules[name].__file__ == str(path)
     assert digests[0] == digests[1] != digests[2]
 
@@ -182,9 +182,9 @@ def test_described_model__object_that_was_changed_is_not_the_run_s(own, tmp_path
         ("magpend_core.models:NO_SUCH", "cannot be imported"),
     ],
 )
-def test_import_model__says_why(path, words):
+def test_import_object__says_why(path, words):
     with pytest.raises(ParameterError, match=words):
-        import_model(path)
+        import_object(path)
     assert problems_of(find_model, path)[0].startswith("model: ")
 
 

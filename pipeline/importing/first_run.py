@@ -1,0 +1,199 @@
+"""Choose a first specification for an imported model: sections, a parameter with a range, and starts.
+
+A short trial integration tells where the motion goes, so that a section lies across it.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from magpend_core.models.text.definition import Definition
+from magpend_core.models.text.numeric import rates_of
+from magpend_core.models.text.reading import read_definition
+from pipeline.importing.assembly import Assembled
+from pipeline.importing.drive import constant_setting
+from pipeline.importing.expressions import size
+
+TOTAL = 100.0
+"""Time of the trial if the file gives none."""
+TRIALS = 9
+"""Values of the swept parameter at which the motion is tried, besides the own one of the file."""
+MOST_EVALUATIONS = 2000
+MOST_NODES = 150_000
+"""Most evaluations of the equations, and of nodes of their expressions, in a trial."""
+VALUES = 51
+"""Values of the swept parameter."""
+SEVERAL = 5.0
+"""Length of a trial in units of the file's time of integration."""
+SAMPLES = 2000
+LEAST_SWING = 0.02
+"""Least range of a state after the transient, in units of that of all trials, that counts as an oscillation."""
+LEAST_WAIT = 10.0
+"""Shortest wait for a return to the section."""
+LARGE = 1e8
+
+
+class _EnoughError(Exception):
+    """The trial has evaluated the equations often enough."""
+
+
+def first_tables(model: Assembled) -> dict[str, Any]:
+    """Return the tables of a first specification."""
+    definition = read_definition(model.model)[0]
+    assert definition is not None
+    name, low, high = _range(model)
+    tables: dict[str, Any] = {"parameters": {}, "axes": {}}
+    if name:
+        tables["axes"][name] = {"start": low, "stop": high, "num": 201 if definition.is_map else VALUES}
+    tables["initial_conditions"] = {"kind": "list", "points": [model.starts]}
+    integration = {"n_transient": 200, "n_keep": 32}
+    if definition.is_map:
+        integration = {"n_transient": 1000, "n_keep": 100}
+    elif model.omega is not None:
+        tables["parameters"]["omega"] = model.omega
+    elif (section := None if model.strengths else _section(model, definition, name, (low, high))) is not None:
+        tables["section"] = section
+    else:
+        tables["parameters"]["frequency_hz"] = _short(200.0 / _total(model))
+    if model.strengths:
+        tables["noise"] = {
+            "strengths": {n: float(t) if _is_number(t) else t for n, t in model.strengths.items()},
+            "interpretation": "ito",
+        }
+        integration = {"n_transient": 0, "n_keep": 200}
+    tables["integration"] = integration
+    return {key: value for key, value in tables.items() if value}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def _range(model: Assembled) -> tuple[str, float, float]:
+    """Return the parameter to sweep and its range: of the file's options, else half its value about it."""
+    source, settings = model.source, model.source.settings
+    parameters = list(source.parameters)
+    chosen = settings.get("rangeover", "")
+    if chosen in parameters:
+        low, high = (constant_setting(source, key, math.nan) for key in ("rangelow", "rangehigh"))
+    else:
+        given = [key in settings for key in ("parmin", "parmax")]
+        # AUTO begins with the first parameter of the file
+        chosen = source.first_parameter if source.first_parameter in parameters else (parameters or [""])[0]
+        low, high = (constant_setting(source, key, d) for key, d in (("parmin", 0.0), ("parmax", 2.0)))
+        if not any(given) or chosen != source.first_parameter:
+            low, high = math.nan, math.nan
+    if not chosen:
+        return "", 0.0, 0.0
+    value = source.parameters[chosen]
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        low, high = sorted((0.5 * value, 1.5 * value)) if value else (0.0, 1.0)
+    return model.names[chosen], _short(low), _short(high)
+
+
+def _section(model: Assembled, definition: Definition, axis: str, span: tuple[float, float]) -> dict[str, Any] | None:
+    """Return a section across the motion, from the file's options or a trial; None if all motions come to rest."""
+    source, settings = model.source, model.source.settings
+    motions = _trials(model, definition, axis, span)
+    state = settings.get("poivar", "")
+    if settings.get("poimap", "")[:1] == "s" and state in source.states:
+        sign = constant_setting(source, "poisgn", 1.0)
+        level = constant_setting(source, "poipln", 0.0)
+        found = {"of": model.names[state], "value": level, "direction": "down" if sign < 0 else "up"}
+    elif (chosen := _across(model, motions)) is not None:
+        found = chosen
+    else:
+        return None
+    return {**found, "longest": _short(max(LEAST_WAIT, _total(model)))}
+
+
+def _total(model: Assembled) -> float:
+    """Return the length of a trial."""
+    total = constant_setting(model.source, "total", TOTAL)
+    return SEVERAL * (total if 0.0 < total < 1e9 else TOTAL)
+
+
+def _trials(
+    model: Assembled, definition: Definition, axis: str, span: tuple[float, float]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return times and states of trials at a few values of the swept parameter."""
+    own = {p.name: float(definition.presets[0].values[p.name]) for p in definition.parameters}
+    shares = (np.arange(TRIALS) + 0.5) / TRIALS if axis else ()
+    values = [own, *({**own, axis: span[0] + (span[1] - span[0]) * share} for share in shares)]
+    found = (_trial(definition, value, model.starts, _total(model)) for value in values)
+    return [motion for motion in found if motion is not None]
+
+
+def _trial(
+    definition: Definition, values: dict[str, float], start: list[float], total: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Integrate for a while, coarsely; return times and states, or None if they do not stay finite."""
+    names = [s.name for s in definition.states]
+    nodes = sum(map(size, (*definition.equations.values(), *definition.define.values())))
+    left = min(MOST_EVALUATIONS, MOST_NODES // nodes)
+    met: list[tuple[float, np.ndarray]] = []
+
+    def rates(t: float, y: np.ndarray) -> list[float]:
+        if len(met) >= left:
+            raise _EnoughError
+        met.append((t, y.copy()))
+        found = rates_of(definition, {**values, "pi": math.pi, **dict(zip(names, y, strict=True))})
+        return [float(found[name]) for name in names]
+
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
+            solved = solve_ivp(
+                rates, (0.0, total), start, "LSODA", np.linspace(0.0, total, SAMPLES), rtol=1e-6, atol=1e-9
+            )
+        t, y = solved.t, solved.y
+    except _EnoughError:
+        met.sort(key=lambda one: one[0])
+        t, y = np.array([one[0] for one in met]), np.array([one[1] for one in met]).T
+    except (ValueError, ArithmeticError):
+        return None
+    return (t, y) if y.size and t[-1] > 0.0 and np.isfinite(y).all() and np.abs(y).max() < LARGE else None
+
+
+def _across(model: Assembled, motions: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any] | None:
+    """Return a section half-way between the extremes of the state that swings most in its own range."""
+    best: tuple[float, int, dict[str, Any]] | None = None
+    for k, state in enumerate(model.source.states):
+        if state in model.source.circles or not motions:
+            continue
+        extent = max(y[k].max() for _, y in motions) - min(y[k].min() for _, y in motions)
+        for times, states in motions:
+            values = states[k][times > 0.5 * times[-1]]
+            if not values.size:
+                continue
+            low, high = float(values.min()), float(values.max())
+            level = _between(low, high)
+            crossings = int(np.count_nonzero((values[1:] > level) & (values[:-1] <= level)))
+            swing = (high - low) / (extent or 1.0)
+            if swing < LEAST_SWING or crossings < 2:
+                continue
+            if best is None or (round(swing, 1), crossings) > best[:2]:
+                best = round(swing, 1), crossings, {"of": model.names[state], "value": level, "direction": "up"}
+    return None if best is None else best[2]
+
+
+def _between(low: float, high: float) -> float:
+    """Return a short number near the middle of an interval."""
+    middle, width = 0.5 * (low + high), high - low
+    if width <= 0.0:
+        return middle
+    if low < 0.0 < high and min(-low, high) > 0.25 * width:
+        return 0.0
+    return round(middle, max(0, 1 - math.floor(math.log10(width))))
+
+
+def _short(value: float) -> float:
+    """Return a number with six digits."""
+    return float(f"{value:.6g}")
