@@ -128,9 +128,9 @@ def _check_names(source: Source) -> None:
     for name, tree in source.parts.items():
         later = [n for n in names_in(tree) & source.parts.keys() if source.line_of(n) > source.line_of(name)]
         if later:
+            place = f"line {source.line_of(name)}: {source.spelled(name)} uses {source.spelled(later[0])}"
             source.notes.append(
-                f"line {source.line_of(name)}: {source.spelled(name)} uses {source.spelled(later[0])}, which comes later: "
-                "XPPAUT takes its value of the step before, the model that of the same instant."
+                f"{place}, which comes later: XPPAUT takes its value of the step before, the model that of this instant."
             )
 
 

@@ -31,8 +31,8 @@ class Rate:
 def drive_of(source: Source) -> float | None:
     """Rewrite the equations of a source as driven by omega; return omega's value, or None if nothing depends on time.
 
-    Time that does not enter as ``sin(w*t + a)`` or ``mod(t, T)``, with one frequency and its multiples, becomes a state,
-    a clock. A clock of a map counts iterations.
+    Time that does not enter as ``sin(w*t + a)`` or ``mod(t, T)``, with one frequency and its multiples, becomes a
+    state, a clock. A clock of a map counts iterations.
     """
     trees = {**source.states, **{f"reset {i}": reset.of for i, reset in enumerate(source.resets)}}
     for reset in source.resets:
@@ -68,9 +68,8 @@ def _timed_parts(source: Source) -> set[str]:
 
 def _drop_timed_quantities(source: Source, timed: set[str]) -> None:
     for name in [n for n, tree in source.quantities.items() if names_in(tree) & ({TIME} | timed)]:
-        source.notes.append(
-            f"line {source.line_of(name)}: aux {source.spelled(name)} is left out: it needs time, and the equations do not."
-        )
+        place = f"line {source.line_of(name)}: aux {source.spelled(name)}"
+        source.notes.append(f"{place} is left out: it needs time, and the equations do not.")
         del source.quantities[name]
 
 
@@ -90,7 +89,7 @@ def _add_clock(source: Source, reason: str) -> None:
     source.states[name] = Tree("sum", 1, "", (clock[TIME], one)) if source.is_map else one
     source.starts[name] = constant_setting(source, "t0", 0.0)
     source.notes.append(
-        f"t is the state {name} ({reason}), so no motion closes: trajectories have a meaning, attractors none."
+        f"t is the state {name} ({reason}): no motion closes, so trajectories have a meaning, attractors none."
     )
 
 

@@ -57,7 +57,7 @@ def _checked(path: Path, tables: dict[str, Any], notes: list[str]) -> Spec:
         spec = Spec.parse(tables)
         model = spec.model.flow
         assert isinstance(model, TextModel)
-        assert model.derived
+        _ = model.derived
     except (SpecError, ModelError) as error:
         raise SpecError([f"{path.name}: {problem}" for problem in error.problems]) from None
     try:

@@ -11,14 +11,12 @@ from pathlib import Path
 
 from magpend_core.models.text.grammar import FUNCTIONS, Tree
 from pipeline.importing.expressions import (
-    ONE,
     ZERO,
     Dialect,
     Parser,
     RefusedError,
     Token,
     as_condition,
-    compared,
     number,
     replaced,
     tokens_of,
@@ -36,6 +34,7 @@ DIALECT = Dialect(
     spelled={"not": "!"},
 )
 RANDOM = ("ran", "normal", "poisson")
+SPELLED = {"ln": "log", "heav": "heaviside", "flr": "floor"}
 SPECIAL_FUNCTIONS = ("besselj", "bessely", "besseli", "erf", "erfc", "lgamma")
 DELAYS = ("delay", "del_shft")
 SUM, SHIFT = "sum of", "shift"
@@ -343,7 +342,7 @@ class _Reader:
             raise RefusedError(f"table {text[:40]}: must name a file beside this one")
         self.source.functions[low] = (("t",), interpolation(self.source.path.parent / file.strip()))
         self.source.notes.append(
-            f"line {n}: the table {name} is interpolated linearly, as in XPPAUT: continuous, with corners at its points."
+            f"line {n}: the table {name} is interpolated linearly, as there: continuous, with corners at its points."
         )
 
     def options(self, text: str) -> None:
@@ -465,18 +464,8 @@ class _Resolver:
 def spelled(tree: Tree) -> Tree:
     """Spell a call of a function of XPPAUT as magpend does; raise if there is none."""
     name, args = str(tree.value), tree.args
-    wanted = {"ln": 1, "log10": 1, "heav": 1, "flr": 1, "mod": 2}.get(name)
-    if wanted is not None and len(args) != wanted:
-        raise RefusedError(f"{name} has {len(args)} arguments; it takes {wanted}")
-    if name == "ln":
-        return Tree("call", tree.at, "log", args)
-    if name == "log10":
-        ten = Tree("call", 1, "log", (Tree("number", 1, 10.0),))
-        return Tree("product", tree.at, "", (Tree("call", tree.at, "log", args), Tree("inverse", 1, "", (ten,))))
-    if name == "heav":
-        return Tree("call", tree.at, "where", (compared("<", args[0], ZERO), ZERO, ONE))
-    if name == "flr":
-        return Tree("call", tree.at, "floor", args)
+    if name in SPELLED:
+        return Tree("call", tree.at, SPELLED[name], args)
     if name in RANDOM:
         raise RefusedError(f"{name}: random numbers are not carried over; white noise is (wiener)")
     if name in DELAYS:
