@@ -9,13 +9,13 @@ from typing import Any
 from magpend_core.models.text.grammar import FUNCTIONS, Tree, name_problem
 from magpend_core.models.text.reading import MAX_DEFINED, OF_RUNS, read_definition
 from magpend_core.models.text.views import MAX_OTHERS
-from pipeline.importing.drive import OMEGA, PHASE, drive_of
+from pipeline.importing.drive import OMEGA, drive_of
 from pipeline.importing.expressions import ZERO, RefusedError, known_call, names_in, replaced, size, walk, written
 from pipeline.importing.functions import Functions
 from pipeline.importing.noise import strengths_of
 from pipeline.importing.source import Source
 
-BUILT_IN = {"t", "pi", OMEGA, PHASE}
+BUILT_IN = {"t", "pi", OMEGA}
 
 
 @dataclass
@@ -130,7 +130,7 @@ def _check_names(source: Source) -> None:
         if later:
             place = f"line {source.line_of(name)}: {source.spelled(name)} uses {source.spelled(later[0])}"
             source.notes.append(
-                f"{place}, which comes later: XPPAUT takes its value of the step before, the model that of this instant."
+                f"{place}, which comes later: XPPAUT takes its value of the step before, the model that of now."
             )
 
 
@@ -175,7 +175,7 @@ def _inline_smallest(source: Source, strengths: dict[str, Tree]) -> None:
 
 def _final_names(source: Source, driven: bool) -> dict[str, str]:
     """Return the name of everything in the model, by its name in the source; tell of those that differ."""
-    names = {OMEGA: OMEGA[1:], PHASE: PHASE[1:]}
+    names = {OMEGA: OMEGA[1:]}
     taken = {"omega"} if driven else set()
     every = [*source.states, *source.parameters, *source.parts, *source.quantities, *source.presets]
     for name in every:

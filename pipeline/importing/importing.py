@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from magpend_core.models import load_model
 from magpend_core.models.model import ModelError
 from magpend_core.models.text.model import TextModel
 from pipeline.importing.assembly import Assembled, assembled, plain
@@ -55,7 +56,7 @@ def _checked(path: Path, tables: dict[str, Any], notes: list[str]) -> Spec:
     """Return the specification, whose equations can be integrated; note starts at which they have no value."""
     try:
         spec = Spec.parse(tables)
-        model = spec.model.flow
+        model = load_model(spec.reference)
         assert isinstance(model, TextModel)
         _ = model.derived
     except (SpecError, ModelError) as error:

@@ -37,6 +37,7 @@ RANDOM = ("ran", "normal", "poisson")
 SPELLED = {"ln": "log", "heav": "heaviside", "flr": "floor"}
 SPECIAL_FUNCTIONS = ("besselj", "bessely", "besseli", "erf", "erfc", "lgamma")
 DELAYS = ("delay", "del_shft")
+RESERVED = ("t", "pi", "if", "then", "else", "sum", "of", "shift", *RANDOM, *DELAYS)
 SUM, SHIFT = "sum of", "shift"
 """Calls that `resolved` writes out."""
 SCREEN_SETTINGS = re.compile(
@@ -128,6 +129,8 @@ class _Reader:
     def define(self, n: int, name: str) -> str:
         """Note where a name is defined and how it is spelled; return it in small letters."""
         low = name.lower()
+        if low in RESERVED:
+            raise RefusedError(f"{name} has a meaning in XPPAUT, for which {low.upper()} and {low} are one")
         known = self.source.lines.get(low)
         if known is not None:
             raise RefusedError(f"{name} is defined in line {known} already")

@@ -15,6 +15,7 @@ from pipeline.importing.source import Source
 MOST_LINES = 20_000
 """Lines after all arrays have been written out."""
 _RANGE = re.compile(r"\[\s*(-?\d{1,6})\s*\.\.\s*(-?\d{1,6})\s*\]")
+_FIXED = re.compile(r"\[\s*(\d{1,6})\s*\]")
 _INDEX = re.compile(r"\[([^\[\]]{0,60})\]")
 _TERM = re.compile(r"([-+]?)(?:(\d{1,6})\*)?(j|\d{1,6})(?:\*(\d{1,6}))?")
 
@@ -92,7 +93,7 @@ def _expanded(line: Line, source: Source) -> Iterator[Line]:
     """Yield a line once for each index of the array in it."""
     span = _RANGE.search(line.text)
     if span is None:
-        yield line
+        yield Line(line.number, _FIXED.sub(r"\1", line.text), line.comments)
         return
     rest = Line(line.number, _RANGE.sub("[j]", line.text))
     for n, j in enumerate(_steps(int(span[1]), int(span[2]))):
