@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from magpend_core.models.text.grammar import FUNCTIONS, Tree
 
@@ -22,6 +23,10 @@ PI = Tree("name", 1, "pi")
 
 class RefusedError(ValueError):
     """Error: a part of a file cannot be carried over; the message is a sentence without its place."""
+
+
+_SIGNS = r"\*\*|\.\*|\./|\.\^|<=|>=|==|/=|!=|~=|&&|\|\||[-+*/^()\[\],<>&|!~=?:#@{}%]"
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
 
 
 @dataclass(frozen=True)
@@ -54,9 +59,12 @@ class Dialect:
     square: bool = False
     spelled: Mapping[str, str] = field(default_factory=dict)
 
+    @cached_property
+    def token(self) -> re.Pattern[str]:
+        """Regular expression of a token."""
+        return re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{self.names})|(?P<sign>{_SIGNS}))")
 
-_SIGNS = r"\*\*|\.\*|\./|\.\^|<=|>=|==|/=|!=|~=|&&|\|\||[-+*/^()\[\],<>&|!~=?:#@{}%]"
-_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
+
 COMPARE = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "==": "==", "!=": "!=", "~=": "!=", "/=": "!="}
 AND, OR, NOT, POWER = ("&", "&&"), ("|", "||"), ("not", "!", "~"), ("^", "**", ".^")
 
@@ -80,11 +88,10 @@ def tokens_of(text: str, dialect: Dialect) -> list[Token]:
     """
     if len(text) > MAX_LENGTH:
         raise RefusedError(f"the expression has {len(text)} characters; {MAX_LENGTH} are the most")
-    whole = re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{dialect.names})|(?P<sign>{_SIGNS}))")
     found, place = [], 0
     text = text.rstrip()
     while place < len(text):
-        match = whole.match(text, place)
+        match = dialect.token.match(text, place)
         if match is None:
             odd = text[place:].lstrip()[:1]
             raise RefusedError(f"{odd!r} has no meaning in an expression")

@@ -75,7 +75,7 @@ class Source:
     def refuse(self, line: int, reason: str) -> None:
         """Add a problem with its line."""
         problem = f"line {line}: {reason.rstrip('.')}."
-        if problem not in self.problems:
+        if problem not in self.problems[-MOST_PROBLEMS:]:
             self.problems.append(problem)
 
     def line_of(self, name: str) -> int:

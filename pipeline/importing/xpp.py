@@ -10,17 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from magpend_core.models.text.grammar import FUNCTIONS, Tree
-from pipeline.importing.expressions import (
-    ZERO,
-    Dialect,
-    Parser,
-    RefusedError,
-    Token,
-    as_condition,
-    number,
-    replaced,
-    tokens_of,
-)
+from pipeline.importing.expressions import ZERO, Dialect, Parser, RefusedError, Token, as_condition, number, replaced
 from pipeline.importing.source import Reset, Source, text_of
 from pipeline.importing.tables import interpolation
 from pipeline.importing.xpp_lines import Line, lines_of
@@ -143,7 +133,7 @@ class _Reader:
             raise RefusedError("integrals (Volterra equations, convolutions) are not carried over")
         parser = Parser(text, DIALECT, {"if": _conditional, SUM[:3]: _sum})
         tree = number(parser.whole())
-        if _mixes_comparison(text):
+        if _mixes_comparison(parser.tokens):
             self.source.notes.append(
                 f"line {n}: XPPAUT compares before it adds, and so does the model: a + b < c is a + (b < c)."
             )
@@ -508,12 +498,10 @@ def _sum(parser: Parser, token: Token) -> Tree:
     return Tree("call", token.at, SUM, (*bounds, number(body)))
 
 
-def _mixes_comparison(text: str) -> bool:
+def _mixes_comparison(tokens: list[Token]) -> bool:
     """Return whether a comparison has an arithmetic operator beside it within the same brackets."""
     levels: list[list[str]] = [[]]
-    for before, token in zip(
-        [Token("sign", "(", 0), *tokens_of(text, DIALECT)], tokens_of(text, DIALECT), strict=False
-    ):
+    for before, token in zip([Token("sign", "(", 0), *tokens], tokens, strict=False):
         if token.text == "(":
             levels.append([])
         elif token.text in (")", ",") and _mixed(levels[-1]):

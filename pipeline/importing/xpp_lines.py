@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pipeline.importing.source import Source
 
-MOST_LINES = 20_000
+MOST_LINES = 5_000
 """Lines after all arrays have been written out."""
 _RANGE = re.compile(r"\[\s*(-?\d{1,6})\s*\.\.\s*(-?\d{1,6})\s*\]")
 _FIXED = re.compile(r"\[\s*(\d{1,6})\s*\]")

@@ -212,7 +212,7 @@ v'=(-v+f(aei*u-aii*v-zi))/tau
         dict(a=0.5, per=3.0),
         (0.0,),
         lambda t, y, p: [-y[0] + p["a"] * (t - p["per"] * floor(t / p["per"]))],
-        2.9,
+        9.0,
         omega=2 * pi / 3.0,
     ),
     "tone_of_numbers": Published(

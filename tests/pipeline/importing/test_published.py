@@ -15,11 +15,11 @@ from pipeline.importing.importing import import_file
 from tests.pipeline.importing.published import PUBLISHED
 
 
-@pytest.fixture(params=PUBLISHED)
-def both(request, tmp_path):
+@pytest.fixture(scope="module", params=PUBLISHED)
+def both(request, tmp_path_factory):
     """A published model and its import."""
     one = PUBLISHED[request.param]
-    path = tmp_path / f"{request.param}.ode"
+    path = tmp_path_factory.mktemp("published") / f"{request.param}.ode"
     path.write_text(one.text)
     return one, import_file(path)
 
