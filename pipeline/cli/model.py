@@ -74,7 +74,9 @@ def new(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File of XPPAUT (.ode).")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File of XPPAUT (.ode), MatCont (.m) or AUTO (.f90, .f, .c).")
+    ],
     out: Annotated[
         Path | None, typer.Option(metavar="NAME.toml", help="File to write; by default named after FILE.")
     ] = None,
@@ -93,8 +95,9 @@ def import_(
     console.note(f"look at it with: magpend model show {target}; run it with: magpend run {target}")
 
 
-for _command, _name in ((show, "show"), (new, "new"), (import_, "import")):
-    add_command(model_app, _command, _name)
+import_.__name__ = "import"
+for _command in (show, new, import_):
+    add_command(model_app, _command, _command.__name__)
 
 
 def _lines(model: Model, found: Description) -> list[str]:

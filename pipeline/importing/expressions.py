@@ -331,7 +331,7 @@ def _write(tree: Tree, names: Mapping[str, str]) -> tuple[str, int]:
         return f"{_within(parts[0], _ATOM)}**{_within(parts[1], _ATOM)}", _POWER
     if tree.kind == "sum":
         return _written_sum(tree, names), _SUM
-    return _written_product(tree, names), _PRODUCT
+    return _written_product(tree, names), _SUM if tree.args[0].kind == "negative" else _PRODUCT
 
 
 def _within(part: tuple[str, int], least: int) -> str:
@@ -343,6 +343,8 @@ def _written_sum(tree: Tree, names: Mapping[str, str]) -> str:
     text = _within(_write(tree.args[0], names), _SUM)
     for term in tree.args[1:]:
         sign, inner = ("-", term.args[0]) if term.kind == "negative" else ("+", term)
+        if term.kind == "product" and term.args[0].kind == "negative":
+            sign, inner = "-", replace(term, args=(term.args[0].args[0], *term.args[1:]))
         text += f" {sign} {_within(_write(inner, names), _SUM + 1)}"
     return text
 
@@ -353,7 +355,7 @@ def _written_product(tree: Tree, names: Mapping[str, str]) -> str:
         if factor.kind == "inverse":
             text = f"{text or '1'}/{_within(_write(factor.args[0], names), _POWER)}"
         else:
-            inner = _within(_write(factor, names), _PRODUCT if not text else _POWER)
+            inner = _within(_write(factor, names), _POWER if text else _SUM if factor.kind == "negative" else _PRODUCT)
             text = f"{text}*{inner}" if text else inner
     return text
 

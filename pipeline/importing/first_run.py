@@ -21,9 +21,9 @@ from pipeline.importing.expressions import size
 
 TOTAL = 100.0
 """Time of the trial if the file gives none."""
-TRIALS = 9
+TRIALS = 6
 """Values of the swept parameter at which the motion is tried, besides the own one of the file."""
-MOST_EVALUATIONS = 2000
+MOST_EVALUATIONS = 1200
 MOST_NODES = 150_000
 """Most evaluations of the equations, and of nodes of their expressions, in a trial."""
 VALUES = 51

@@ -20,7 +20,12 @@ from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
 from pipeline.store.local import refuse_place
 
-READERS = {".ode": "pipeline.importing.xpp:read"}
+READERS = {
+    ".ode": "pipeline.importing.xpp:read",
+    ".m": "pipeline.importing.matlab:read",
+    **dict.fromkeys((".f90", ".f"), "pipeline.importing.auto:read_fortran"),
+    ".c": "pipeline.importing.auto:read_c",
+}
 """Function that reads the files of a suffix."""
 
 
@@ -44,7 +49,6 @@ def import_file(path: str | Path) -> Imported:
     path = Path(path)
     read = _reader(path)
     source = read(path)
-    source.check()
     source.first_parameter = next(iter(source.parameters), "")
     model = assembled(source)
     tables = {"kind": "sweep", "title": model.model.get("title", model.model["name"]), **first_tables(model)}
@@ -84,7 +88,7 @@ def import_model(path: str | Path) -> Spec:
     Parameters
     ----------
     path
-        A file of XPPAUT (``.ode``).
+        A file of XPPAUT (``.ode``), MatCont (``.m``) or AUTO (``.f90``, ``.f``, ``.c``).
 
     Returns
     -------

@@ -40,10 +40,15 @@ def _without(tree: Tree, noises: list[str]) -> tuple[Tree, Tree]:
         tree, factor = _split(tree, noise)
         factors.append(factor)
     if len(factors) == 1:
-        return tree, factors[0]
+        return tree, _positive(factors[0])
     two = Tree("number", 1, 2.0)
     squares = tuple(Tree("power", 1, "", (factor, two)) for factor in factors)
     return tree, Tree("call", 1, "sqrt", (Tree("sum", 1, "", squares),))
+
+
+def _positive(tree: Tree) -> Tree:
+    """Return a strength without its sign, which noise does not show."""
+    return tree.args[0] if tree.kind == "negative" else tree
 
 
 def _split(tree: Tree, noise: str) -> tuple[Tree, Tree]:
@@ -53,7 +58,7 @@ def _split(tree: Tree, noise: str) -> tuple[Tree, Tree]:
         return zero, ONE
     if tree.kind == "negative":
         rest, factor = _split(tree.args[0], noise)
-        return Tree("negative", 1, "", (rest,)), Tree("negative", 1, "", (factor,))
+        return (zero if rest == zero else Tree("negative", 1, "", (rest,))), factor
     noisy = [arg for arg in tree.args if noise in names_in(arg)]
     if len(noisy) != 1 or tree.kind not in ("sum", "product") or noisy[0].kind == "inverse":
         raise RefusedError(f"the noise {noise} enters otherwise than as a summand")

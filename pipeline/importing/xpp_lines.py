@@ -85,7 +85,7 @@ def _looped(lines: Iterator[Line], source: Source) -> Iterator[Line]:
 
 
 def _steps(first: int, last: int) -> range:
-    first, last = max(-MOST_LINES, first), min(MOST_LINES, last)
+    first, last = max(-2 * MOST_LINES, first), min(2 * MOST_LINES, last)
     return range(first, last + 1) if first <= last else range(first, last - 1, -1)
 
 
