@@ -176,15 +176,15 @@ def _inline_smallest(source: Source, strengths: dict[str, Tree]) -> None:
 def _final_names(source: Source, driven: bool) -> dict[str, str]:
     """Return the name of everything in the model, by its name in the source; tell of those that differ."""
     names = {OMEGA: OMEGA[1:]}
-    taken = {"omega"} if driven else set()
+    taken, free = ({"omega"}, ()) if driven else (set(), ("f", "phase"))
     every = [*source.states, *source.parameters, *source.parts, *source.quantities, *source.presets]
     for name in every:
         wanted = source.spelled(name) if name not in source.presets else name
         new = wanted
-        if name_problem(new) is not None:
+        if name_problem(new, free) is not None:
             new = re.sub(r"[^A-Za-z0-9]+", "_", new).strip("_")
             new = (new if new[:1].isalpha() else f"x{new}")[:36]
-        while name_problem(new) is not None or new in OF_RUNS or new in taken:
+        while name_problem(new, free) is not None or new in OF_RUNS or new in taken:
             new += "_"
         taken.add(new)
         names[name] = new
