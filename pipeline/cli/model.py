@@ -92,7 +92,7 @@ def import_(
     target, notes = write_import(file, out)
     console.note(*notes)
     console.result(f"specification: {target}")
-    console.note(f"look at it with: magpend model show {target}; run it with: magpend run {target}")
+    console.note(f"look at it with: magpend model show {target}; run it with: magpend run {target} --plot")
 
 
 import_.__name__ = "import"
