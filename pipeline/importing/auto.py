@@ -58,7 +58,7 @@ def _read(source: Source, routines: dict[str, list[tuple[int, str]]], procedure:
         source.refuse(1, "there is no routine FUNC")
     for line, text in routines.get("func", ()):
         try:
-            if re.match(r"if\s*\(\s*ijac\b", text, re.IGNORECASE):
+            if re.fullmatch(r"if\s*\(\s*ijac\b.*\)\s*return\b.*", text, re.IGNORECASE):
                 break  # derivatives, which magpend makes itself
             _assign(procedure, line, text)
         except RefusedError as error:

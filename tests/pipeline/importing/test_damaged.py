@@ -7,12 +7,14 @@ import time
 
 import pytest
 
-from pipeline.importing import xpp
+from pipeline.importing import auto, matlab, xpp
 from pipeline.importing.assembly import assembled
 from pipeline.specification.problems import SpecError
 from tests.pipeline.importing.published import PUBLISHED
+from tests.pipeline.importing.test_procedural import AB_C, AB_F, AB_F90, AB_M
 
-TEXTS = [one.text for one in PUBLISHED.values()]
+TEXTS = [*(one.text for one in PUBLISHED.values()), *[AB_F90, AB_F, AB_C, AB_M] * 2]
+READERS = {AB_F90: auto.read_fortran, AB_F: auto.read_fortran, AB_C: auto.read_c, AB_M: matlab.read}
 BITS = (
     *"()[]{}'=^-!%\",;&|#\n\x00é_",
     *("[1..9]", "[1..99999]", "[j]", "**", "1e400", "9" * 50, "sum(0,9)of(", "shift(", "if(", "then(", "else("),
@@ -46,11 +48,12 @@ def judge(path, seed: int, count: int) -> tuple[int, int]:
     rng = random.Random(seed)
     good = bad = 0
     for _ in range(count):
-        text = damaged(rng, rng.choice(TEXTS))
+        whole = rng.choice(TEXTS)
+        text = damaged(rng, whole)
         path.write_bytes(text.encode("latin-1", "replace"))
         begun = time.monotonic()
         try:
-            source = xpp.read(path)
+            source = READERS.get(whole, xpp.read)(path)
             assembled(source)
             good += 1
         except SpecError as error:
