@@ -10,7 +10,16 @@ from magpend_core.models.text.grammar import FUNCTIONS, Tree, name_problem
 from magpend_core.models.text.reading import MAX_DEFINED, OF_RUNS, read_definition
 from magpend_core.models.text.views import MAX_OTHERS
 from pipeline.importing.drive import OMEGA, drive_of
-from pipeline.importing.expressions import ZERO, RefusedError, known_call, names_in, replaced, size, walk, written
+from pipeline.importing.expressions import (
+    ZERO,
+    RefusedError,
+    arguments_problem,
+    names_in,
+    replaced,
+    size,
+    walk,
+    written,
+)
 from pipeline.importing.functions import Functions
 from pipeline.importing.noise import strengths_of
 from pipeline.importing.source import Source
@@ -121,7 +130,7 @@ def _check_names(source: Source) -> None:
         for node in walk(tree):
             if node.kind == "call" and node.value not in FUNCTIONS:
                 source.refuse(line, f"{node.value}: the text of a model has no such function")
-            elif node.kind == "call" and (problem := known_call(node)) is not None:
+            elif node.kind == "call" and (problem := arguments_problem(node)) is not None:
                 source.refuse(line, problem)
     if source.program != "XPPAUT":
         return

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from magpend_core.models.text.grammar import Tree
-from pipeline.importing.expressions import Dialect, RefusedError
+from pipeline.importing.expressions import Dialect, RefusedError, replaced
 from pipeline.importing.procedural import Procedure
 from pipeline.importing.source import Source, text_of
 
@@ -87,8 +87,6 @@ def _assign(procedure: Procedure, line: int, text: str) -> None:
 
 def _point(procedure: Procedure, text: str, points: dict[str, dict[int, Tree]], own: dict[str, Tree]) -> None:
     """Take an assignment of the starting point."""
-    from pipeline.importing.expressions import replaced
-
     match = _ASSIGNMENT.fullmatch(text)
     if match is None or (_DECLARATION.match(text) and match[1].lower() not in points):
         if _DECLARATION.match(text):

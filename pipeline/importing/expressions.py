@@ -291,8 +291,8 @@ def size(tree: Tree) -> int:
     return sum(1 for _ in walk(tree))
 
 
-def known_call(tree: Tree) -> str | None:
-    """Return what is wrong with the call of a function of the text language, or None."""
+def arguments_problem(tree: Tree) -> str | None:
+    """Return what is wrong with the number of arguments of a call, or None."""
     least, most = FUNCTIONS[str(tree.value)]
     if least <= len(tree.args) <= most:
         return None

@@ -6,7 +6,7 @@ from magpend_core.models.text.grammar import Tree
 from pipeline.importing.expressions import MAX_DEPTH, MAX_NODES, RefusedError, replaced, rewritten, size
 from pipeline.importing.source import Source
 
-FEW = 6
+MOST_REPEATED = 6
 """Nodes of a function's right side up to which it is written out everywhere."""
 
 
@@ -49,7 +49,7 @@ class Functions:
         self.nodes += size(body)
         if self.nodes > MAX_NODES:
             raise RefusedError("functions make the equations too long")
-        if self.parts is None or len(plain) < len(args) or size(body) <= FEW:
+        if self.parts is None or len(plain) < len(args) or size(body) <= MOST_REPEATED:
             return body
         return Tree("name", node.at, self._part(name, plain, body))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,6 @@ def _checked(path: Path, tables: dict[str, Any], notes: list[str]) -> Spec:
 
 
 def _reader(path: Path) -> Callable[[Path], Source]:
-    from importlib import import_module
-
     if path.suffix not in READERS:
         raise SpecError(f"{path}: files that end in {', '.join(READERS)} are read.")
     module, _, name = READERS[path.suffix].partition(":")

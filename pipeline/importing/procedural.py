@@ -10,7 +10,7 @@ from pipeline.importing.expressions import ZERO, Dialect, Parser, RefusedError, 
 from pipeline.importing.numbers import constant
 from pipeline.importing.source import Source
 
-MOST_STATES = 1000
+MOST_INDEX = 1000
 """Highest index of a variable or parameter."""
 _WHOLE_DIVISION = re.compile(r"(?<![\w.])\d+\s*/\s*\d+(?![\w.])")
 
@@ -39,7 +39,7 @@ class Procedure:
 
     def element(self, kind: str, index: int) -> str:
         """Return the name of an element of an array of states or parameters, which exists from then on."""
-        if not self.base <= index < MOST_STATES + self.base:
+        if not self.base <= index < MOST_INDEX + self.base:
             raise RefusedError(f"the index {index} is out of bounds")
         table = self.states if kind == "state" else self.parameters
         return table.setdefault(index, f"{'u' if kind == 'state' else 'par'}{index - self.base + 1}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from magpend_core.models.text.grammar import Tree
 from pipeline.specification.problems import SpecError
 
-MOST_BYTES = 1_000_000
+MOST_FILE_BYTES = 1_000_000
 """Size of the largest file that is read."""
 MOST_PROBLEMS = 20
 """Most problems that are told."""
@@ -112,8 +112,8 @@ def text_of(path: Path) -> str:
         data = path.read_bytes()
     except OSError as error:
         raise SpecError(f"{path}: cannot be read ({error.strerror or error}).") from None
-    if len(data) > MOST_BYTES:
-        raise SpecError(f"{path}: has {len(data)} bytes; {MOST_BYTES} are the most for a model.")
+    if len(data) > MOST_FILE_BYTES:
+        raise SpecError(f"{path}: has {len(data)} bytes; {MOST_FILE_BYTES} are the most for a model.")
     if b"\0" in data:
         raise SpecError(f"{path}: is not a text file.")
     try:

@@ -9,7 +9,7 @@ import numpy as np
 from magpend_core.models.text.grammar import Tree
 from pipeline.importing.expressions import RefusedError
 
-MOST_POINTS = 200
+MOST_CORNER_POINTS = 200
 
 
 def interpolation(path: Path) -> Tree:
@@ -32,8 +32,8 @@ def interpolation(path: Path) -> Tree:
         values = np.array([float(word) for word in words[3 : 3 + max(count, 0)]])
     except (ValueError, IndexError):
         raise RefusedError(f"{path.name}: must have the number of points, two ends and the values") from None
-    if not 2 <= count <= MOST_POINTS or len(values) != count or not high > low:
-        raise RefusedError(f"{path.name}: must have 2 to {MOST_POINTS} values between two ends that rise")
+    if not 2 <= count <= MOST_CORNER_POINTS or len(values) != count or not high > low:
+        raise RefusedError(f"{path.name}: must have 2 to {MOST_CORNER_POINTS} values between two ends that rise")
     if not (np.isfinite(values).all() and np.isfinite([low, high]).all() and np.abs(values).max() < 1e300):
         raise RefusedError(f"{path.name}: has a value that is not finite")
     step = (high - low) / (count - 1)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from magpend_core.models.text.grammar import FUNCTIONS, Tree
 from pipeline.importing.expressions import ZERO, Dialect, Parser, RefusedError, Token, as_condition, number, replaced
+from pipeline.importing.numbers import constant
 from pipeline.importing.source import Reset, Source, text_of
 from pipeline.importing.tables import interpolation
 from pipeline.importing.xpp_lines import Line, lines_of
@@ -168,8 +169,6 @@ class _Reader:
         try:
             if name not in self.source.states:
                 raise RefusedError(f"{name}(0): there is no such variable")
-            from pipeline.importing.numbers import constant
-
             self.source.starts[name] = constant(self.source, self.tree(n, text), {"t": 0.0})
         except RefusedError as error:
             self.source.refuse(n, str(error))
@@ -412,6 +411,7 @@ class _Resolver:
             return ZERO
 
     def resolved(self, tree: Tree, args: frozenset[str]) -> Tree:
+        """Return a tree that is written out; `args` are the arguments of the function around it."""
         self.budget -= 1
         if self.budget < 0:
             raise RefusedError("sums make the equations too long")
@@ -426,6 +426,7 @@ class _Resolver:
         return spelled(tree)
 
     def summed(self, tree: Tree, args: frozenset[str]) -> Tree:
+        """Return the terms of a sum."""
         low, high = (int(self.constant(arg, args)) for arg in tree.args[:2])
         if high - low >= 2000:
             raise RefusedError(f"sum({low},{high}): has more than 2000 terms")
@@ -437,14 +438,14 @@ class _Resolver:
         return Tree("sum", tree.at, "", tuple(terms)) if len(terms) > 1 else (terms or [ZERO])[0]
 
     def constant(self, tree: Tree, args: frozenset[str]) -> float:
-        from pipeline.importing.numbers import constant
-
+        """Return the value of an expression of numbers."""
         try:
             return constant(self.source, self.resolved(tree, args), {})
         except RefusedError:
             raise RefusedError("the bounds of sums and the second argument of shift must be numbers") from None
 
     def shifted(self, tree: Tree, args: frozenset[str]) -> Tree:
+        """Return the variable so many places after another."""
         if len(tree.args) != 2 or tree.args[0].kind != "name":
             raise RefusedError("shift must be shift(NAME, NUMBER)")
         name, step = str(tree.args[0].value), int(self.constant(tree.args[1], args))

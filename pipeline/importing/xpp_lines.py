@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pipeline.importing.source import Source
 
-MOST_LINES = 5_000
+MOST_EXPANDED = 5_000
 """Lines after all arrays have been written out."""
 _RANGE = re.compile(r"\[\s*(-?\d{1,6})\s*\.\.\s*(-?\d{1,6})\s*\]")
 _FIXED = re.compile(r"\[\s*(\d{1,6})\s*\]")
@@ -35,8 +35,8 @@ def lines_of(text: str, source: Source) -> Iterator[Line]:
     for line in _looped(_joined(text), source):
         for expanded in _expanded(line, source):
             count += 1
-            if count > MOST_LINES:
-                source.refuse(line.number, f"arrays make more than {MOST_LINES} lines")
+            if count > MOST_EXPANDED:
+                source.refuse(line.number, f"arrays make more than {MOST_EXPANDED} lines")
                 return
             yield expanded
 
@@ -85,7 +85,7 @@ def _looped(lines: Iterator[Line], source: Source) -> Iterator[Line]:
 
 
 def _steps(first: int, last: int) -> range:
-    first, last = max(-2 * MOST_LINES, first), min(2 * MOST_LINES, last)
+    first, last = max(-2 * MOST_EXPANDED, first), min(2 * MOST_EXPANDED, last)
     return range(first, last + 1) if first <= last else range(first, last - 1, -1)
 
 
