@@ -109,7 +109,8 @@ def _point(procedure: Procedure, text: str, points: dict[str, dict[int, Tree]], 
 
 def _fortran_routines(text: str) -> Iterator[tuple[str, list[tuple[int, str]]]]:
     """Yield the subroutines of a Fortran file with their statements."""
-    name, body = "", []
+    name = ""
+    body: list[tuple[int, str]] = []
     for line, statement in _fortran_statements(text):
         if match := re.match(r"subroutine\s+(\w+)", statement, re.IGNORECASE):
             name, body = match[1].lower(), []

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import LSODA
 
-from magpend_core.models.text.definition import Definition
-from magpend_core.models.text.numeric import rates_of
+from magpend_core.models.text.definition import Definition, Impact
+from magpend_core.models.text.grammar import Tree
+from magpend_core.models.text.numeric import rates_of, value_of
 from magpend_core.models.text.reading import read_definition
 from pipeline.importing.assembly import Assembled
 from pipeline.importing.drive import constant_setting
@@ -30,7 +32,8 @@ VALUES = 51
 """Values of the swept parameter."""
 SEVERAL = 5.0
 """Length of a trial in units of the file's time of integration."""
-SAMPLES = 2000
+STEPS = 500
+"""Least steps of a trial."""
 LEAST_SWING = 0.02
 """Least range of a state after the transient, in units of that of all trials, that counts as an oscillation."""
 LEAST_WAIT = 10.0
@@ -128,38 +131,80 @@ def _trials(
     own = {p.name: float(definition.presets[0].values[p.name]) for p in definition.parameters}
     shares = (np.arange(TRIALS) + 0.5) / TRIALS if axis else ()
     values = [own, *({**own, axis: span[0] + (span[1] - span[0]) * share} for share in shares)]
-    found = (_trial(definition, value, model.starts, _total(model)) for value in values)
+    found = (_Trial(definition, value).motion(model.starts, _total(model)) for value in values)
     return [motion for motion in found if motion is not None]
 
 
-def _trial(
-    definition: Definition, values: dict[str, float], start: list[float], total: float
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Integrate for a while, coarsely; return times and states, or None if they do not stay finite."""
-    names = [s.name for s in definition.states]
-    nodes = sum(map(size, (*definition.equations.values(), *definition.define.values())))
-    left = min(MOST_EVALUATIONS, MOST_NODES // nodes)
-    met: list[tuple[float, np.ndarray]] = []
+class _Trial:
+    """A short, coarse integration of a model at given parameters, with its impacts."""
 
-    def rates(t: float, y: np.ndarray) -> list[float]:
-        if len(met) >= left:
+    def __init__(self, definition: Definition, values: dict[str, float]) -> None:
+        self.definition = definition
+        self.values = {**values, "pi": math.pi}
+        self.names = [s.name for s in definition.states]
+        nodes = sum(map(size, (*definition.equations.values(), *definition.define.values())))
+        self.left = min(MOST_EVALUATIONS, MOST_NODES // nodes)
+
+    def known(self, y: np.ndarray) -> dict[str, Any]:
+        """Return the values of names."""
+        return {**self.values, **dict(zip(self.names, y, strict=True))}
+
+    def rates(self, t: float, y: np.ndarray) -> list[float]:
+        """Return the rates; raise if they were asked for too often."""
+        self.left -= 1
+        if self.left < 0:
             raise _EnoughError
-        met.append((t, y.copy()))
-        found = rates_of(definition, {**values, "pi": math.pi, **dict(zip(names, y, strict=True))})
-        return [float(found[name]) for name in names]
+        found = rates_of(self.definition, self.known(y))
+        return [float(found[name]) for name in self.names]
 
-    try:
+    def valued(self, trees: Sequence[Tree], y: np.ndarray) -> list[float]:
+        """Return the values of expressions."""
+        known = self.known(y)
+        for name in self.definition.used(trees):
+            if name in self.definition.define:
+                known[name] = value_of(self.definition.define[name], known)
+        return [float(value_of(tree, known)) for tree in trees]
+
+    def surface(self, impact: Impact) -> Callable[[float, np.ndarray], float]:
+        """Return the function whose zero is an impact."""
+
+        def of(t: float, y: np.ndarray) -> float:
+            return self.valued((impact.of,), y)[0]
+
+        return of
+
+    def motion(self, start: list[float], total: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return times and states, as far as they were computed; None if they do not stay finite."""
+        rows: list[tuple[float, np.ndarray]] = []
         with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
-            solved = solve_ivp(
-                rates, (0.0, total), start, "LSODA", np.linspace(0.0, total, SAMPLES), rtol=1e-6, atol=1e-9
-            )
-        t, y = solved.t, solved.y
-    except _EnoughError:
-        met.sort(key=lambda one: one[0])
-        t, y = np.array([one[0] for one in met]), np.array([one[1] for one in met]).T
-    except (ValueError, ArithmeticError):
-        return None
-    return (t, y) if y.size and t[-1] > 0.0 and np.isfinite(y).all() and np.abs(y).max() < LARGE else None
+            try:
+                self._integrate(np.array(start), total, rows)
+            except _EnoughError:
+                pass
+            except (ValueError, ArithmeticError):
+                return None
+        t, y = np.array([row[0] for row in rows]), np.array([row[1] for row in rows]).T
+        return (t, y) if y.size and t[-1] > 0.0 and np.isfinite(y).all() and np.abs(y).max() < LARGE else None
+
+    def _integrate(self, y: np.ndarray, total: float, rows: list[tuple[float, np.ndarray]]) -> None:
+        """Append a row for each step; after an impact go on from the states that it sets."""
+        surfaces = [self.surface(impact) for impact in self.definition.impacts]
+        before = [surface(0.0, y) for surface in surfaces]
+        solver = LSODA(self.rates, 0.0, y, total, rtol=1e-6, atol=1e-9, max_step=total / STEPS)
+        while solver.status == "running":
+            solver.step()
+            rows.append((solver.t, solver.y.copy()))
+            after = [surface(solver.t, solver.y) for surface in surfaces]
+            for impact, old, new in zip(self.definition.impacts, before, after, strict=True):
+                if old * impact.direction < 0.0 <= new * impact.direction:
+                    y = solver.y.copy()
+                    for name, value in zip(impact.set, self.valued(list(impact.set.values()), y), strict=True):
+                        y[self.names.index(name)] = value
+                    after = [surface(solver.t, y) for surface in surfaces]
+                    solver = LSODA(self.rates, solver.t, y, total, rtol=1e-6, atol=1e-9, max_step=total / STEPS)
+                    rows.append((solver.t + 1e-12 * total, y.copy()))
+                    break
+            before = after
 
 
 def _across(model: Assembled, motions: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any] | None:

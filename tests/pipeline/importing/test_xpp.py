@@ -135,6 +135,8 @@ def test_read__a_section_lies_across_the_motion(imported):
     assert found["of"] in ("x", "y")
     assert found["value"] == pytest.approx(5.0 if found["of"] == "x" else 7.0, abs=0.1)
     assert "section" not in imported("x'=-x\ninit x=1").spec.tables  # comes to rest
+    fires = imported("x'=1.5-x\nglobal 1 x-1 {x=0}").spec.tables["section"]  # would rest at 1.5 without its event
+    assert 0.0 < fires["value"] < 1.0
 
 
 def test_read__sets_become_presets(imported):
