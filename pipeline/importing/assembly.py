@@ -9,7 +9,7 @@ from typing import Any
 from magpend_core.models.text.grammar import FUNCTIONS, Tree, name_problem
 from magpend_core.models.text.reading import MAX_DEFINED, OF_RUNS, read_definition
 from magpend_core.models.text.views import MAX_OTHERS
-from pipeline.importing.drive import OMEGA, drive_of
+from pipeline.importing.drive import OMEGA, PHASE, TIME, drive_of
 from pipeline.importing.expressions import (
     ZERO,
     RefusedError,
@@ -24,7 +24,7 @@ from pipeline.importing.functions import Functions
 from pipeline.importing.noise import strengths_of
 from pipeline.importing.source import Source
 
-BUILT_IN = {"t", "pi", OMEGA}
+BUILT_IN = {"t", "pi", OMEGA, PHASE}
 
 
 @dataclass
@@ -184,7 +184,10 @@ def _inline_smallest(source: Source, strengths: dict[str, Tree]) -> None:
 
 def _final_names(source: Source, driven: bool) -> dict[str, str]:
     """Return the name of everything in the model, by its name in the source; tell of those that differ."""
-    names = {OMEGA: OMEGA[1:]}
+    trees = [*(table[name] for table, name, _ in _each(source)), *(reset.of for reset in source.resets)]
+    uses_time = any(TIME in names_in(tree) for tree in trees)
+    # the word omega has its meaning in texts with t
+    names = {OMEGA: "omega" if uses_time else "(2*pi*f)", PHASE: "phase"}
     taken, free = ({"omega"}, ()) if driven else (set(), ("f", "phase"))
     every = [*source.states, *source.parameters, *source.parts, *source.quantities, *source.presets]
     for name in every:

@@ -12,8 +12,8 @@ from pipeline.importing.expressions import MAX_NODES, PI, RefusedError, names_in
 from pipeline.importing.source import Source
 
 TIME = "t"
-OMEGA = "@omega"
-"""Name in trees of the drive's angular frequency; no file can have it."""
+OMEGA, PHASE = "@omega", "@phase"
+"""Names in trees of the drive's angular frequency and phase; no file can have them."""
 PERIODIC = ("sin", "cos", "tan")
 MOST_HARMONIC = 64
 """Highest multiple of the drive's frequency."""
@@ -258,6 +258,10 @@ def _phase(source: Source, node: Tree, base: Rate) -> Tree:
     if node.kind != "call" or TIME not in names_in(node):
         return node
     omega = Tree("name", 1, OMEGA)
+    if node.value == "mod":
+        if _multiple(_period_rate(source, node), base) != 1:
+            raise RefusedError("t enters mod with a multiple of the drive's frequency")
+        return Tree("product", 1, "", (node.args[1], Tree("name", 1, PHASE)))
     if node.value not in PERIODIC or (node.args[0].kind == "product" and omega in node.args[0].args):
         return node
     slope, rest = _linear(node.args[0])

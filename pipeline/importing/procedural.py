@@ -70,6 +70,7 @@ class Procedure:
         if self.arrays.get(target) == "rate" and index is not None:
             if index in self.rates:
                 raise RefusedError(f"{target}({index}) is assigned twice")
+            self.element("state", index)
             self.rates[index] = tree
             self.source.lines[f"rate {index}"] = line
             return
@@ -93,8 +94,6 @@ class Procedure:
         source = self.source
         if not self.rates:
             source.refuse(1, "no equations were found")
-        for index in self.rates.keys() | self.states.keys():
-            self.element("state", index)
         for index, name in sorted(self.states.items()):
             if index not in self.rates:
                 source.refuse(1, f"there is no equation of variable {index - self.base + 1}")
