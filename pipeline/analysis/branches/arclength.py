@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.predicting import ALIKE, MOST_PREDICTING, predict
+from pipeline.analysis.branches.predicting import MOST_PREDICTING, SAME_WAY, predict
 from pipeline.analysis.branches.problems import OrbitProblem, Problem, Value
 
 
@@ -209,7 +209,7 @@ def trace(
 def _before_turns(points: list[Point]) -> list[Point]:
     """Return the last points along which the curve keeps its direction."""
     n, last = 1, points[-MOST_PREDICTING:]
-    while n < len(last) and last[-n - 1].tangent @ last[-1].tangent > ALIKE:
+    while n < len(last) and last[-n - 1].tangent @ last[-1].tangent > SAME_WAY:
         n += 1
     return last[-n:]
 

@@ -17,7 +17,7 @@ MOST_PREDICTING = 8
 TANGENT_ERROR = 1e-6
 """Error of a prediction by tangents, whose parts by the parameter are one-sided differences, per length of the step."""
 
-ALIKE = 0.8
+SAME_WAY = 0.8
 """Least cosine of the angle between the direction and the tangent at a point through which the polynomial leads."""
 
 
@@ -42,7 +42,7 @@ def predict(u: Array, tangents: Array, direction: Array, at: float, more: Array)
     """
     s, speeds = (u - u[-1]) @ direction, tangents @ direction
     near = np.argsort(np.abs(s - at), kind="stable")
-    near = near[speeds[near] > ALIKE][:MOST_PREDICTING]
+    near = near[speeds[near] > SAME_WAY][:MOST_PREDICTING]
     if not len(near):  # no smooth function there
         return u[-1] + at * direction, more[-1]
     s, u, slopes = s[near], u[near], tangents[near] / speeds[near, None]
