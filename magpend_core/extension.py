@@ -107,8 +107,8 @@ def orbit_periods(
     settings = Settings(0, 0, max_orbit_period, closure_tolerance, window)
     rings = np.zeros((len(sections), window * system.n_states))
     # the compiled test divides by the units
-    flat = (sections[:, -window:] * _per_scale(system)).reshape(len(sections), -1)
-    rings[:, : flat.shape[1]] = flat
+    last = sections[:, -window:] * _per_scale(system)
+    rings[:, : last.shape[1] * system.n_states] = last.reshape(len(last), last.shape[1] * system.n_states)
     found = np.zeros(len(sections), np.int16)
     judge_of(system.plain)(rings, min(sections.shape[1], window), settings, found)
     return found

@@ -145,10 +145,8 @@ class Flight:
         """Return the orbit period of each of the trajectories `rows` from their last sections; 0 if it has not closed
         on an orbit.
         """
-        found = np.zeros(len(self.rows), np.int16)
-        flying = self.flying
-        if flying.any():
-            found[flying] = self._periods(section[flying])
+        found, flying = np.zeros(len(self.rows), np.int16), self.flying
+        found[flying] = self._periods(section[flying])
         return found
 
     def _periods(self, section: np.ndarray) -> np.ndarray:

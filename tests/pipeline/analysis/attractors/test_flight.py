@@ -7,6 +7,7 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.sections import run_branches
+from magpend_core.status import Status
 from pipeline.analysis.attractors.flight import Flight
 
 HOW = {"rtol": 1e-8, "atol": 1e-8}
@@ -51,3 +52,13 @@ def test_flight__legs_have_the_bits_of_one_integration():
     np.testing.assert_array_equal(flight.section, whole.section[rows, 0])
     np.testing.assert_array_equal(flight.closed(flight.section), whole.orbit_period[rows, 0])
     assert (whole.orbit_period > 0).any()
+
+
+def test_flight__legs_in_which_all_trajectories_fail():
+    square = load_model({"name": "square", "kind": "map", "states": {"x": {}}, "equations": {"x": "x**2"}})
+    limits = {"max_steps": 100, "closure": CLOSURE, "longest": LONGEST, "most": 8}
+    flight = Flight(square.system, np.zeros(0), 1.0, np.full((2, 1), 1e200), **limits, **HOW)
+    legs = flight.legs(2, 4)
+    assert (legs.status == Status.DIVERGED).all()
+    assert (legs.orbit_period == 0).all()
+    assert np.isnan(legs.section).all()
