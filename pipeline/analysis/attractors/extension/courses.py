@@ -20,6 +20,7 @@ class Course:
     # state (state,) and step size [s] with which the integration continues
     state: np.ndarray
     step: float = 0.0
+    sent: int = 0  # length to which it was last to be integrated, and is not yet where it leapt on the way
     end: int = ON_SET  # number of an orbit, or one of the codes above
     seconds: float = 0.0  # time of the extension [s]; 0 if it is not known
     periods: float = 0.0  # drive periods or returns from its last kept section until it came near its end

@@ -245,14 +245,16 @@ class _Extension:
             going = [course for course in self.courses if course.goes_on]
             if not going or self._has_stayed(going, target):
                 return
-            if not self.has_budget:
-                self.ran_out = True
-                return
-            # extend the shortest courses first: those of a later round
+            # extend the shortest courses first: those of a later round, and those that leapt
             least = min(course.length for course in going)
             shortest = [course for course in going if course.length == least]
+            if not self.has_budget and not any(course.length < course.sent for course in shortest):
+                self.ran_out = True
+                return
             states, steps = np.array([c.state for c in shortest]), np.array([c.step for c in shortest])
             n_legs = self._n_legs(going, shortest, target)
+            for course in shortest:
+                course.sent = least + n_legs * LEG
             legs = yield Leg(states, steps, self.spent / self.budget, n_legs)
             yield from self._take(shortest, legs, n_legs)
 
