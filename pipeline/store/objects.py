@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -282,9 +283,7 @@ class ObjectFiles:
 
     def zarr(self, *, read_only: bool) -> Store:
         """Return the objects below the prefix as a zarr store."""
-        from pipeline.store.run_store import RunStore
-
-        return RunStore(self, read_only=read_only)
+        return _run_store(self, read_only)
 
     def lock(self) -> AbstractContextManager[None]:
         """Return a context manager that holds a lease, the lock of an object store; see `lease`."""
@@ -461,3 +460,50 @@ def _replace(files: ObjectFiles, content: bytes, tag: str) -> str:
     except (obstore.exceptions.BaseError, OSError):
         return tag  # not renewed this time
     return str(put["e_tag"])
+
+
+def _run_store(files: ObjectFiles, read_only: bool) -> Store:
+    store: Store = _class_of_stores()(files, read_only=read_only)
+    return store
+
+
+@cache
+def _class_of_stores() -> type[Any]:
+    """Define the zarr store of a run in an object store, at its first use: importing zarr takes long."""
+    from zarr.storage import ObjectStore
+
+    class RunStore(ObjectStore[Any]):
+        """A zarr store in an object store: errors have magpend's messages, and writers read metadata only once."""
+
+        def __init__(self, files: ObjectFiles, *, read_only: bool = False) -> None:
+            super().__init__(files.store, read_only=read_only)
+            self._files = files
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            return _run_store, (self._files, self.read_only)
+
+        def with_read_only(self, read_only: bool = False) -> RunStore:
+            """Return the same store for zarr, with the given read-only setting."""
+            return RunStore(self._files, read_only=read_only)
+
+        async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
+            """Return the content of a key for zarr; None if the object does not exist."""
+            kept = self._files.metadata
+            if key in kept and not self.read_only:
+                return kept[key]
+            try:
+                found = await super().get(key, prototype, byte_range)
+            except Exception as error:
+                raise explain(self._files.path(key), error) from None
+            if found is not None and key.endswith("zarr.json") and not self.read_only:
+                kept[key] = found
+            return found
+
+        async def set(self, key: str, value: Any) -> None:
+            """Write the content of a key for zarr."""
+            try:
+                await super().set(key, value)
+            except Exception as error:
+                raise explain(self._files.path(key), error, writing=True) from None
+
+    return RunStore

@@ -1,7 +1,6 @@
 """Trace solution curves of a system of equations by pseudo-arclength continuation (Keller 1977).
 
-The predictor extends the cubic through the last two points by a step along the tangent, or, of orbits, a polynomial of
-higher order through more points (`predicting`). The corrector is
+The predictor extends the cubic through the last two points by a step along the tangent. The corrector is
 Newton's method in the plane normal to the tangent, so that it also passes folds in the parameter.
 Unknowns are scaled; lengths are Euclidean in them.
 
@@ -13,14 +12,13 @@ scale is the interval that it stays in.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipeline.analysis.branches.lockstep import Query, Steps
-from pipeline.analysis.branches.predicting import MOST_PREDICTING, SAME_WAY, predict
-from pipeline.analysis.branches.problems import OrbitProblem, Problem, Value
+from pipeline.analysis.branches.problems import Problem, Value
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +76,6 @@ class Trace:
     end: str = ""
 
 
-ROUGH = 1e-2
-"""Residual of a predicted orbit, in units of the tolerance, above which it gets one Newton step more: predictions from
-it raise its error."""
-
-
 def correct(
     problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
 ) -> Steps[Point | None]:
@@ -100,29 +93,20 @@ def correct(
         residual = float(np.abs(value.residual).max())
         if residual <= settings.tolerance:
             tangent = tangent_of(value, normal if along is None else along)
-            more = None
-            if isinstance(problem, OrbitProblem) and iteration == 0 and residual > ROUGH * settings.tolerance:
-                more = _newton_step(value, normal, 0.0)
-            u = u if more is None else u + more
             return None if tangent is None else Point(u, tangent, value, iteration)
         if residual > 2.0 * last or iteration == settings.max_iterations:
             return None
         last = residual
-        step = _newton_step(value, normal, -normal @ (u - guess))
-        if step is None or not np.abs(step).max() < 0.5:
+        matrix = np.vstack([value.derivative, normal])
+        right = np.append(-value.residual, -normal @ (u - guess))
+        try:
+            step = np.linalg.solve(matrix, right)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.abs(step).max() < 0.5:
             return None
         u = u + step
     return None
-
-
-def _newton_step(value: Value, normal: np.ndarray, along: float) -> np.ndarray | None:
-    """Return the step to where the linearised equations hold, of a length along a normal; None if there is no such
-    step.
-    """
-    try:
-        return np.asarray(np.linalg.solve(np.vstack([value.derivative, normal]), np.append(-value.residual, along)))
-    except np.linalg.LinAlgError:
-        return None
 
 
 def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
@@ -136,7 +120,8 @@ def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
         tangent = np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
         return None
-    length = np.linalg.norm(tangent)
+    with np.errstate(over="ignore"):  # where the matrix is singular but for rounding
+        length = np.linalg.norm(tangent)
     return tangent / length if np.isfinite(length) else None
 
 
@@ -170,13 +155,10 @@ def trace(
     point, but not where the unknowns jump (`across`). The start is the first of the points.
     """
     found = Trace([start])
-    step, low, high, since = settings.first_step, start.u, start.u, 0
+    step, low, high = settings.first_step, start.u, start.u
     while len(found.points) < settings.max_points:
         here = found.points[-1]
-        if isinstance(problem, OrbitProblem):
-            guess = guess_of_orbit(problem, _before_turns(found.points[since:]), here.tangent, step)
-        else:
-            guess = _ahead(found.points, step)
+        guess = _ahead(found.points, step)
         there = yield from correct(problem, guess, here.tangent, settings)
         ranges = np.maximum(high - low, settings.size)
         is_near = there is not None and _is_near(here, there, step, ranges, settings)
@@ -189,7 +171,7 @@ def trace(
                 found.end = "stuck"
                 return found
             found.points.append(pair[1])
-            step, low, high, since = settings.first_step, pair[1].u, pair[1].u, len(found.points) - 1
+            step, low, high = settings.first_step, pair[1].u, pair[1].u
             continue
         found.points.append(there)
         found.end = stop(found.points) if stop else ""
@@ -204,27 +186,6 @@ def trace(
         step = min(step, longest)
     found.end = "max_points"
     return found
-
-
-def _before_turns(points: list[Point]) -> list[Point]:
-    """Return the last points along which the curve keeps its direction."""
-    n, last = 1, points[-MOST_PREDICTING:]
-    while n < len(last) and last[-n - 1].tangent @ last[-1].tangent > SAME_WAY:
-        n += 1
-    return last[-n:]
-
-
-def guess_of_orbit(problem: OrbitProblem, points: Sequence[Point], direction: np.ndarray, at: float) -> np.ndarray:
-    """Predict the orbit at a coordinate along a direction, measured from the last of some points; tell its equations
-    what its section points will be there.
-    """
-    last = points[-MOST_PREDICTING:]
-    images = last[-1].value.images
-    more = np.array([problem.family.along(images, p.value.images).ravel() for p in last])
-    u, tangents = np.array([p.u for p in last]), np.array([p.tangent for p in last])
-    guess, ahead = predict(u, tangents, direction, at, more)
-    problem.expect(guess, ahead.reshape(images.shape))
-    return guess
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:

@@ -10,17 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic, guess_of_orbit
+from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, TORUS
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import (
-    FollowedProblem,
-    OrbitProblem,
-    Problem,
-    doubling_test,
-    hopf_test,
-    torus_product,
-)
+from pipeline.analysis.branches.problems import FollowedProblem, Problem, doubling_test, hopf_test, torus_product
 
 CONTRADICTORY = "contradictory"
 """Criticality of a period doubling or pitchfork whose coefficient and whose other branch disagree."""
@@ -255,7 +248,7 @@ def find_root(
     chord = last_point.u - first.u
     length = float(np.linalg.norm(chord))
     low, high = (0.0, first, at_first), (1.0, last_point, at_last)
-    known, points = [low[::2], high[::2]], [first, last_point]
+    known = [low[::2], high[::2]]
     least, last = settings.bracket / length, np.inf
     for trial in range(60):
         if high[0] - low[0] <= least:
@@ -269,11 +262,7 @@ def find_root(
         at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
         inward = least if at - low[0] < high[0] - at else -least
         for shift in shifts:
-            if isinstance(problem, OrbitProblem):
-                there = (at + shift * inward) * length - float((points[-1].u - first.u) @ chord) / length
-                guess = guess_of_orbit(problem, points, chord / length, there)
-            else:
-                guess = _between(first, last_point, at + shift * inward)
+            guess = _between(first, last_point, at + shift * inward)
             middle = yield from correct(problem, guess, chord / length, settings, first.tangent)
             if middle is not None:
                 at += shift * inward
@@ -282,7 +271,6 @@ def find_root(
             return None
         value = yield from test(middle)
         known.append((at, value))
-        points.append(middle)
         if value * low[2] > 0.0:
             low = (at, middle, value)
         else:

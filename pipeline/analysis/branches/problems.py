@@ -176,11 +176,6 @@ class Family:
         start = u[: self.system.n_states] * scales
         return np.asarray(wrap_angles(image - start, self.system) / scales)
 
-    def along(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Return states whose angles differ from those of others by less than a turn, scaled."""
-        scales = np.asarray(self.system.scales)
-        return np.asarray((here + wrap_angles(there - here, self.system)) / scales)
-
     def scaled(self, monodromy: np.ndarray) -> np.ndarray:
         """Convert a monodromy matrix to scaled states."""
         scales = np.asarray(self.system.scales)
@@ -242,14 +237,6 @@ class OrbitProblem(FamilyProblem):
         points = self._known.at(u)
         own = np.column_stack([points, np.full(len(points), u[-1])])
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
-
-    def expect(self, u: np.ndarray, images: np.ndarray) -> None:
-        """Begin the next evaluation, at `u`, at the scaled section points that are expected there."""
-        n = self.size - 1
-        if self.family.period > 1:
-            points = np.concatenate([u[None, :n], images[:-1]])
-            slopes = np.zeros((len(points), n, n + 1)) if self._known is None else self._known.slopes
-            self._known = _Segments(u, points, slopes)
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
         """Compute the mismatch of the orbit after one period, and its derivative; None if more trajectories are

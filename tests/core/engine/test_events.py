@@ -405,8 +405,8 @@ TOSS = load_model(
     table(
         "toss",
         {"x": "v", "v": "-g - k*sign(x - level)"},
-        dict.fromkeys(("g", "k", "level", "floor", "r", "down"), 0.0),
-        impacts=[{"of": "x - floor", "direction": "down", "set": {"x": "x - down", "v": "-r*v"}}],
+        dict.fromkeys(("g", "k", "level", "ground", "r", "down"), 0.0),
+        impacts=[{"of": "x - ground", "direction": "down", "set": {"x": "x - down", "v": "-r*v"}}],
     )
 ).system
 

@@ -20,7 +20,7 @@ from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.runs.zoom import read_source
-from pipeline.store import local, objects, run_store
+from pipeline.store import local, objects
 from pipeline.store.commits import read_commits, sweep
 from pipeline.store.errors import DamagedError, LockedError
 from pipeline.store.files import RECORD_COPY
@@ -203,7 +203,7 @@ def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeyp
         made.commit(index)
         if index:
             remote.commit(index)
-    real, left = run_store.RunStore.set, [0]
+    real, left = objects._class_of_stores().set, [0]
 
     async def put(self, key, value):
         if not left[0]:
@@ -217,7 +217,7 @@ def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeyp
     for n in range(len(made.plan.variables) + 1):
         left[0] = n
         with monkeypatch.context() as patch:
-            patch.setattr(run_store.RunStore, "set", put)
+            patch.setattr(objects._class_of_stores(), "set", put)
             patch.setattr(objects.ObjectFiles, "write_once", never)
             with pytest.raises(CrashError):
                 remote.commit(0)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of, tangent_of, trace
+from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic, kernel_of, tangent_of, trace
 from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation, _explains, _root, find_root, turns_twice
 from pipeline.analysis.branches.homoclinic_curves import saddle_quantity
 from pipeline.analysis.branches.kinds import BRANCHING, DOUBLING, FOLD, HOPF, PITCHFORK, TORUS, TRANSCRITICAL
@@ -23,7 +23,6 @@ from pipeline.analysis.branches.normal_forms import (
     critical_vectors,
     settled,
 )
-from pipeline.analysis.branches.predicting import predict
 from pipeline.analysis.branches.problems import Rows, Value
 
 PLAIN = SimpleNamespace(scaled=lambda matrix: matrix)
@@ -276,20 +275,11 @@ def test_run_together__answers_each_its_own_problem() -> None:
     assert (one.residual.item(), other.residual.item()) == (3.0, -1.0)
 
 
-def test_predict__is_exact_between_and_beyond_for_cubics() -> None:
-    """Of the graph (s, s^3/9): tangents of two points are as good as values of four. Over a slanted line the point lies
-    at its coordinate."""
-    for line in (np.array([1.0, 0.0]), np.array([0.96, 0.28])):
-        for known, wanted in (((0.8, 1.0), 0.9), ((0.9, 0.8), 1.1), ((0.7, 0.8, 0.9, 1.0), 1.1)):
-            points = np.array([(s, s**3 / 9.0) for s in known])
-            slopes = np.array([(1.0, s * s / 3.0) for s in known])
-            tangents = slopes / np.linalg.norm(slopes, axis=1)[:, None]
-            there = np.array([wanted, wanted**3 / 9.0])
-            at = float((there - points[-1]) @ line)
-            found, _ = predict(points, tangents, line, at, np.zeros((len(known), 0)))
-            if line[1] == 0.0:
-                np.testing.assert_allclose(found, there, atol=1e-14)
-            np.testing.assert_allclose((found - points[-1]) @ line, at, atol=1e-14)
+def test_cubic__is_exact_between_and_beyond_for_cubics() -> None:
+    """Of the graph (s, s^3 - s) over its chord; tangents count with the length of the chord."""
+    a, b = (SimpleNamespace(u=np.array([s, s**3 - s]), tangent=np.array([1.0, 3.0 * s * s - 1.0])) for s in (0.0, 1.0))
+    for share in (0.25, 0.5, 1.2):
+        np.testing.assert_allclose(cubic(a, b, share), [share, share**3 - share], atol=1e-14)
 
 
 def test_turns_twice__two_folds_within_a_step() -> None:
