@@ -41,7 +41,14 @@ from typing import Any
 DOCS = Path(__file__).resolve().parent
 FOLLOWED = ("rig", "recorded-drives", "python")
 """Pages that are followed like tutorials."""
-PAGES = {p.stem: p for p in (*sorted((DOCS / "tutorials").glob("*.md")), *(DOCS / f"{name}.md" for name in FOLLOWED))}
+FOLDERS = ("tutorials", "coming-from")
+PAGES = {
+    p.stem: p
+    for p in (
+        *(p for f in FOLDERS for p in sorted((DOCS / f).glob("*.md"))),
+        *(DOCS / f"{name}.md" for name in FOLLOWED),
+    )
+}
 GALLERY = DOCS / "gallery"
 COLOURS = 128
 """Colours in a picture of the gallery."""
