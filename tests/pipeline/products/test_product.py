@@ -16,10 +16,11 @@ NAMES = [f"{type(p).__name__}-{p.name}" for p in ALL]
 
 @pytest.mark.parametrize("product", ALL, ids=NAMES)
 def test_product__its_functions_are_there(product):
-    for role in ("compute", "table", "needs", "settle", "finish", "draw"):
+    of_role = {"table": 1, "needs": 2, "settle": 2, "parts": 2, "finish": 3, "draw": 2}
+    of_role["compute"] = 3 if getattr(product, "parts", "") else 2
+    for role, wanted in of_role.items():
         name = getattr(product, role, "")
         if isinstance(name, str) and name:
-            wanted = {"table": 1}.get(role, 2)
             assert len(inspect.signature(function_of(name)).parameters) == wanted, name
     for other in getattr(product, "builds_on", ()):
         assert other in ANALYSES
