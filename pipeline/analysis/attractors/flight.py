@@ -146,7 +146,8 @@ class Flight:
         on an orbit.
         """
         found, flying = np.zeros(len(self.rows), np.int16), self.flying
-        found[flying] = self._periods(section[flying])
+        if flying.any():
+            found[flying] = self._periods(section[flying])
         return found
 
     def _periods(self, section: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ class Course:
         self.seconds, self.state, self.step = sum(seconds.tolist(), self.seconds), state, step
         sections = sections.reshape(-1, sections.shape[2])
         n = self.length + len(sections)
-        if n > len(self._added):
+        if n > len(self._added) or not self.length:
             self._added = np.concatenate([self.extension, np.empty((2 * n - self.length, self.kept.shape[1]))])
         self._added[self.length : n] = sections
         self.length = n

@@ -8,6 +8,7 @@ import pytest
 from magpend_core.models import load_model
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
+from pipeline.analysis.attractors.extension.courses import Course
 from pipeline.analysis.attractors.flight import Flight
 
 HOW = {"rtol": 1e-8, "atol": 1e-8}
@@ -62,3 +63,11 @@ def test_flight__legs_in_which_all_trajectories_fail():
     assert (legs.status == Status.DIVERGED).all()
     assert (legs.orbit_period == 0).all()
     assert np.isnan(legs.section).all()
+
+
+def test_course__fails_in_its_first_leg():
+    course = Course(0, 0, np.zeros((3, 2)), np.zeros(2))
+    course.add(np.zeros((0, 8, 2)), np.zeros(0), np.ones(2), 0.1)
+    assert course.extension.shape == (0, 2)
+    course.add(np.full((1, 8, 2), 7.0), np.ones(1), np.ones(2), 0.1)
+    np.testing.assert_array_equal(course.extension, np.full((8, 2), 7.0))
