@@ -9,6 +9,7 @@ import pytest
 from numba import njit
 
 from magpend_core.engine import jit, linking
+from magpend_core.engine.code_cache import PartFolder
 from magpend_core.engine.jit import bound_part, entry, inline
 from magpend_core.engine.simd import WIDTH, load, load_rows, store
 from tests.core.conftest import run_script
@@ -186,7 +187,7 @@ def _of_a_pair(w, out):
     out[0] = firsts(w)[0] + N  # noqa: F821
 
 
-def test_part__is_kept_for_each_type_that_its_callees_return(monkeypatch):
+def test_part__is_kept_for_each_type_that_its_callees_return(monkeypatch, tmp_path):
     """One system after the other, each in what would be a process of its own: a record replaces no other one."""
     code = {n: f"def firsts(w):\n    return ({'w[0], ' * n})\n" for n in (2, 3)}
 
@@ -200,6 +201,7 @@ def test_part__is_kept_for_each_type_that_its_callees_return(monkeypatch):
         assert out[0] == 0.5 + n
         return sum(part.stats.cache_misses.values())
 
+    monkeypatch.setattr(jit, "PARTS", PartFolder(tmp_path / "cache"))
     monkeypatch.setattr(_of_a_pair, "__module__", jit.__name__)  # only parts of the package are kept
     assert [compiled(n) for n in (2, 3, 2, 3)] == [1, 1, 0, 0]
 
