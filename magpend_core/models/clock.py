@@ -90,7 +90,7 @@ class Clock:
         return np.linspace(0.0, seconds, n) if self.is_continuous else np.arange(seconds + 1.0)
 
     def orbit_seconds(self, n_periods: int, frequency_hz: float) -> float:
-        """Return the time in which an orbit of some periods closes [s]; NaN if it has a period of its own."""
+        """Return how long an orbit of `n_periods` drive periods takes [s]; NaN without a drive, where orbits differ."""
         return np.nan if self.has_equilibria else n_periods / frequency_hz
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from magpend_core.models.text.grammar import FUNCTIONS, Tree, name_problem
@@ -174,16 +175,13 @@ def _inline_smallest(source: Source, strengths: dict[str, Tree]) -> None:
     too_many = len(source.parts) + 1 - MAX_DEFINED
     for name in sorted(source.parts, key=lambda n: size(source.parts[n]))[: max(0, too_many)]:
         own = {name: source.parts.pop(name)}
-        for table, key, _ in _each(source):
-            table[key] = replaced(table[key], own)
-        for reset in source.resets:
-            reset.of = replaced(reset.of, own)
+        source.rewrite(partial(replaced, names=own))
         for key, tree in strengths.items():
             strengths[key] = replaced(tree, own)
 
 
 def _final_names(source: Source, driven: bool) -> dict[str, str]:
-    """Return the name of everything in the model, by its name in the source; tell of those that differ."""
+    """Return the model's name for each name of the file, and note those that changed."""
     trees = [*(table[name] for table, name, _ in _each(source)), *(reset.of for reset in source.resets)]
     uses_time = any(TIME in names_in(tree) for tree in trees)
     # the word omega has its meaning in texts with t

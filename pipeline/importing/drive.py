@@ -80,12 +80,7 @@ def _add_clock(source: Source, reason: str) -> None:
         name += "_"
     clock = {TIME: Tree("name", 1, name)}
     one = Tree("number", 1, 1.0)
-    for table in (source.states, source.parts, source.quantities):
-        for key, tree in table.items():
-            table[key] = replaced(tree, clock)
-    for reset in source.resets:
-        reset.of = replaced(reset.of, clock)
-        reset.set = {key: replaced(tree, clock) for key, tree in reset.set.items()}
+    source.rewrite(lambda tree: replaced(tree, clock))
     source.states[name] = Tree("sum", 1, "", (clock[TIME], one)) if source.is_map else one
     source.starts[name] = constant_setting(source, "t0", 0.0)
     source.notes.append(
@@ -143,16 +138,7 @@ def _rewrite(source: Source) -> float:
     replaceable = [n for n, power in base.powers if n in source.parameters and abs(power) == 1]
     if base.powers and not replaceable:
         raise RefusedError("the frequency is no product of a parameter")
-
-    def change(node: Tree) -> Tree:
-        return _phase(source, node, base)
-
-    for table in (source.states, source.parts, source.quantities):
-        for name, tree in table.items():
-            table[name] = rewritten(tree, change)
-    for reset in source.resets:
-        reset.of = rewritten(reset.of, change)
-        reset.set = {n: rewritten(tree, change) for n, tree in reset.set.items()}
+    source.rewrite(lambda tree: rewritten(tree, lambda node: _phase(source, node, base)))
     if any(TIME in names_in(_without_phases(tree)) for tree in source.states.values()):
         raise RefusedError("t stands outside of sin(w*t)")
     if replaceable:
@@ -227,7 +213,7 @@ def _rate(source: Source, tree: Tree) -> Rate:
 
 
 def _base(rates: list[Rate]) -> Rate:
-    """Return the greatest angular frequency of which all are multiples."""
+    """Return the greatest angular frequency that divides all others without remainder."""
     first = rates[0]
     if any(rate.powers != first.powers for rate in rates):
         raise RefusedError("t enters with several frequencies")
@@ -313,12 +299,7 @@ def _replace_parameter(source: Source, name: str, base: Rate) -> None:
 
 def _rename(source: Source, old: str, new: str) -> None:
     other = {old: Tree("name", 1, new)}
-    for table in (source.states, source.parts, source.quantities):
-        for name, tree in table.items():
-            table[name] = replaced(tree, other)
-    for reset in source.resets:
-        reset.of = replaced(reset.of, other)
-        reset.set = {n: replaced(tree, other) for n, tree in reset.set.items()}
+    source.rewrite(lambda tree: replaced(tree, other))
 
 
 def _inverse(tree: Tree) -> Tree:

@@ -31,7 +31,7 @@ _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a program writes expressions.
+    """Rules by which a program writes expressions.
 
     Attributes
     ----------

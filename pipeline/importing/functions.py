@@ -54,7 +54,7 @@ class Functions:
         return Tree("name", node.at, self._part(name, plain, body))
 
     def _part(self, name: str, plain: tuple[str, ...], body: Tree) -> str:
-        """Give the value of a function at some names a name of its own."""
+        """Make a call of a function, whose arguments are names, a part with a name, and return this name."""
         assert self.parts is not None
         first = all(known != name for known, _ in self.named)
         new = name if first else "_".join((name, *plain))

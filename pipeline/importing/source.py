@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -85,6 +86,14 @@ class Source:
     def spelled(self, name: str) -> str:
         """Return a name as the file writes it."""
         return self.spelling.get(name, name)
+
+    def rewrite(self, change: Callable[[Tree], Tree]) -> None:
+        """Replace each expression of the equations, parts, quantities and events by what `change` makes of it."""
+        for table in (self.states, self.parts, self.quantities):
+            table.update({name: change(tree) for name, tree in table.items()})
+        for reset in self.resets:
+            reset.of = change(reset.of)
+            reset.set = {name: change(tree) for name, tree in reset.set.items()}
 
     def check(self) -> None:
         """Raise all problems.

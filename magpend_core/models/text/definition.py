@@ -136,7 +136,7 @@ class Definition:
 
     @property
     def dynamics(self) -> list[Tree]:
-        """All expressions of the equations and the impacts."""
+        """Expressions of all equations and impacts."""
         of_impacts = [tree for i in self.impacts for tree in (i.of, *i.set.values())]
         return [*self.equations.values(), *of_impacts]
 

@@ -181,7 +181,7 @@ def root_under(node: Node) -> tuple[Node, int] | None:
 
 
 def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
-    """For a sine, return the node of the cosine of the same argument if the code needs both; likewise for a cosine."""
+    """Return the cosine that the code needs beside a sine of one argument, or the sine beside a cosine; else None."""
     other = "cos" if node.op == "sin" else "sin"
     for candidate in wanted.values():
         if candidate.op == other and candidate.args[0] is node.args[0]:
@@ -254,7 +254,7 @@ def source_of(derived: Derived) -> Source:
 
 
 def _entries(derived: Derived) -> tuple[int, ...] | None:
-    """Return the positions of those entries of a large Jacobian that can differ from 0; None for a small Jacobian."""
+    """Return the positions of the entries of a large Jacobian that are not always 0; None for a small Jacobian."""
     if len(derived.rates) <= WRITTEN_OUT or not derived.jacobian:
         return None
     found = tuple(i for i, node in enumerate(derived.jacobian) if not node.is_number(0.0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magpend_core.models import load_model
+from magpend_core.models.text.reading import MAX_DEFINED
 from pipeline.importing.importing import import_file, import_model
 from pipeline.specification.problems import SpecError
 from pipeline.specification.spec import Spec
@@ -220,3 +221,14 @@ def test_command__writes_a_file_that_runs(main, tmp_path, monkeypatch):
     assert code == 2
     assert "bad.ode, line 1: ran: random numbers" in err
     assert not (tmp_path / "other.toml").exists()
+
+
+def test_read__writes_out_the_shortest_parts_beyond_those_that_a_model_may_have(imported):
+    n = MAX_DEFINED + 1
+    parts = [f"a{k}={k}*x^2+{k}*x+{k}" if k > 2 else f"a{k}={k}*x" for k in range(1, n + 1)]
+    terms = "+".join(f"a{k}" for k in range(1, n + 1))
+    model = load_model(imported("\n".join([*parts, f"x'=-x+{terms}", "global 1 x-a1-4 {x=a2}"])).spec.reference)
+    found = model.definition.table
+    assert set(found["define"]) == {f"a{k}" for k in range(3, n + 1)}
+    assert found["equations"]["x"].startswith("-x + 1*x + 2*x + a3 + a4")
+    assert (found["impacts"][0]["of"], found["impacts"][0]["set"]) == ("x - 1*x - 4", {"x": "2*x"})

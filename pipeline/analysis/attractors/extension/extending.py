@@ -127,7 +127,7 @@ def _has_no_shape(one: BoundedSet) -> bool:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What trajectories do in a leg, one row per leg."""
+    """What each leg of a trajectory shows: whether it was completed, and which orbit or equilibrium it approaches."""
 
     is_whole: np.ndarray  # whether it was integrated to the end
     # index of the orbit that the leg is on or approaches, the same if it attracts, and index of the equilibrium that it

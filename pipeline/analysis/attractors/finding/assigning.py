@@ -160,7 +160,7 @@ class _Near:
         return cls(cells[is_near], orbit, rows[near[is_near]] - first[orbit], orbits, points, first)
 
     def on_orbit(self, section: np.ndarray, tolerance: float, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cells of which the last period of sections lies on the orbit, and the orbit of each."""
+        """Return the cells whose last sections, over one period, lie on the orbit; return also the orbit of each."""
         period = np.diff(self.first, append=len(self.points))[self.orbit]
         n = np.minimum(period, section.shape[1])
         row, back = np.repeat(np.arange(len(n)), n), _ranges(n)
