@@ -152,12 +152,15 @@ def test_copy__shows_the_diagram_and_an_orbit(visit, copies, hosted, looked_at, 
     )
     # a click selects, and the address keeps it
     page.evaluate("window.magpend.state.set({selected: null})")
+    page.wait_for_timeout(1000)
+    before = page.url
     for share in (0.5, 0.45, 0.4, 0.35, 0.55, 0.6):  # somewhere near a point
         page.mouse.click(box["x"] + 0.52 * box["width"], box["y"] + share * box["height"])
-        if page.evaluate("window.magpend.state.get().selected"):
+        page.wait_for_timeout(1000)  # the nearest point is found in a worker, and the address follows
+        if selected := page.evaluate("window.magpend.state.get().selected"):
             break
-    selected = page.evaluate("window.magpend.state.get().selected")
     assert selected is not None
+    page.wait_for_url(lambda address: address != before)
     page.locator(".facts").first.wait_for()
     again = visit(page.url)
     assert _drawn(again).evaluate("window.magpend.state.get().selected") == selected
