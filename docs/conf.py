@@ -46,7 +46,7 @@ TOP = {"changelog": "CHANGELOG.md", "contributing": "CONTRIBUTING.md", "programs
 """Pages whose text is a file at the top of the repository."""
 
 GROUPS = {
-    "Runs": ("run", "state", "open_run", "Run", "verify_run", "extend", "zoom", "Status", "SpecError"),
+    "Runs": ("run", "state", "open_run", "Run", "verify_run", "extend", "zoom", "Status", "SpecError", "show_versions"),
     "Analyses": ("derive", "prune"),
     "Figures and animations": (
         "figure",

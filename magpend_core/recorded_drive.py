@@ -307,7 +307,7 @@ def recorded_trajectory(
         max_steps_per_interval=max_steps_per_interval,
     )
     if found.status[0] != Status.BOUNDED:
-        raise ArithmeticError(f"The trajectory ended early: {Status(int(found.status[0])).sentence}.")
+        raise ArithmeticError(f"The trajectory ended early: {Status(int(found.status[0])).advice}.")
     return np.asarray(found.states[0])
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+from magpend_core.troubleshooting import see
+
 
 class Status(IntEnum):
     """Outcome of one trajectory (one parameter set and initial condition), as a code."""
@@ -23,6 +25,13 @@ class Status(IntEnum):
     def sentence(self) -> str:
         """Return the code's meaning and, for a failure, the remedy."""
         return _SENTENCES[self]
+
+    @property
+    def advice(self) -> str:
+        """Return the sentence, and for all but known orbits the section of the page of troubleshooting."""
+        if self in (Status.PERIODIC, Status.INFERRED):
+            return self.sentence
+        return f"{self.sentence} {see(self.name.lower().replace('_', '-'))}"
 
 
 _SENTENCES = {

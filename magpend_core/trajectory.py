@@ -88,5 +88,5 @@ def trajectory(
         limits_first_step=False,
     )
     if found.status[0] != Status.BOUNDED:
-        raise ArithmeticError(f"The trajectory ended early: {Status(found.status[0]).sentence}.")
+        raise ArithmeticError(f"The trajectory ended early: {Status(found.status[0]).advice}.")
     return found.states[0]

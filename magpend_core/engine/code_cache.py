@@ -30,6 +30,8 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, UserProvidedCacheLocator
 from numba.core.compiler_lock import global_compiler_lock
 
+from magpend_core.troubleshooting import see
+
 fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None  # Windows has none
 
 LOG = logging.getLogger("magpend.cache")
@@ -78,7 +80,7 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
     if problem:
         say(
             f"magpend's compile cache is not used, every process compiles anew: {problem} set "
-            "MAGPEND_CACHE_DIR to a folder of your own."
+            f"MAGPEND_CACHE_DIR to a folder of your own {see('compile-cache')}."
         )
     return dispatcher
 
@@ -258,14 +260,16 @@ def _read_sealed(path: str) -> bytes | None:
     # an empty file fails here, too: it does not begin with the digest of an empty content
     if not problem and _DIGEST(content).digest() == sealed[:_LENGTH]:
         return content
-    say(f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again.")
+    say(
+        f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again {see('compile-cache')}."
+    )
     return None
 
 
 def _say_not_kept(folder: str, error: OSError) -> None:
     say(
         f"compiled kernels cannot be kept in {folder} ({error.strerror or error}); make room there, or set "
-        "MAGPEND_CACHE_DIR to another folder."
+        f"MAGPEND_CACHE_DIR to another folder {see('compile-cache')}."
     )
 
 
@@ -280,7 +284,7 @@ class _Entries(IndexDataCacheFile):
         name, stamp, kept = pickle.loads(content)
         if (name, stamp) == (key, self._source_stamp):
             return kept
-        say(f"a compiled kernel is not used: {path} is damaged; it is compiled again.")
+        say(f"a compiled kernel is not used: {path} is damaged; it is compiled again {see('compile-cache')}.")
         return None
 
     def save(self, key: Any, data: Any) -> None:

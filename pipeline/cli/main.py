@@ -14,6 +14,7 @@ if __name__ == "__main__":
 
 import typer
 
+from magpend_core.troubleshooting import see
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.animate import animate
 from pipeline.cli.common import CommandError
@@ -54,10 +55,24 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _versions(wanted: bool) -> None:
+    if wanted:
+        from pipeline.runs.environment import show_versions
+
+        show_versions()
+        raise typer.Exit
+
+
 @app.callback()
 def _main(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    versions: Annotated[
+        bool,
+        typer.Option(
+            "--versions", callback=_versions, is_eager=True, help="Print what a report of an error needs, and exit."
+        ),
     ] = False,
 ) -> None:
     pass
@@ -112,6 +127,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
 
 def _complain(error: BaseException) -> None:
     lines: list[Any] = getattr(error, "problems", None) or [_shortage(error) or str(error)]
+    lines = [" ".join([str(lines[0]), *getattr(error, "__notes__", ())]), *lines[1:]]
     head = "magpend: " if len(lines) == 1 else f"magpend: {len(lines)} problems\n  "
     text = _short(head + "\n  ".join(map(str, lines)))
     if LOG.handlers:
@@ -190,9 +206,11 @@ def _shortage(error: BaseException) -> str:
     """Return a sentence about an error that says that the system has no more memory or threads; else an empty text."""
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError):
-        return f"memory ran out{f' ({text})' if text else ''}. Free some, or raise its limit (ulimit -v)."
+        return (
+            f"memory ran out{f' ({text})' if text else ''}. Free some, or raise its limit (ulimit -v) {see('memory')}."
+        )
     if isinstance(error, RuntimeError) and "can't start new thread" in text:
-        return f"{text}: raise the limits on processes and memory (ulimit -u, -v)."
+        return f"{text}: raise the limits on processes and memory (ulimit -u, -v) {see('memory')}."
     return ""
 
 

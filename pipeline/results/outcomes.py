@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from magpend_core.troubleshooting import see
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, TRANSIENT, UNSTABLE, split_dims
 from pipeline.layout.vocabulary import DIVERGES as DIVERGED_LATER
@@ -135,6 +136,11 @@ def left_out(ids: xr.Dataset) -> str:
 def sentence(ids: xr.Dataset) -> str:
     """Return a text on how many cells end on attractors, and what happens to the others."""
     return told(ids["attractor_id"].size, {name: int(which.sum()) for name, which in other_cells(ids).items()})
+
+
+def pointed(text: str, has_others: bool) -> str:
+    """Return the text of a table on what cells end on, with the page that helps where some end on no attractor."""
+    return f"{text} {see('no-attractor')}" if has_others else text
 
 
 def told(total: int, others: Mapping[str, int]) -> str:

@@ -215,7 +215,7 @@ def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndar
     )
     status = Status(int(found.status[0]))
     if not np.isfinite(found.states[0]).all():
-        raise ArithmeticError(f"The trajectory ended early: {status.sentence}.")
+        raise ArithmeticError(f"The trajectory ended early: {status.advice}.")
     return np.asarray(found.states[0])
 
 

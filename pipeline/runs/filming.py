@@ -309,7 +309,7 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
             from magpend_core.status import Status
 
             status = Status(int(one["status"]))
-            problems.append(f"--cell {number}: has no sections to start from ({status.sentence}).")
+            problems.append(f"--cell {number}: has no sections to start from ({status.advice}).")
             continue
         parameters, frequency = _at_point(cube, one)
         seconds = parameters.model.clock.orbit_seconds(int(one["orbit_period"]), frequency)

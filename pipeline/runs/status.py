@@ -61,7 +61,7 @@ def describe_state(found: State) -> list[str]:
 def _status_lines(cells: Mapping[str, int], pending: int) -> list[str]:
     numbers = {**cells, "pending": pending}
     return [
-        f"  {s.name.lower():15s} {numbers[s.name.lower()]:>10d}  {s.sentence}"
+        f"  {s.name.lower():15s} {numbers[s.name.lower()]:>10d}  {s.advice}"
         for s in Status
         if numbers.get(s.name.lower())
     ]
@@ -154,7 +154,7 @@ def warning(run: RunDirectory) -> str:
     if n_lost <= WORTH_A_WARNING * computed:
         return ""
     told = "; ".join(
-        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.sentence}" for o in lost
+        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.advice}" for o in lost
     )
     return (
         f"warning: {n_lost} of {computed} cells ({100 * n_lost / computed:.1f} %) diverged or failed; "

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from magpend_core.troubleshooting import see
 from pipeline.analysis.attractors.declaration import AttractorOptions, IdentifyOptions
 from pipeline.layout.small_states import small_states
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter, model_of, split_dims
 from pipeline.products.product import Table
 from pipeline.results.intervals import binomial_interval
-from pipeline.results.outcomes import other_cells, sentence, share_interval, shares_of_others
+from pipeline.results.outcomes import other_cells, pointed, sentence, share_interval, shares_of_others
 from pipeline.results.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, places_of_rows, row_of_cells
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import (
@@ -90,7 +91,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
             shown, more = _largest([row for row in rows if all(row[k] == v for k, v in where.items())])
             table = point_table(ds, where, shown, lambda row: _attractor_words(row, n_points, model))
             lines += [*table, *more, *rest[i]]
-    return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
+    return Table(rows, [*lines, pointed(sentence(ds), bool(other_cells(ds))), *_remarks(ds, rows)])
 
 
 def _largest(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
@@ -219,20 +220,20 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
         text = ", ".join(map(str, above))
         lines.append(
             f"cells return after {text} periods, which is above the longest detected period: --max-orbit-period "
-            f"{above[-1]} (now {longest}) detects such orbits"
+            f"{above[-1]} (now {longest}) detects such orbits {see('not-settled')}"
         )
     elif any(row["kind"] == "bounded_set" and row["lyapunov_high"] < 0.0 for row in unsettled):
         lines.append(
             f"cells that are not settled contract: they may close with a period above {longest}; "
-            "--max-orbit-period detects longer ones"
+            f"--max-orbit-period detects longer ones {see('not-settled')}"
         )
     if int(ds.attrs.get("identify_extend", 1)) == 0 and unsettled:
-        lines.append("nothing was extended (--no-extend): without this option, samples of these cells are extended")
+        lines.append(f"nothing was extended (--no-extend): without it, samples are extended {see('not-settled')}")
     elif int(ds["ran_out"].sum()):
         n = int(ds["ran_out"].sum())
         lines.append(
             f"the extension reached its budget before all sets were classified at {counted(n, 'parameter point')}: "
-            f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much"
+            f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much {see('not-settled')}"
         )
     if RUN_AWAY & set(other_cells(ds)):
         lines += model_of(ds).flow.angle_remarks

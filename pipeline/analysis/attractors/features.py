@@ -204,7 +204,7 @@ def _follow(
         limits_first_step=False,
     )
     if (paths.status != Status.BOUNDED).any():
-        raise ArithmeticError(f"An orbit ended early: {Status(paths.status.max()).sentence}.")
+        raise ArithmeticError(f"An orbit ended early: {Status(paths.status.max()).advice}.")
     angles = np.flatnonzero(geometry.is_angle)
     turns = np.round((paths.states[:, -1] - paths.states[:, 0])[:, angles] / TWO_PI)
     low, high = paths.states.min(axis=1), paths.states.max(axis=1)

@@ -17,7 +17,7 @@ from pipeline.layout.vocabulary import letter, split_dims
 from pipeline.products.product import Table
 from pipeline.products.reporting import track
 from pipeline.results.intervals import binomial_interval
-from pipeline.results.outcomes import DIVERGED, other_cells, outcomes, told
+from pipeline.results.outcomes import DIVERGED, other_cells, outcomes, pointed, told
 from pipeline.results.ragged import dims_of, places_of_rows
 from pipeline.results.run import OpenRun
 from pipeline.results.tabular import (
@@ -115,7 +115,8 @@ NO_OUTCOME = -1
 def _sentence(ds: xr.Dataset) -> str:
     counts = {"diverged": int(ds["count"].values[ds["attractor"].values == DIVERGED].sum())}
     counts |= {text: int(ds[name].sum()) for name, text in OTHERS.items()}
-    return told(ds["outcome"].size, {text: n for text, n in counts.items() if n})
+    counts = {text: n for text, n in counts.items() if n}
+    return pointed(told(ds["outcome"].size, counts), bool(counts))
 
 
 def _basin_words(row: Row) -> Words:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.sizes import LEVEL
+from magpend_core.troubleshooting import see
 from pipeline.analysis.branches.completeness import counted_lines, searched_lines
 from pipeline.analysis.branches.declaration import COEFFICIENTS, BranchOptions, CurveOptions
 from pipeline.analysis.branches.intervals import (
@@ -35,7 +36,7 @@ from pipeline.layout.own_words import RATE, dims_in_own_words, place_in_words, r
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_of, parameter_name, parameters_of
 from pipeline.products.product import Table
 from pipeline.results.run import OpenRun
-from pipeline.results.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values
+from pipeline.results.tabular import Row, Words, aligned, counted, header_of, plain, value_with_error, values, words_of
 from pipeline.specification.problems import SpecError
 from pipeline.specification.tables import FREQUENCY
 
@@ -314,7 +315,7 @@ def _unbounded(ds: xr.Dataset) -> list[str]:
             f"    eigenvalues {eigenvalues} [1/s]; {told}",
             f"    slope of the period over {law}: {fitted:.5g} ± {error:.0e} fitted, {expected:.5g} computed",
         ]
-    return ["", "the period grows without bound", *lines] if lines else []
+    return ["", f"the period grows without bound {see('unbounded')}", *lines] if lines else []
 
 
 def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
@@ -413,7 +414,7 @@ def period_words(period: int) -> str:
 def listed(ds: xr.Dataset, name: str) -> list[str]:
     """Return the lines of an attribute under its name."""
     lines = str(ds.attrs.get(name, "")).splitlines()
-    return ["", name.replace("_", " "), *(f"  {line}" for line in lines)] if lines else []
+    return ["", f"{name.replace('_', ' ')} {see('left-out')}", *(f"  {line}" for line in lines)] if lines else []
 
 
 def isolas_of(ds: xr.Dataset) -> list[int]:
@@ -554,6 +555,8 @@ def curves_table(ds: xr.Dataset) -> Table:
     rows.sort(key=lambda row: (row["type"], row[names[0]]))
     lines = [f"{counted(ds.sizes['curve'], 'curve')} in the plane of {' and '.join(names)}"]
     lines += [_curve_line(ds.isel(curve=i), i, names) for i in range(ds.sizes["curve"])]
+    if any(_is_cut(ds, end) for end in ("first_end", "last_end")):
+        lines.append(f"  a curve ends where it could not be followed {see('curves')}")
     missed = int(ds["n_missed"].sum())
     if missed:
         lines += ["", f"{counted(missed, 'sign change')} of test functions could not be located: points may be missing"]
@@ -561,6 +564,10 @@ def curves_table(ds: xr.Dataset) -> Table:
         lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
     header = header_of(ds, "special", lambda one: _special(one, names, ranges))
     return Table(rows, [*lines, *listed(ds, "left_out")], header=header)
+
+
+def _is_cut(ds: xr.Dataset, end: str) -> bool:
+    return not {"stuck", "max_points", "budget"}.isdisjoint(np.array(words_of(ds[end]))[ds[end].values])
 
 
 def _special(one: xr.Dataset, names: list[str], ranges: list[float]) -> Row:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from magpend_core.troubleshooting import see
 from pipeline.analysis.events.graph import graph_of
 from pipeline.analysis.events.kinds import EVENTS, LIVES_ON, RANGE_END, UNDECIDED
 from pipeline.layout.vocabulary import letter, parameter_name
@@ -43,7 +44,7 @@ def events_table(ds: xr.Dataset) -> Table:
     rows = [_with_others(ds, row, ends) for k, row in enumerate(ends) if row["event"] == k]
     own = [row for row in rows if row["what"] not in (RANGE_END, LIVES_ON)]
     n_open = sum(row["what"] == UNDECIDED for row in own)
-    lines = [f"{counted(len(own), 'event')}, {n_open} not decided"]
+    lines = [f"{counted(len(own), 'event')}, {n_open} not decided{' ' + see('not-decided') if n_open else ''}"]
     told = [row for row in rows if row["what"] != RANGE_END]
     lines += [f"  {row['sentence']}" for row in told[:MOST_ROWS]]
     if len(told) > MOST_ROWS:

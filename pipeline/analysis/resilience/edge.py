@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from magpend_core.troubleshooting import see
 from pipeline.analysis.attractors.destinations import Destinations, destinations_at
 from pipeline.analysis.attractors.extension.clouds import group
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
@@ -207,7 +208,8 @@ def edge_table(ds: xr.Dataset) -> Table:
     lines += aligned([_words(ds.isel(edge=i)) for i in range(ds.sizes["edge"])])
     reasons = ds["pair_reason"].values
     for code in np.unique(reasons[reasons > 0]).tolist():
-        lines.append(f"  not decided, {counted(int((reasons == code).sum()), 'pair')}: {_SENTENCES[REASONS[code]]}")
+        n = counted(int((reasons == code).sum()), "pair")
+        lines.append(f"  not decided, {n}: {_SENTENCES[REASONS[code]]} {see('not-decided')}")
     nothing = "" if n_pairs else f"no cells end on both of {letters}; grow the run, or choose two others."
     return Table(_rows(ds), lines, nothing)
 

@@ -14,7 +14,7 @@ from magpend_core.models.parameters import ParameterError
 from magpend_core.models.sectioned import of_flow
 from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.pointwise import rates
-from pipeline.analysis.branches.analysis import fixed_of
+from pipeline.analysis.branches.analysis import fixed_of, listed
 from pipeline.analysis.branches.curves import lies_on
 from pipeline.analysis.branches.declaration import BranchOptions
 from pipeline.analysis.branches.intervals import interval_of, swept_axis
@@ -328,15 +328,14 @@ def backbone_table(ds: xr.Dataset) -> Table:
     stable if no multiplier is outside the unit circle by more than 1e-4. The text shows the range of each curve.
     """
     rows = _rows(ds)
-    left_out = str(ds.attrs["left_out"]).splitlines()
     if not rows:
-        why = f"no backbone: {'; '.join(left_out) or 'no linear mode'}"
+        why = f"no backbone: {'; '.join(str(ds.attrs['left_out']).splitlines()) or 'no linear mode'}"
         return Table(rows, [why], why)
     channel, force = str(ds.attrs["of_channel"]), str(ds.attrs["force"])
     unit = str(ds["unit"].sel(channel=channel).values)
     head = f"amplitude of {channel}{'' if unit in ('', '1') else f' [{unit}]'} along its backbone curves"
     lines = [head, "", *aligned([_words(ds, i, channel, force) for i in range(ds.sizes["curve"])], "")]
-    return Table(rows, [*lines, *(["", "left out", *(f"  {line}" for line in left_out)] if left_out else [])])
+    return Table(rows, [*lines, *listed(ds, "left_out")])
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:

@@ -108,7 +108,7 @@ def _of_cell(found: xr.Dataset, cell: xr.Dataset, where: dict[str, float]) -> Mo
     section = cell["section"].transpose("period_index", "state").values
     kept = np.flatnonzero(np.isfinite(section).all(axis=1))
     if not len(kept):
-        raise ValueError(f"the cell has no section from which it could go on: {Status(int(cell['status'])).sentence}.")
+        raise ValueError(f"the cell has no section from which it could go on: {Status(int(cell['status'])).advice}.")
     told = (BOUNDED_SET, NOT_SETTLED, 0, np.nan, np.nan)
     return Motion._make((where, -1, *told, section[kept[-1]], *_parameters(found, where)))
 

@@ -71,6 +71,7 @@ from pipeline.rig.recordings.figure import plot_recording as plot_recording
 from pipeline.runs.derive import derive as derive
 from pipeline.runs.derive import prune as prune
 from pipeline.runs.drawing import figure as figure
+from pipeline.runs.environment import show_versions as show_versions
 from pipeline.runs.extend import extend as extend
 from pipeline.runs.filming import animation as animation
 from pipeline.runs.preview import preview as preview

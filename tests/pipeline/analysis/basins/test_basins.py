@@ -94,7 +94,8 @@ def test_basins__cells_without_an_outcome():
     # at most 3/N
     np.testing.assert_allclose(found["unseen_high"], 3 / 385, rtol=0.01)
     assert basins_table(found).lines[-1] == (
-        "380 of 400 cells end on attractors; 5 diverged, 5 pending, 5 not settled, 5 step limit"
+        "380 of 400 cells end on attractors; 5 diverged, 5 pending, 5 not settled, 5 step limit "
+        "(see docs/troubleshooting.md#no-attractor)"
     )
     # every start is in one row, and the shares of all rows make 1
     rows = basins_table(found).rows
