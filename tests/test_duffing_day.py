@@ -74,7 +74,21 @@ initial_conditions = { kind = "list", points = [[-0.8, 0.0]] }
 integration = { n_transient = 0, n_keep = 100 }
 """
 
-SPECS = {"sweep": SWEEP, "walk": WALK, "ramp": RAMP, "noisy": NOISY}
+CYCLE = """
+kind = "sweep"
+title = "A flow, for what limit cycles alone have"
+model.name = "hopf"
+model.states = { x = {}, y = {} }
+model.parameters = { a = 1.0, shear = 0.5 }
+model.equations.x = "a*x - 3*y - (x*x + y*y)*(x - shear*y)"
+model.equations.y = "3*x + a*y - (x*x + y*y)*(shear*x + y)"
+section = { of = "y", value = 0.0, direction = "up", longest = 20.0 }
+axes = { a = { values = [0.5, 1.0] } }
+initial_conditions = { kind = "list", points = [[0.3, 0.0], [1.2, 0.0]] }
+integration = { n_transient = 10, n_keep = 4 }
+"""
+
+SPECS = {"sweep": SWEEP, "walk": WALK, "ramp": RAMP, "noisy": NOISY, "cycle": CYCLE}
 
 POINT = "--at frequency_hz=0.159154943 --at amplitude=0.3"
 LINE = "--at amplitude=0.15"
@@ -88,6 +102,7 @@ ANALYSES = {
     "chaos": "sweep",
     "dimension": f"sweep {POINT} --n-max 2000",
     "spectrum": f"sweep {POINT} --averages 3",
+    "phase": "cycle --kick x=0.2 --grid 8",
     "series": f"sweep {POINT} --attractor E --periods 60 --samples 16",
     "branches": "walk",
     "manifolds": f"{SWEPT} --length 0.5 --chord 0.1",
@@ -119,6 +134,7 @@ FIGURES_OF = {
     "gallery": f"sweep {POINT}",
     "basins": f"sweep {POINT} --shade",
     "fractions": f"sweep {LINE}",
+    "isochrones": "cycle --at a=1 --grid 16",
     "waterfall": f"sweep {LINE} --averages 3 --segment 16",
     "lyapunov": f"sweep {LINE}",
     "convergence": f"sweep {POINT}",
@@ -256,7 +272,7 @@ def test_plot(drawn, day, words):
                 assert stored[key].astype(str).values.tolist() == wanted.astype(str).tolist(), key
 
         texts = " ".join(" ".join(text.get_text() for text in figure.findobj(Text)).split())
-        assert ("damping = " if directory == "walk" else "cubic = 1") in texts
+        assert {"walk": "damping = ", "cycle": "section y = 0"}.get(directory, "cubic = 1") in texts
         assert all(f"= {float(value):.6g}" in texts for value in re.findall(r"--at \w+=(\S+)", words))
 
 
@@ -315,6 +331,7 @@ UNFIT = {
     "the product lyapunov": ("walk", "walk --at frequency=0.2"),
     "a run with [drift]": ("walk", "sweep", "noisy"),
     "a run with [noise]": ("walk", "sweep", "ramp"),
+    "a section": ("walk", "sweep"),
 }
 """Runs that lack what a figure needs, by the words of the guide; a figure with no words takes any steady run."""
 

@@ -40,6 +40,7 @@ _ONE, _TWO = "one swept parameter (--at chooses values of others)", "two swept p
 _SWEEP, _NOISE, _DRIFT = "a sweep", "a run with [noise]", "a run with [drift]"
 _AT_A_POINT = f"{_SWEEP}, and {_POINT}"
 _ROTATION, _EXPONENTS = "the product rotation", "the product lyapunov"
+_CYCLES = "a flow with a section"
 _CELLS = "pipeline.products.diagrams"
 
 _OWN: dict[str, dict[str, Line]] = {
@@ -78,6 +79,8 @@ _OWN: dict[str, dict[str, Line]] = {
     "Orbits and branches, stable or not": {
         "branches": Line(_room("branches"), "", ""),
         "multipliers": Line(_room("branches"), None, ""),
+        "phase": Line(_room("phase"), _CYCLES, _CYCLES),
+        "isochrones": Line(_room("phase"), None, f"{_CYCLES} and two states, and {_POINT}"),
         "events": Line(_room("events"), "a sweep or continuation along one parameter"),
         "genealogy": Line(_room("events"), None, _ONE),
         "response": Line(_room("response"), "", ""),

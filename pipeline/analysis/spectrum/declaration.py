@@ -11,11 +11,16 @@ _ROOM = "pipeline.analysis.spectrum.analysis"
 _MOTIONS = "pipeline.analysis.spectrum.motions"
 
 
-class MotionOptions(Options):
-    """Options that choose motions of a run, and a quantity of them."""
+class SetOptions(Options):
+    """Options that choose attractors of a run."""
 
     at: dict[str, float] = option({}, "Value of an axis of the run; by default all values.")
     attractor: str = option("", "Letter or id of one attractor; by default all that are there.")
+
+
+class MotionOptions(SetOptions):
+    """Options that choose motions of a run, and a quantity of them."""
+
     channel: str = option("", "State or quantity; by default the model's first state.")
 
 

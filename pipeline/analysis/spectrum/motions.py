@@ -15,14 +15,15 @@ from magpend_core.sampling import Drive
 from magpend_core.status import Status
 from pipeline.analysis.attractors.portraits import mean_return
 from pipeline.analysis.flown import flown
-from pipeline.analysis.spectrum.declaration import SPECTRUM_COLUMNS, CellOptions, MotionOptions
+from pipeline.analysis.spectrum.declaration import SPECTRUM_COLUMNS, MotionOptions, SetOptions
 from pipeline.layout.vocabulary import BOUNDED_SET, NOT_SETTLED, frequency_of, letter, parameters_of, split_dims
 from pipeline.results.ragged import dims_of, places_of_rows, points_of_rows
 from pipeline.results.run import OpenRun
 from pipeline.results.selection import select_points
 from pipeline.specification.problems import unknown_name
 
-Chosen = TypeVar("Chosen", bound=MotionOptions)
+Chosen = TypeVar("Chosen", bound=SetOptions)
+OfChannel = TypeVar("OfChannel", bound=MotionOptions)
 
 
 class Motion(NamedTuple):
@@ -51,10 +52,8 @@ def needs_motion(run: OpenRun, options: MotionOptions) -> None:
     names = [v.name for v in channels_of(run.model)]
     if options.channel and options.channel not in names:
         raise ValueError(unknown_name("channel", options.channel, names))
-    if options.attractor and not options.attractor.strip().isalnum():
-        raise ValueError(f"attractor {options.attractor!r}: give its letter or its id.")
+    needs_set(run, options)
     status = run.cube()["status"]
-    select_points(run.cube(), options.at)
     cell = getattr(options, "cell", None)
     if cell is None:
         return
@@ -64,21 +63,34 @@ def needs_motion(run: OpenRun, options: MotionOptions) -> None:
         raise ValueError("cell names a motion already: drop at and attractor.")
 
 
-def settle_motion(run: OpenRun, options: Chosen) -> Chosen:
+def needs_set(run: OpenRun, options: SetOptions) -> None:
+    """Raise ValueError unless the options name a set that can be there."""
+    if options.attractor and not options.attractor.strip().isalnum():
+        raise ValueError(f"attractor {options.attractor!r}: give its letter or its id.")
+    select_points(run.cube(), options.at)
+
+
+def settle_motion(run: OpenRun, options: OfChannel) -> OfChannel:
     """Fill in the channel, and replace the id of an attractor by its letter."""
+    channel = options.channel or run.model.state_names[0]
+    return settle_set(run, options).model_copy(update={"channel": channel})
+
+
+def settle_set(run: OpenRun, options: Chosen) -> Chosen:
+    """Replace the id of an attractor by its letter."""
     name = options.attractor.strip().upper()
-    chosen = letter(int(name)) if name.isdigit() else name
-    return options.model_copy(update={"channel": options.channel or run.model.state_names[0], "attractor": chosen})
+    return options.model_copy(update={"attractor": letter(int(name)) if name.isdigit() else name})
 
 
-def motions_of(run: OpenRun, options: CellOptions, wanted: Container[int] | None = None) -> list[Motion]:
+def motions_of(run: OpenRun, options: SetOptions, wanted: Container[int] | None = None) -> list[Motion]:
     """Return the motions of the chosen sets, or of a cell; all, or those with the wanted numbers."""
     found = run.derive("attractors")
     dims, _ = split_dims(found["attractor_id"])
     chosen, where, attractor = run.cube(), dict(options.at), options.attractor
-    if options.cell is not None:
+    cell_number = getattr(options, "cell", None)
+    if cell_number is not None:
         status = chosen["status"]
-        place = np.unravel_index(options.cell, status.shape)
+        place = np.unravel_index(cell_number, status.shape)
         index = {str(d): int(i) for d, i in zip(status.dims, place, strict=True)}
         cell = chosen[["status", "section"]].isel(index).load()
         where = {d: float(found[d][index[d]]) for d in dims}

@@ -100,6 +100,7 @@ dimension = Run.dimension
 spectrum = Run.spectrum
 series = Run.series
 branches = Run.branches
+phase = Run.phase
 events = Run.events
 response = Run.response
 backbone = Run.backbone

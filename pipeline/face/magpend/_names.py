@@ -10,6 +10,7 @@ from pipeline.analysis.chaos import declaration as of_chaos
 from pipeline.analysis.events import declaration as of_events
 from pipeline.analysis.manifolds import declaration as of_manifolds
 from pipeline.analysis.noise import declaration as of_noise
+from pipeline.analysis.phase import declaration as of_phase
 from pipeline.analysis.resilience import declaration as of_resilience
 from pipeline.analysis.response import declaration as of_response
 from pipeline.analysis.series import declaration as of_series
@@ -36,6 +37,7 @@ class Analyses:
     spectrum = AnalysisMethod(of_spectrum.SpectrumOptions)
     series = AnalysisMethod(of_series.SeriesOptions)
     branches = AnalysisMethod(of_branches.BranchOptions)
+    phase = AnalysisMethod(of_phase.PhaseOptions)
     events = AnalysisMethod(of_events.EventOptions)
     response = AnalysisMethod(of_response.ResponseOptions)
     backbone = AnalysisMethod(of_response.BackboneOptions)
@@ -73,6 +75,8 @@ class Figures:
     series = SeveralPanels(of_series.SeriesFigureOptions)
     branches = OnePanel(of_branches.BranchFigureOptions)
     multipliers = OnePanel(of_branches.MultiplierOptions)
+    phase = SeveralPanels(of_phase.PhaseFigureOptions)
+    isochrones = OnePanel(of_phase.IsochroneOptions)
     genealogy = OnePanel(of_events.GenealogyOptions)
     response = SeveralPanels(of_response.ResponseFigureOptions)
     backbone = OnePanel(of_response.BackboneFigureOptions)
