@@ -3,6 +3,8 @@
 With ``--copies`` each page of the gallery gets a copy of the explorer with the page's run, in one file. The runs are
 computed in ``build/gallery``, which takes some minutes; complete ones are used again.
 
+Each page of the gallery gets its notebook, by `docs/notebooks.py`.
+
 Warnings are errors, broken links within the docs among them. Then the built pages are read: nothing in them
 may be loaded from elsewhere.
 """

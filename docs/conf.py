@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent / "pipeline" / "face"), str(HERE.parent)]
+sys.path[:0] = [str(HERE.parent / "pipeline" / "face"), str(HERE.parent), str(HERE)]
 
 project = "magpend"
 author = "the magpend authors"
@@ -158,6 +158,8 @@ def _read(app: Any, page: str, source: list[str]) -> None:
     folder, _, name = page.partition("/")
     if folder == "gallery" and COPIES and (Path(COPIES) / f"{name}.html").is_file():
         text += f'\n<p><a href="{name}-explorer.html">Explore this run</a>: a copy of the explorer, one file.</p>\n'
+    if folder == "gallery":
+        text += f'\n<p><a href="{name}.ipynb" download>This page as a notebook</a>, to execute and change.</p>\n'
     if page in TOP:
         # their links are seen from the top of the repository
         text = (HERE.parent / TOP[page]).read_text("utf-8").replace("](docs/", "](")
@@ -169,6 +171,15 @@ def _read(app: Any, page: str, source: list[str]) -> None:
     source[0] = text
 
 
+def _write_notebooks(app: Any, error: Exception | None) -> None:
+    """Write the gallery's notebooks beside its pages."""
+    from notebooks import write_notebooks
+
+    if error is None:
+        write_notebooks(HERE / "gallery", Path(app.outdir) / "gallery")
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
     app.connect("source-read", _read)
+    app.connect("build-finished", _write_notebooks)

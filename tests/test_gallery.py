@@ -6,7 +6,10 @@ All are computed with MAGPEND_LONG=1.
 from __future__ import annotations
 
 import math
+import os
 import re
+import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,6 +25,7 @@ PAGES = ROOT / "docs" / "gallery"
 
 
 tutorials = program("docs/run_tutorials.py")
+notebooks = program("docs/notebooks.py")
 STUDY = load_study("gallery")
 FIGURE = {figure.number: figure for figure in STUDY.table.figures}
 QUICK = ("josephson-steps", "ueda-coexisting")
@@ -106,3 +110,68 @@ def test_copies__a_page_links_to_its_copy_of_the_explorer(tmp_path, monkeypatch)
         source = ["text"]
         conf._read(None, page, source)
         assert ('href="ueda-coexisting-explorer.html"' in source[0]) == there
+
+
+def test_site__each_gallery_page_links_to_its_notebook(tmp_path):
+    conf = program("docs/conf.py")
+    for page, has_link in (("gallery/belt-friction", True), ("index", False)):
+        source = ["text"]
+        conf._read(None, page, source)
+        assert ('href="belt-friction.ipynb"' in source[0]) == has_link
+    (tmp_path / "gallery").mkdir()
+    conf._write_notebooks(SimpleNamespace(outdir=tmp_path), None)
+    assert {path.stem for path in (tmp_path / "gallery").iterdir()} == set(FIGURE)
+
+
+@pytest.mark.parametrize("name", FIGURE)
+def test_notebook__has_the_page_s_commands_texts_and_specification(name):
+    page = PAGES / f"{name}.md"
+    made = notebooks.notebook_of(page)
+    sources = {kind: [c["source"] for c in made["cells"] if c["cell_type"] == kind] for kind in ("code", "markdown")}
+    text = page.read_text("utf-8")
+    commands = re.search(r"```sh\n(.*?)```", text, re.DOTALL).group(1).replace("\\\n", " ")
+    lines = [" ".join(line.split()) for line in commands.splitlines() if line.strip()]
+    assert sources["code"][1].replace("!", "").splitlines() == lines
+    assert sources["code"][2] == f'Image("{name}.png")'
+    whole = "\n".join(sources["markdown"])
+    assert "<!--" not in whole
+    assert "](.." not in whole  # nothing of the repository lies beside it
+    printed = re.search(r"<!-- printed -->\n(```text\n.*?```)", text, re.DOTALL).group(1)
+    assert printed in whole
+    system = re.search(r"^\*\*The system\.\*\*.*?(?=\n\n)", text, re.DOTALL | re.MULTILINE).group(0)
+    assert system.partition("[")[0] in whole
+    assert f"**{name}.toml**\n\n```toml\n{find_spec(f'gallery/{name}').read_text('utf-8')}```" in whole
+
+
+def test_notebook__is_one_that_jupyter_reads(tmp_path):
+    nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed")
+    written = notebooks.write_notebooks(PAGES, tmp_path)
+    assert {path.stem for path in written} == set(FIGURE)
+    for path in written:
+        nbformat.validate(nbformat.read(path, as_version=4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.long]) for name in FIGURE]
+)
+def test_notebook__executed_it_prints_and_draws_what_the_page_shows(name, tmp_path, monkeypatch):
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
+    nbformat = pytest.importorskip("nbformat")
+    # a magpend of this checkout, after the one of the kernel's Python
+    script = tmp_path / "bin" / "magpend"
+    script.parent.mkdir()
+    script.write_text(f"#!{sys.executable}\nfrom pipeline.cli.entry import main\n\nmain()\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{script.parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    made = nbformat.from_dict(notebooks.notebook_of(PAGES / f"{name}.md"))
+    resources = {"metadata": {"path": str(tmp_path)}}
+    done = nbclient.NotebookClient(made, timeout=600, kernel_name="python3", resources=resources).execute()
+    outputs = [output for cell in done.cells if cell.cell_type == "code" for output in cell.outputs]
+    seen = "".join(output.text for output in outputs if output.output_type == "stream").splitlines()
+    text = (PAGES / f"{name}.md").read_text("utf-8")
+    printed = re.search(r"<!-- printed -->\n```text\n(.*?)```", text, re.DOTALL).group(1).splitlines()
+    assert [line for line in printed if not any(tutorials.alike(line, one) for one in seen)] == []
+    assert [output for output in outputs if "image/png" in output.get("data", {})]
+    assert not tutorials.is_stale(PAGES / f"{name}.png", tmp_path / f"{name}.png")
