@@ -125,13 +125,26 @@ def _rows(starts: ListStarts) -> list[np.ndarray]:
 def _samples(starts: RandomStarts) -> list[np.ndarray]:
     # a number is drawn for fixed states, too, so that fixing one does not change the others
     names = starts.system.state_names
-    uniform = np.random.Generator(np.random.PCG64(starts.seed)).random((starts.n, len(names)))
+    uniform = _uniform(starts, len(names))
     columns = []
     for state, u in zip(names, uniform.T, strict=True):
         value, factor = _state_value(starts, state)
         low, high = value if isinstance(value, tuple) else (value, value)
         columns.append((low + (high - low) * u) * factor)
     return columns
+
+
+def _uniform(starts: RandomStarts, n_states: int) -> np.ndarray:
+    """Return samples of the unit box, shape (sample, state)."""
+    random = np.random.Generator(np.random.PCG64(starts.seed))
+    if starts.sampling is None:
+        return random.random((starts.n, n_states))
+    from scipy.stats import qmc  # slow to import
+
+    if starts.sampling == "latin-hypercube":
+        return np.asarray(qmc.LatinHypercube(n_states, rng=random).random(starts.n))
+    # its numbers of samples are powers of two: of others the first are taken
+    return np.asarray(qmc.Sobol(n_states, rng=random).random_base2((starts.n - 1).bit_length())[: starts.n])
 
 
 def coordinates(spec: Spec) -> tuple[Coordinate, ...]:

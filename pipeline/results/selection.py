@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.layout.own_words import axis_in_own_words, rate_of
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import grid_dim, split_dims
 from pipeline.results.ragged import isel
 from pipeline.specification.problems import unknown_name
 from pipeline.specification.tables import FREQUENCY
@@ -27,6 +27,17 @@ def start_dims(attractors: xr.Dataset) -> list[str]:
     condition.
     """
     return list(split_dims(attractors["attractor_id"])[1])
+
+
+def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> npt.NDArray[np.float64]:
+    """Return the initial states of the cells of a parameter point, shape (cell, state)."""
+    shape = tuple(cube.sizes[d] for d in starts)
+    columns = []
+    for name in cube["state"].values:
+        column = cube[grid_dim(str(name))]
+        own = xr.DataArray(np.ones(shape), dims=starts) * column.drop_vars(list(column.coords))
+        columns.append(own.transpose(*starts).values.ravel())
+    return np.column_stack(columns)
 
 
 def listed(text: str) -> list[str]:

@@ -356,6 +356,7 @@ class Spec:
         *,
         n: int,
         seed: int | None = None,
+        sampling: Literal["sobol", "latin-hypercube"] | None = None,
         states: Mapping[str, float | tuple[float, float]] | None = None,
         **named: float | tuple[float, float],
     ) -> Self:
@@ -367,12 +368,14 @@ class Spec:
             Number of random states; 1 or more.
         seed
             Seed of the random numbers; 0 or more.
+        sampling
+            ``"sobol"`` or ``"latin-hypercube"``, which cover the box evenly; by default samples are independent.
         states
             States whose names are keywords here, such as ``states={"n": (-1, 1)}``; or any others.
         named
             States by name; for an angle or its rate ``NAME_deg`` takes degrees. Each is a number or ``(low, high)``.
         """
-        own = {"kind": "random", "n": n, "seed": seed, "states": states and dict(states)}
+        own = {"kind": "random", "n": n, "seed": seed, "sampling": sampling, "states": states and dict(states)}
         return self._replaced("initial_conditions", {**own, **named})
 
     with_parameters = TableMethod(ParametersTable, "Set values of the model's parameters.")

@@ -228,11 +228,17 @@ def positions(model: Model) -> tuple[str, ...]:
 
 
 class RandomStarts(_PerState):
-    """The table ``[initial_conditions]`` of kind random: uniform samples from a box ``[low, high]`` per state."""
+    """The table ``[initial_conditions]`` of kind random: uniform samples from a box ``[low, high]`` per state.
+
+    With `sampling` they cover it more evenly than independent ones.
+    """
 
     kind: Literal["random"]
     n: int = Field(ge=1, le=MAX_POINTS, description="Number of samples.")
     seed: int = Field(0, ge=0, description="Seed of the samples.")
+    sampling: Literal["sobol", "latin-hypercube"] | None = Field(
+        None, description="sobol or latin-hypercube cover the box evenly; without it samples are independent."
+    )
 
     @model_validator(mode="after")
     def _boxes(self) -> RandomStarts:

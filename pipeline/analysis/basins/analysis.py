@@ -8,18 +8,27 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.boundaries import basin_entropy, box_sides, epsilons_of, uncertainty_exponent
-from pipeline.analysis.basins.declaration import OTHERS, BasinOptions
+from pipeline.analysis.basins.boundaries import (
+    basin_entropy,
+    box_sides,
+    boxes_per_side,
+    epsilons_of,
+    scattered_entropy,
+    uncertainty_exponent,
+)
+from pipeline.analysis.basins.declaration import OTHERS, BasinOptions, share_name
 from pipeline.analysis.basins.numbers import basin_rows
 from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import letter, split_dims
 from pipeline.products.product import Table
 from pipeline.products.reporting import track
+from pipeline.results.expressions import check_density, weights_of
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import DIVERGED, other_cells, outcomes, pointed, told
 from pipeline.results.ragged import dims_of, places_of_rows
 from pipeline.results.run import OpenRun
+from pipeline.results.selection import start_states
 from pipeline.results.tabular import (
     FEW_POINTS,
     FRACTION,
@@ -38,6 +47,7 @@ from pipeline.results.tabular import (
 def needs_starts(run: OpenRun, options: BasinOptions) -> None:
     """Raise ValueError unless the run's cells are independent initial conditions."""
     check_starts(run.cube())
+    check_density(run, options.density)
 
 
 def basins(run: OpenRun, options: BasinOptions) -> xr.Dataset:
@@ -56,7 +66,9 @@ def basins_table(ds: xr.Dataset) -> Table:
     """
     rows, dims = _rows(ds), dims_of(ds)
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
-    lines = [f"fractions of all cells, {ds.attrs['basin_interval']}, {confidence}"]
+    density = str(ds.attrs["basin_density"])
+    of = "all cells" if density == "1" else f"the density {density}"
+    lines = [f"fractions of {of}, {ds.attrs['basin_interval']}, {confidence}"]
     if int(np.prod([ds.sizes[d] for d in dims])) > FEW_POINTS:
         shown, n_others = leading([row for row in rows if row["label"] != NO_OUTCOME], "label", "n_cells")
         lines += summary(ds, shown, dims, _label_summary, "label")
@@ -93,19 +105,11 @@ def _rows(ds: xr.Dataset) -> list[Row]:
 
 def _other_row(ds: xr.Dataset, at: Mapping[str, int], where: Row, name: str) -> Row:
     """Return the row of the cells of a parameter point that have no outcome for one reason."""
-    count, n = int(ds[name].isel(at)), int(ds["n_cells"].isel(at))
+    count, share, n = (float(ds[key].isel(at)) for key in (name, share_name(name), "n_effective"))
     settings: dict[str, Any] = {"confidence": ds.attrs["basin_confidence"], "method": ds.attrs["basin_interval"]}
-    low, high = (float(end) for end in binomial_interval(count, n, **settings))
-    told = {"label": NO_OUTCOME, "outcome": OTHERS[name], "n_cells": count, "n_inferred": 0}
-    return {
-        **where,
-        **told,
-        "fraction": count / n,
-        "low": low,
-        "high": high,
-        "fraction_if_all": count / n,
-        "high_if_all": high,
-    }
+    low, high = (float(end) for end in binomial_interval(share * n, n, **settings))
+    told = {"label": NO_OUTCOME, "outcome": OTHERS[name], "n_cells": int(count), "n_inferred": 0}
+    return {**where, **told, "fraction": share, "low": low, "high": high, "fraction_if_all": share, "high_if_all": high}
 
 
 NO_OUTCOME = -1
@@ -202,6 +206,9 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
         parameter dims the number of the latter by reason, such as `n_not_settled` and `n_no_return` (`OTHERS`);
         they add up to `n_unfinished`.
 
+        If the starts are scattered, `basin_entropy` and `boundary_basin_entropy` as below, of boxes with as many cells
+        on average as on a grid.
+
         If the starts are a grid, evenly spaced along every axis, on the parameter dims:
         `basin_entropy`, `boundary_basin_entropy`, `uncertainty_exponent`, `wada_beyond`, each with
         `_stderr`, `_low`, `_high`; `above_ln2_surely`, `boundary_dimension`, `exponent_r_squared`;
@@ -222,10 +229,19 @@ def basins_of(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = No
     result["n_periods"] = ds["n_periods"].transpose(*dims, *start_dims).load()
     result["outcome"] = labels
     inferred = (ids["status"] == vocabulary.INFERRED).transpose(*dims, *start_dims)
-    result = result.merge(basin_rows(labels, dims, inferred, options.confidence, options.interval))
-    result = result.assign(_unfinished(ids, dims))
+    n_points = int(np.prod(labels.shape[: len(dims)]))
+    weights = np.ones((n_points, labels.size // n_points))
+    if options.density != "1":
+        weights = weights_of(ds, dims, start_dims, options.density)
+    result = result.merge(basin_rows(labels, dims, inferred, options.confidence, options.interval, weights))
+    result = result.assign(_unfinished(ids, dims, weights))
     if reason := _no_grid(ds, start_dims):
         missing = {"boundaries": reason}
+        if "initial_condition" in start_dims:
+            states = start_states(ds, start_dims)
+            missing = {"uncertainty exponent and Wada test": reason, **_too_few(states, options)}
+            if "basin entropy" not in missing:
+                result = result.assign(_entropies(labels, dims, states, options))
     else:
         missing = _problems(labels.shape[len(dims) :], options)
         result = result.assign(_boundaries(labels, dims, options, missing))
@@ -245,15 +261,17 @@ def check_starts(ds: xr.Dataset) -> None:
         raise ValueError("basins need several initial conditions per parameter point; this run has one.")
 
 
-def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Count the cells without an outcome at each parameter point by reason."""
+def _unfinished(ids: xr.Dataset, dims: tuple[str, ...], weights: np.ndarray) -> dict[str, xr.DataArray]:
+    """Count the cells without an outcome at each parameter point by reason, and give their share of the weight."""
     others = other_cells(ids)
     shape = ids["attractor_id"].transpose(*dims, ...).shape
     found = {}
     for name, reason in OTHERS.items():
         which = others.get(reason, np.zeros(shape, bool))
-        count = which.reshape(*shape[: len(dims)], -1).sum(axis=-1, dtype=np.int64)
-        found[name] = xr.DataArray(count, dims=dims)
+        cells = which.reshape(weights.shape)
+        share = (weights * cells).sum(axis=1) / weights.sum(axis=1)
+        for key, values in ((name, cells.sum(axis=1, dtype=np.int64)), (share_name(name), share)):
+            found[key] = xr.DataArray(values.reshape(shape[: len(dims)]), dims=dims)
     return found
 
 
@@ -265,6 +283,30 @@ def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
         if np.ptp(steps) > 1e-6 * np.abs(steps).max(initial=0.0):
             return f"{dim} is not evenly spaced"
     return ""
+
+
+def _too_few(states: np.ndarray, options: BasinOptions) -> dict[str, str]:
+    """Return why scattered starts have no basin entropy, by the name of the measure."""
+    varying = states[:, np.ptp(states, axis=0) > 0.0]
+    try:
+        boxes_per_side(varying.shape, options.box ** varying.shape[1])
+    except ValueError as error:
+        return {"basin entropy": str(error)}
+    return {}
+
+
+def _entropies(
+    labels: xr.DataArray, dims: tuple[str, ...], states: np.ndarray, options: BasinOptions
+) -> dict[str, Any]:
+    """Measure the basin entropy of scattered starts at each parameter point; return variables as (dims, values)."""
+    common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}
+    per_box = options.box ** int((np.ptp(states, axis=0) > 0.0).sum())
+    points = []
+    for one in track([*labels.values.reshape(-1, len(states))], "measuring basin entropies"):
+        known = (one != -1).any()
+        points.append(dict(_of_entropy(scattered_entropy(states, one, per_box, **common))) if known else {})
+    names = [name for name in _MEASURES if "basin_entropy" in name or name == "above_ln2_surely"]
+    return _over_points(points, names, labels.shape[: len(dims)], dims)
 
 
 def _problems(shape: tuple[int, ...], options: BasinOptions) -> dict[str, str]:
@@ -304,11 +346,7 @@ def _boundaries(
         dict(_boundary(one, options, missing))
         for one in track([*labels.values.reshape(-1, *grid)], "measuring boundaries")
     ]
-    found: dict[str, Any] = {}
-    for name in _MEASURES:
-        is_flag = name in _FLAGS
-        values = np.array([point.get(name, -1 if is_flag else np.nan) for point in points])
-        found[name] = (dims, values.astype(np.int8 if is_flag else np.float64).reshape(shape))
+    found = _over_points(points, _MEASURES, shape, dims)
     if "uncertainty exponent" not in missing:
         epsilon = epsilons_of(None, grid, options.scaling)
         values = np.array([point.get("uncertain", np.full(len(epsilon), np.nan)) for point in points])
@@ -317,17 +355,33 @@ def _boundaries(
     return found
 
 
+def _over_points(
+    points: Sequence[Mapping[str, Any]], names: Sequence[str], shape: tuple[int, ...], dims: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return measures of parameter points as (dims, values), NaN where a point has none, or -1 of flags."""
+    found: dict[str, Any] = {}
+    for name in names:
+        is_flag = name in _FLAGS
+        values = np.array([point.get(name, -1 if is_flag else np.nan) for point in points])
+        found[name] = (dims, values.astype(np.int8 if is_flag else np.float64).reshape(shape))
+    return found
+
+
+def _of_entropy(entropy: xr.Dataset) -> Iterator[tuple[str, Any]]:
+    """Yield the name and value of each measure of basin entropies."""
+    for ours, theirs in (("basin_entropy", "entropy"), ("boundary_basin_entropy", "boundary_entropy")):
+        yield from _with_errors(entropy, ours, theirs)
+    if np.isfinite(entropy["boundary_entropy_low"]):
+        yield "above_ln2_surely", int(entropy["above_ln2_surely"])
+
+
 def _boundary(grid: np.ndarray, options: BasinOptions, missing: Mapping[str, str]) -> Iterator[tuple[str, Any]]:
     """Yield the name and value of each measure of the basin boundaries on one grid of labels."""
     if not (grid != -1).any():
         return
     common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}
     if "basin entropy" not in missing:
-        entropy = basin_entropy(grid, options.box, block=options.block, **common)
-        for ours, theirs in (("basin_entropy", "entropy"), ("boundary_basin_entropy", "boundary_entropy")):
-            yield from _with_errors(entropy, ours, theirs)
-        if np.isfinite(entropy["boundary_entropy_low"]):
-            yield "above_ln2_surely", int(entropy["above_ln2_surely"])
+        yield from _of_entropy(basin_entropy(grid, options.box, block=options.block, **common))
     if "uncertainty exponent" not in missing:
         exponent = uncertainty_exponent(grid, method=options.scaling, **common)
         yield from _with_errors(exponent, "uncertainty_exponent", "exponent")

@@ -249,6 +249,99 @@ def uncertainty_exponent(
     )
 
 
+def scattered_entropy(
+    states: npt.ArrayLike,
+    labels: npt.ArrayLike,
+    per_box: int = 25,
+    *,
+    unfinished: Collection[int] = UNFINISHED,
+    resamples: int = 200,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Compute the basin entropy and the boundary basin entropy of cells with scattered initial states.
+
+    Boxes of equal size divide the region of the states, with `per_box` cells each on average; otherwise as
+    `basin_entropy`, which is for grids. The mean is over 16 random placements of the boxes. A box of few cells has too
+    small an entropy, about (labels - 1)/(2 cells) below that of many.
+
+    Parameters
+    ----------
+    states
+        Initial states of the cells, shape (cell, state), evenly distributed in a region; states that are the same
+        everywhere do not count.
+    labels
+        Outcome per cell, integers, shape (cell,).
+    per_box
+        Mean number of cells in a box, 2 or more.
+    unfinished, resamples, confidence, seed
+        See `basin_entropy`.
+
+    Returns
+    -------
+    Dataset
+        `entropy` and `boundary_entropy` [nat], each with `_stderr`, `_low`, `_high`, `n_boxes` and
+        `n_boundary_boxes` of the first placement, and `above_ln2_surely`.
+
+    Raises
+    ------
+    TypeError
+        If the labels are not integers.
+    ValueError
+        If the cells do not fill two boxes along each state.
+    """
+    n_placements = 16
+    check_confidence(confidence)
+    check_resamples(resamples)
+    codes = read_labels(labels, unfinished).codes
+    points = np.asarray(states, np.float64)
+    points = points[:, np.ptp(points, axis=0) > 0.0]
+    side = boxes_per_side(points.shape, per_box)
+    places = (points - points.min(axis=0)) / np.ptp(points, axis=0) * side
+    rng = np.random.default_rng(seed)
+    first_boxes = _fill_scattered(codes, places, side)
+    # moved by a part of a box, one box less lies within the region
+    offsets = rng.random((n_placements - 1, places.shape[1]))
+    placements = [first_boxes, *(_fill_scattered(codes, places - offset, side - 1) for offset in offsets)]
+    first, everywhere = _totals(placements[0]), _totals(np.concatenate([p.reshape(3, -1) for p in placements], axis=1))
+    value = _entropies(everywhere)
+    errors = np.array([_placement_errors(one, 1, resamples, confidence, seed) for one in placements])
+    stderr, below, above = np.fmax.reduce(errors, axis=0)
+    low, high = np.maximum(value - below, 0.0), value + above
+    ds = xr.Dataset({"n_boxes": int(first[1]), "n_boundary_boxes": int(first[2])})
+    for i, name in enumerate(("entropy", "boundary_entropy")):
+        for end, of in (("", value), ("_stderr", stderr), ("_low", low), ("_high", high)):
+            ds[f"{name}{end}"] = ((), of[i])
+    return ds.assign(above_ln2_surely=bool(low[1] > ABOVE_LN_2))
+
+
+def boxes_per_side(shape: tuple[int, ...], per_box: int) -> int:
+    """Return the number of boxes along each state for cells of shape (cell, state); ValueError if below 2."""
+    n, dims = shape
+    if per_box < 2:
+        raise ValueError(f"a box of {per_box} cells has no entropy: give 2 or more")
+    side = int((n / per_box) ** (1.0 / max(dims, 1)) * (1.0 + 1e-12)) if dims else 0
+    if side < 2:
+        raise ValueError(
+            f"{n} scattered cells over {dims} states do not fill two boxes of {per_box} along each of them: "
+            f"take {per_box * 2**dims} cells, or smaller boxes"
+        )
+    return side
+
+
+def _fill_scattered(codes: Codes, places: Floats, side: int) -> Floats:
+    """Return the entropy of each box, whether it has finished cells, and whether it has several labels."""
+    known = (codes >= 0) & ((places >= 0.0) & (places <= side)).all(axis=1)
+    index = np.minimum(places[known].astype(np.int64), side - 1)
+    sides = (side,) * places.shape[1]
+    counts = np.zeros((side ** len(sides), int(codes.max(initial=0)) + 1))
+    np.add.at(counts, (np.ravel_multi_index(tuple(index.T), sides), codes[known]), 1.0)
+    total = counts.sum(axis=1)
+    share = counts / np.maximum(total, 1.0)[:, None]
+    entropy = -(share * np.log(np.where(share > 0.0, share, 1.0))).sum(axis=1)
+    return np.stack([entropy, total > 0, (counts > 0).sum(axis=1) > 1]).reshape(3, *sides)
+
+
 # --- boxes ---------------------------------------------------------------------------------------------
 
 

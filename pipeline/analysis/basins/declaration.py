@@ -16,7 +16,12 @@ class BasinOptions(Options):
 
     interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")
     confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
-    box: int = option(5, "Basin entropy: side of the boxes.", unit="cells", ge=2)
+    density: str = option(
+        "1", "Density of the initial states, an expression of states and parameters; it weighs the cells in fractions."
+    )
+    box: int = option(
+        5, "Basin entropy: side of the boxes; of scattered starts they hold as many cells.", unit="cells", ge=2
+    )
     block: int = option(1, "Basin entropy: side of the bootstrap's blocks, in boxes.", ge=1)
     scaling: Literal["perturbation", "boxes", "entropy"] = option(
         "perturbation", "Uncertainty exponent: scaling that is fitted."
@@ -44,6 +49,12 @@ OTHERS = {
 
 _ERRORS = ("low", "high", "stderr")
 
+
+def share_name(name: str) -> str:
+    """Return the name of the share that belongs to a number of cells without an outcome."""
+    return f"share_{name.removeprefix('n_')}"
+
+
 COLUMNS: Columns = (
     *only(IDENTIFIED_COLUMNS, "n_sets ran_out attractor_id decision status"),
     *over("* +", outcome="attractor that the cell ends on", n_periods="{periods} integrated in all"),
@@ -51,6 +62,7 @@ COLUMNS: Columns = (
         "*",
         n_cells="cells of the parameter point",
         n_unfinished="cells that are not finished",
+        n_effective="independent cells of equal weight with the same error",
         fraction_unfinished="share of the cells that are not finished",
         unseen_high="upper bound of the fraction of an attractor that no cell shows",
         unseen_high_if_all="this bound if all unfinished cells ended on one such attractor",
@@ -60,6 +72,7 @@ COLUMNS: Columns = (
         wada="passes the Wada merge test; -1 fewer than three labels",
     ),
     *over("*", **{name: f"cells without an outcome: {text}" for name, text in OTHERS.items()}),
+    *over("*", **{share_name(name): f"share without an outcome: {text}" for name, text in OTHERS.items()}),
     *over("* epsilon", uncertain="uncertain part of the region"),
     *over("epsilon", "cells", epsilon="distance within which another outcome makes a cell uncertain"),
     *over("*", "cells", wada_distance="largest distance between boundaries, the least radius that passes"),
@@ -85,7 +98,7 @@ BASINS = Analysis(
     "basins",
     """Measure the basins of a sweep: fractions with intervals, entropy, uncertainty exponent, Wada test.
 
-    The last three need starts on a grid.""",
+    The exponent and the test need starts on a grid.""",
     BasinOptions,
     compute=f"{_ROOM}:basins",
     columns=COLUMNS,
@@ -94,7 +107,7 @@ BASINS = Analysis(
     builds_on=("attractors",),
     figure="basins",
     by_point=True,
-    version=3,
+    version=4,
 )
 
 
@@ -111,6 +124,14 @@ class RegimeOptions(FigureOptions):
     curves: str = option("", "Run along one axis whose bifurcation curves are drawn over the map.")
 
 
+class FractionFigureOptions(FigureOptions):
+    """Options of a figure of basin fractions."""
+
+    density: str = option(
+        "1", "Density of the initial states, an expression of states and parameters; it weighs the cells."
+    )
+
+
 BASINS_FIGURE = Figure(
     "basins",
     "Draw basins of attraction: the attractor on which each initial state of a grid ends.",
@@ -122,8 +143,9 @@ BASINS_FIGURE = Figure(
 FRACTIONS_FIGURE = Figure(
     "fractions",
     "Draw basin fractions over the swept parameter, as stacked bands.",
-    FigureOptions,
+    FractionFigureOptions,
     "pipeline.analysis.basins.fractions_figure:draw_fractions",
+    needs="pipeline.analysis.basins.fractions_figure:needs_density",
 )
 
 

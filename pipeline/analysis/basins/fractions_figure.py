@@ -12,10 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from pipeline.analysis.basins.analysis import check_starts
+from pipeline.analysis.basins.declaration import FractionFigureOptions
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, letter
 from pipeline.plots import labels, palette, style
 from pipeline.plots.figure import frame_of, noted, values_of
-from pipeline.products.product import FigureOptions, StateOptions
+from pipeline.products.product import StateOptions
+from pipeline.results.expressions import check_density, weights_of
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import left_out, outcomes
 from pipeline.results.ragged import dense
@@ -27,7 +30,11 @@ _BAR: dict[str, Any] = {"linewidth": 0.7, "color": "black"}
 
 @style.drawn
 def plot_fractions(
-    attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
+    attractors: xr.Dataset,
+    *,
+    at: Mapping[str, float] | None = None,
+    density: str = "1",
+    frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the fraction of the initial states that end on each attractor, as stacked bands over the swept parameter.
 
@@ -37,6 +44,8 @@ def plot_fractions(
         Result of `pipeline.analysis.attractors.attractors.match` for a sweep over one parameter or more.
     at
         Values of the other swept parameters, for example ``{"q": 1.5}``.
+    density
+        Density of the initial states, an expression of states and parameters; it weighs the cells.
     frame
         Width of the figure and ranges of its axes.
 
@@ -62,7 +71,7 @@ def plot_fractions(
     keep = (parameter, *start_dims(attractors))
     part = choose(attractors, at, keep, f"fractions are drawn over {parameter}")
     cast = palette.cast_of(attractors, part)
-    data = _fractions(part, parameter, cast)
+    data = _fractions(part, parameter, cast, density)
     bands = _bands(data, cast)
     place = {number: k for k, number in enumerate(cast.order)}
     listed = sorted(bands, key=lambda band: place.get(band.attractor, len(place)))
@@ -98,7 +107,7 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
     )
 
 
-def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
+def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast, density: str) -> xr.Dataset:
     """Return the basin fractions, and the share of cells without an attractor, at each parameter value."""
     n = part.sizes[parameter]
     ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
@@ -108,14 +117,19 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
         if name in others:
             codes[others[name].reshape(n, -1)] = len(cast.names) + k
     width = len(cast.names) + len(kinds)
-    counts = np.array([np.bincount(row, minlength=width) for row in codes])
+    starts = tuple(start_dims(part))
+    weights = np.ones(ids.shape) if density == "1" else weights_of(part, [parameter], starts, density)
+    # as many cells of equal weight have the same error
+    weights = weights * (weights.sum(axis=1) / (weights**2).sum(axis=1))[:, None]
+    counts = np.array([np.bincount(row, w, minlength=width) for row, w in zip(codes, weights, strict=True)])
+    effective = weights.sum(axis=1)[:, None]
     labels = [*(letter(i) for i in range(len(cast.names))), *kinds]
     names = [*cast.names.values(), *kinds]
     branches = "branch" in start_dims(part)
     of = "branches" if branches else "initial states"
-    shares = {"fraction": (counts / max(ids.shape[1], 1), f"share of the {of}")}
+    shares = {"fraction": (counts / np.maximum(effective, 1e-300), f"share of the {of}")}
     if not branches:
-        low, high = binomial_interval(counts, ids.shape[1])
+        low, high = binomial_interval(np.minimum(counts, effective), effective)
         shares |= {"low": (low, "95 % interval, low end"), "high": (high, "95 % interval, high end")}
     return xr.Dataset(
         {
@@ -126,7 +140,10 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
             "n_cells": ((parameter,), np.full(n, ids.shape[1], np.int32), {"units": "1", "long_name": "cells"}),
         },
         coords={parameter: part[parameter], "outcome": labels, "name": ("outcome", names)},
-        attrs={"title": f"shares of the {of}" if branches else "basin fractions"},
+        attrs={
+            "title": f"shares of the {of}" if branches else "basin fractions",
+            **({"density": density} if density != "1" else {}),
+        },
     )
 
 
@@ -136,7 +153,8 @@ def _about(data: xr.Dataset) -> str:
         return f"{n} branches each"
     seen = data["fraction"] > 0
     half = float((0.5 * (data["high"] - data["low"])).where(seen).max())
-    return f"shares of all {n} initial states, grey ones included, 95 % intervals within ±{half:.2g}"
+    of = f"all {n} initial states" if "density" not in data.attrs else f"the density {data.attrs['density']}"
+    return f"shares of {of}, grey ones included, 95 % intervals within ±{half:.2g}"
 
 
 @dataclass(frozen=True)
@@ -219,11 +237,18 @@ def _raster(
     return raster
 
 
-def draw_fractions(run: OpenRun, options: FigureOptions) -> style.DataFigure:
+def needs_density(run: OpenRun, options: FractionFigureOptions) -> None:
+    """Raise ValueError if cells are to be weighed, and they are no independent starts, or it is no density."""
+    if options.density != "1":
+        check_starts(run.cube())
+        check_density(run, options.density)
+
+
+def draw_fractions(run: OpenRun, options: FractionFigureOptions) -> style.DataFigure:
     """Draw the figure ``fractions`` of a run."""
     at, notes = values_of(run, options)
     found = run.derive("attractors")
-    return noted(plot_fractions(found, at=at, frame=frame_of(options)), notes)
+    return noted(plot_fractions(found, at=at, density=options.density, frame=frame_of(options)), notes)
 
 
 _UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55

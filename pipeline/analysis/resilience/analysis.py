@@ -20,7 +20,6 @@ from pipeline.analysis.attractors.destinations import Destinations, Followed, de
 from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
 from pipeline.analysis.resilience.declaration import ResilienceOptions
-from pipeline.analysis.resilience.expressions import density_at, mean_over_cells, read_expression
 from pipeline.analysis.resilience.local import local_stability
 from pipeline.analysis.resilience.shocks import (
     Asked,
@@ -33,14 +32,14 @@ from pipeline.analysis.resilience.shocks import (
     search_together,
     sizes,
 )
-from pipeline.layout.evaluation import parameter_points
-from pipeline.layout.vocabulary import ATTRACTS, grid_dim, letter, model_of, section_attributes, split_dims, told_by
+from pipeline.layout.vocabulary import ATTRACTS, letter, model_of, section_attributes, split_dims, told_by
 from pipeline.products.product import Table
+from pipeline.results.expressions import check_density, density_at, mean_over_cells, read_expression
 from pipeline.results.intervals import binomial_interval
 from pipeline.results.outcomes import DIVERGED, outcomes
 from pipeline.results.ragged import N_IDS, ROW_SIZE, SET, dims_of, rows_at
 from pipeline.results.run import OpenRun
-from pipeline.results.selection import listed, select_points
+from pipeline.results.selection import listed, select_points, start_states
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import (
     FEW_POINTS,
@@ -55,7 +54,6 @@ from pipeline.results.tabular import (
     values,
     with_interval,
 )
-from pipeline.specification.tables import FREQUENCY
 
 _ENDS = {-1: "-", DIVERGED: "diverges", -3: "elsewhere"}
 
@@ -84,9 +82,7 @@ def needs_sweep(run: OpenRun, options: ResilienceOptions) -> None:
     check_starts(cube)
     select_points(cube, options.at)
     _chosen(run, options)
-    states = _by_name(run, start_states(cube, split_dims(cube["status"])[1]))
-    for point in parameter_points(run.spec):
-        density_at(options.density, {"f": point[FREQUENCY], **point}, states)
+    check_density(run, options.density)
     _asked_quantity(run, options)
 
 
@@ -138,17 +134,6 @@ def resilience(run: OpenRun, options: ResilienceOptions) -> xr.Dataset:
             result.local(index, there)
             result.quantity(index, {**known, **by_name}, own, weights)
     return result.dataset()
-
-
-def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> np.ndarray:
-    """Return the initial states of the cells of a parameter point, shape (cell, state)."""
-    shape = tuple(cube.sizes[d] for d in starts)
-    columns = []
-    for name in cube["state"].values:
-        column = cube[grid_dim(str(name))]
-        own = xr.DataArray(np.ones(shape), dims=starts) * column.drop_vars(list(column.coords))
-        columns.append(own.transpose(*starts).values.ravel())
-    return np.column_stack(columns)
 
 
 def _nearest_seeds(there: Destinations, bases: Bases, states: np.ndarray, labels: np.ndarray, norm: Norm) -> Seeds:

@@ -22,7 +22,6 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import SECTION_BYTES, Dynamics, slabs
 from pipeline.analysis.basins.analysis import check_starts
-from pipeline.analysis.resilience.analysis import start_states
 from pipeline.analysis.resilience.declaration import EdgeOptions
 from pipeline.analysis.resilience.edge_tracking import REASONS, Pair, Tracking, nearest_pairs, orbits_on
 from pipeline.layout.conventions import code_flags
@@ -41,7 +40,7 @@ from pipeline.products.product import Table
 from pipeline.results.outcomes import outcomes
 from pipeline.results.ragged import padded
 from pipeline.results.run import OpenRun
-from pipeline.results.selection import select_points
+from pipeline.results.selection import select_points, start_states
 from pipeline.results.sets import Geometry
 from pipeline.results.tabular import Row, Words, aligned, counted, plain, words_of
 from pipeline.results.tolerances import SAME_EQUILIBRIUM

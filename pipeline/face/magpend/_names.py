@@ -63,7 +63,7 @@ class Figures:
     gallery = SeveralPanels(of_product.FigureOptions)
     regimes = AnyPanels(of_basins.RegimeOptions)
     basins = OnePanel(of_basins.BasinFigureOptions)
-    fractions = OnePanel(of_product.FigureOptions)
+    fractions = OnePanel(of_basins.FractionFigureOptions)
     resilience = SeveralPanels(of_resilience.ResilienceFigureOptions)
     edge = OnePanel(of_resilience.EdgeFigureOptions)
     transfer = SeveralPanels(of_transfer.TransferFigureOptions)

@@ -6,11 +6,13 @@ import itertools
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.stats import qmc
 
 from magpend_core import load_preset
 from magpend_core.models import load_model
@@ -20,6 +22,7 @@ from pipeline.layout.cells import CellMap, coordinates, initial_states
 from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.specification.spec import Spec
+from pipeline.specification.starts import starts_model
 
 ROOT = Path(__file__).parents[3]
 
@@ -195,3 +198,20 @@ def test_coordinates__fixed_frequency_and_single_cell():
     assert inputs.initial_states.tolist() == [[0.1, 0, 0, 0]]
     assert cells.outputs((), np.ones((1, 1, 3))).shape == (3,)
     assert {c.name: c.dims for c in coordinates(spec)}["frequency"] == ()
+
+
+@pytest.mark.parametrize("sampling", ["sobol", "latin-hypercube"])
+def test_samples__cover_the_box_more_evenly(sampling: str) -> None:
+    def samples(**more: Any) -> np.ndarray:
+        table = {"kind": "random", "n": 300, "x": [-1.0, 3.0], "v": [0.0, 2.0], **more}
+        starts = starts_model("random", load_model("duffing")).model_validate(table)
+        return initial_states(starts).at(np.arange(300))
+
+    found, plain = samples(sampling=sampling), samples()
+    box = [[-1.0, 0.0], [3.0, 2.0]]
+    even, independent = (qmc.discrepancy(qmc.scale(s, *box, reverse=True)) for s in (found, plain))
+    assert even < 0.3 * independent
+    np.testing.assert_array_equal(found, samples(sampling=sampling))
+    assert (found != samples(sampling=sampling, seed=1)).any()
+    if sampling == "latin-hypercube":  # one sample in each of 300 parts of each state
+        assert np.unique(np.floor(75.0 * (found[:, 0] + 1.0))).size == 300

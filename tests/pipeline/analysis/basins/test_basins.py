@@ -5,8 +5,10 @@ import pytest
 import xarray as xr
 from scipy.stats import binomtest
 
+import magpend
 from magpend_core.status import Status
 from pipeline.analysis.basins.analysis import basins_of, basins_table
+from pipeline.analysis.basins.boundaries import basin_entropy, scattered_entropy
 from pipeline.analysis.basins.numbers import basin_rows
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.results.ragged import dense
@@ -144,14 +146,98 @@ def test_basins__starts_that_are_no_regular_grid():
     found = basins_of(cube.assign_coords(psi1_0=uneven), ids.assign_coords(psi1_0=uneven))
     assert found.attrs["not_computed"] == "boundaries: psi1_0 is not evenly spaced"
     assert "basin_entropy" not in found
-    sample = [x.isel(psi2_0=0).rename(psi1_0="initial_condition") for x in (cube, ids)]
+    starts = {"psi1_0": ("initial_condition", np.arange(20.0)), "state": ["psi1"]}
+    sample = [x.isel(psi2_0=0).rename(psi1_0="initial_condition").assign_coords(starts) for x in (cube, ids)]
     found = basins_of(*sample)
-    assert found.attrs["not_computed"] == "boundaries: the starts are no grid"
+    assert found.attrs["not_computed"] == "uncertainty exponent and Wada test: the starts are no grid"
+    # four boxes of five cells, all of one basin
+    assert found["basin_entropy"].values.tolist() == [0.0]
+    assert "do not fill two boxes of 11" in basins_of(*sample, box=11).attrs["not_computed"]
     assert found["fraction"].dims == ("set",)
     found = basins_of(*labelled([halves(20, 8)]), box=21)
     assert "box (21, 21) is larger than the grid (20, 20)" in found.attrs["not_computed"]
     assert np.isnan(found["basin_entropy"]).all()
     assert np.isfinite(found["uncertainty_exponent"]).all()
+
+
+def test_basin_rows__weights_are_those_of_a_density():
+    """Basins [0, 1/2) and [1/2, 1] of starts with the density 2 x have the fractions 1/4 and 3/4."""
+    x = (np.arange(4000) + 0.5) / 4000
+    labels = xr.DataArray((x > 0.5).astype(int)[None], dims=("f", "start"))
+    labels[0, :100] = -1  # unfinished: a share of 1/1600
+    plain = basin_rows(labels, ("f",), xr.zeros_like(labels, bool), 0.95, "wilson")
+    rows = basin_rows(labels, ("f",), xr.zeros_like(labels, bool), 0.95, "wilson", (2.0 * x)[None])
+    np.testing.assert_allclose(rows["fraction"], [0.25 - 1 / 1600, 0.75], atol=1e-9)
+    np.testing.assert_allclose(rows["fraction_if_all"], [0.25, 0.75 + 1 / 1600], atol=1e-9)
+    np.testing.assert_allclose(rows["fraction_unfinished"], 1 / 1600, atol=1e-9)
+    # (int 2x)^2 / int 4x^2 = 3/4 of the cells count
+    np.testing.assert_allclose(rows["n_effective"], 3000.0, rtol=1e-6)
+    assert plain["n_effective"].values.tolist() == [4000.0]
+    assert rows["count"].values.tolist() == plain["count"].values.tolist() == [1900, 2000]
+    interval = binomtest(2250, 3000).proportion_ci(0.95, "wilson")
+    np.testing.assert_allclose([rows["low"][1], rows["high"][1]], [*interval], atol=1e-6)
+
+
+def test_scattered_entropy__of_a_straight_boundary():
+    """Of m boxes per side 1/m are crossed, at a place that is even in the box: their mean entropy is 1/2.
+
+    The integral of -u ln u - (1 - u) ln(1 - u) from 0 to 1.
+    """
+    rng = np.random.default_rng(5)
+    states = np.column_stack([rng.random((40_000, 2)), np.ones(40_000)])
+    places = np.linspace(0.3, 0.7, 17)
+    several = [scattered_entropy(states, (states[:, 0] > place).astype(int), 400) for place in places]
+    # the first placement has 10 columns of boxes, 15 others have 9, and the boundary crosses one column of each
+    assert [int(found["n_boxes"]) for found in several] == [100] * 17
+    entropy, boundary = (np.mean([float(found[name]) for found in several]) for name in ("entropy", "boundary_entropy"))
+    assert entropy == pytest.approx(16 * 0.5 / (10 + 15 * 9), rel=0.05)
+    assert boundary == pytest.approx(
+        0.5, rel=0.25
+    )  # a boundary at an edge of the first boxes is in two columns, or none
+    assert all(found["entropy_low"] < found["entropy"] < found["entropy_high"] for found in several)
+    # riddled basins: each box has both labels in even shares
+    mixed = scattered_entropy(states, rng.integers(0, 2, 40_000), 400)
+    np.testing.assert_allclose([mixed["entropy"], mixed["boundary_entropy"]], LN_2, rtol=0.01)
+    assert not mixed["above_ln2_surely"]
+    three = scattered_entropy(states, rng.integers(0, 3, 40_000), 400)
+    assert three["above_ln2_surely"]
+
+
+def test_scattered_entropy__agrees_with_that_of_a_grid():
+    def inside(x, y):
+        return (np.hypot(x - 0.5, y - 0.5) < 0.31).astype(int)
+
+    states = np.random.default_rng(7).random((40_000, 2))
+    cells = (np.arange(200) + 0.5) / 200
+    grid, scattered = basin_entropy(inside(*np.meshgrid(cells, cells))), scattered_entropy(states, inside(*states.T))
+    assert float(scattered["entropy"]) == pytest.approx(float(grid["entropy"]), rel=0.08)
+    assert float(scattered["boundary_entropy"]) == pytest.approx(float(grid["boundary_entropy"]), rel=0.08)
+
+
+@pytest.mark.slow
+def test_basins__of_a_density_and_even_samples(tmp_path):
+    """Of x -> tanh(2 x), the starts above 0 go up; the density exp(-a x) on [-1, 2] has closed integrals."""
+    spec = {
+        "kind": "sweep",
+        "model": {"name": "tanh", "kind": "map", "states": {"x": {}}, "parameters": {"a": 1.0}},
+        "axes": {"a": {"values": [0.5, 2.0]}},
+        "initial_conditions": {"kind": "random", "sampling": "sobol", "n": 2048, "x": [-1.0, 2.0]},
+        "integration": {"n_transient": 60, "n_keep": 4},
+    }
+    spec["model"]["equations"] = {"x": "tanh((2 + 0*a)*x)"}
+    run = magpend.run(spec, tmp_path / "run")
+    found = run.basins(density="exp(-a*x)").load()
+    rows = basins_table(found).rows
+    for a in (0.5, 2.0):
+        exact = (1.0 - np.exp(-2.0 * a)) / (np.exp(a) - np.exp(-2.0 * a))
+        own = sorted(row["fraction"] for row in rows if row["a"] == a)
+        assert own == pytest.approx(sorted([exact, 1.0 - exact]), abs=2e-3)
+    assert found["n_effective"].values.max() < 2048
+    assert np.isfinite(found["basin_entropy"].values).all()
+    figure = magpend.figure(run, "fractions", {"density": "exp(-a*x)"})
+    np.testing.assert_allclose(figure.data["fraction"].sum("outcome"), 1.0)
+    with pytest.raises(magpend.SpecError, match="must be 0 or greater"):
+        run.basins(density="x")
 
 
 @pytest.mark.parametrize(

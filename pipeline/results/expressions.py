@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from magpend_core.models.text.calls import Writing
 from magpend_core.models.text.grammar import GrammarError, Tree, names, parse, unknown
 from magpend_core.models.text.numeric import value_of
+from pipeline.layout.evaluation import parameter_points
+from pipeline.layout.vocabulary import frequency_of, parameters_of, split_dims
+from pipeline.results.run import OpenRun
+from pipeline.results.selection import start_states
+from pipeline.specification.tables import FREQUENCY
 
 CONSTANTS = ("pi", "f")
 """Names in every expression: pi, and the drive frequency [Hz]."""
@@ -45,6 +52,32 @@ def mean_over_cells(tree: Tree, known: Mapping[str, Any], weights: np.ndarray) -
         return float(value)
     counts = weights > 0.0
     return float(np.average(value[counts], weights=weights[counts])) if counts.any() else np.nan
+
+
+def check_density(run: OpenRun, text: str) -> None:
+    """Raise ValueError unless an expression is a density of a run's starts, at both ends of every axis."""
+    cube = run.cube()
+    columns = start_states(cube, split_dims(cube["status"])[1]).T
+    states = dict(zip(run.model.state_names, columns, strict=True))
+    for point in parameter_points(run.spec):
+        density_at(text, {"f": point[FREQUENCY], **point}, states)
+
+
+def weights_of(ds: xr.Dataset, dims: Sequence[str], starts: tuple[str, ...], text: str) -> np.ndarray:
+    """Return the density of the starts of cells as their weights, shape (parameter point, cell).
+
+    `ds` has the coordinates of a cube; its parameter points are those over `dims`.
+    """
+    base = parameters_of(ds)
+    states = dict(zip(base.model.state_names, start_states(ds, starts).T, strict=True))
+    fixed = {str(name): float(v) for name, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
+    points = itertools.product(*(ds[d].values.tolist() for d in dims))
+    found = []
+    for values in points:
+        here = {**fixed, **dict(zip(dims, values, strict=True))}
+        known = {**base, **{name: value for name, value in here.items() if name in base}}
+        found.append(density_at(text, {"f": frequency_of(base.model, here), **known}, states))
+    return np.array(found)
 
 
 def density_at(text: str, known: Mapping[str, Any], states: Mapping[str, np.ndarray]) -> np.ndarray:
