@@ -319,6 +319,11 @@ def _problems(spec: Spec, widening: Widening) -> list[str]:
             f"axis {states[0]}: the initial conditions are a {kind}, and a range widens only a grid; "
             "give a SPEC with the new starts."
         )
+    if widening.starts is not None and getattr(spec.initial_conditions, "sampling", None) == "latin-hypercube":
+        problems.append(
+            f"starts = {widening.starts}: more samples of a latin hypercube are all others; begin a new run, or take "
+            'sampling = "sobol", whose first samples stay.'
+        )
     if widening.starts is not None and not isinstance(spec.initial_conditions, RandomStarts):
         problems.append(
             f"starts = {widening.starts}: the initial conditions are a {kind}, not random samples; "

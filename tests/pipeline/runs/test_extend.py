@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from importlib import import_module
 
 import numpy as np
@@ -12,9 +13,12 @@ from magpend_core import Status, extension
 from pipeline import open_run
 from pipeline.compute import exponents, task
 from pipeline.compute.execute import TaskFailedError
+from pipeline.layout.cells import initial_states
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
+from pipeline.runs.zoom import Widening, widened
 from pipeline.specification.problems import SpecError
+from pipeline.specification.spec import Spec
 from pipeline.store.errors import RefusedError
 from pipeline.store.run import RunDirectory
 from tests.pipeline.factories import duffing, quietly, silent
@@ -336,3 +340,16 @@ def test_refined__integrated_cells_alone_are_taken(grown, tmp_path, old, new):
         assert cells == n_inferred
     else:
         assert cells < found.size - n_inferred
+
+
+def test_widened__samples_stay_but_those_of_a_hypercube():
+    def wider(**sampling: str) -> np.ndarray:
+        table = {"kind": "random", "n": 5, "x": [-1.0, 1.0], "v": [0.0, 1.0], **sampling}
+        spec = Spec.parse({**tomllib.loads(BASE), "initial_conditions": table})
+        few, more = (initial_states(s.initial_conditions) for s in (spec, widened(spec, Widening(starts=40))))
+        np.testing.assert_array_equal(few.at(np.arange(5)), more.at(np.arange(5)))
+        return more.at(np.arange(40))
+
+    assert wider().shape == wider(sampling="sobol").shape == (40, 2)
+    with pytest.raises(SpecError, match="more samples of a latin hypercube are all others"):
+        wider(sampling="latin-hypercube")
