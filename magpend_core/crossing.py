@@ -1,4 +1,4 @@
-"""Define the Poincare section of a system without a drive: the points where a state crosses a level."""
+"""Define the Poincare section of a system without a drive, where a state or an expression crosses a level."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIRECTIONS = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Crossing:
-    """A Poincare section of a system without forcing: the points where one state crosses a level.
+    """A Poincare section of a system without forcing: the points where a state or an expression crosses a level.
 
     A period is then the time from one crossing to the next, a *return*. Crossings are steps of the
     integration that end on the level (see `engine.events`, which says what can be missed). An angle crosses
@@ -28,11 +28,11 @@ class Crossing:
     Attributes
     ----------
     of : str
-        Name of a state.
+        Name of a state; of a model as text, also an expression of its states, parameters, parts and quantities.
     value : float
-        The level, in the state's unit.
+        The level, in the unit of `of`.
     direction : str
-        "up" for crossings at which the state rises, "down" where it falls.
+        "up" for crossings at which this rises, "down" where it falls.
     longest : float
         Longest wait for a return [s]; a cell that has none within it ends as ``NO_RETURN``.
 
@@ -66,7 +66,7 @@ class Crossing:
 
     @property
     def sentence(self) -> str:
-        """Description of the section in words: state, level and direction."""
+        """Description of the section in words: what crosses, level and direction."""
         return f"{self.of} = {self.value:g} going {self.direction}"
 
     def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:

@@ -1,10 +1,6 @@
 """Find periodic orbits by Newton's method on the stroboscopic or return map, with multipliers.
 
-The return map of a flow takes a point of a section by crossing to its next crossing. With the flow's
-monodromy matrix Phi over that time, its rates f at the image, and the normal n of the section, its derivative
-is (1 - f n^T/(n^T f)) Phi on the section (Parker & Chua, Practical Numerical Algorithms for Chaotic Systems,
-1989, Sect. D.2). The row and the column of the state that crosses are 0 here: so is one multiplier, which
-stands for the flow's own, 1 along the orbit.
+The return map of a flow takes a point of a section by crossing to its next crossing; `poincare` has its derivative.
 """
 
 from __future__ import annotations
@@ -19,9 +15,9 @@ from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.ordering import order_of_columns
+from magpend_core.poincare import section_of
 from magpend_core.pointwise import rates_packed
 from magpend_core.precision import limits_at
-from magpend_core.sizes import LEVEL
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
 
@@ -126,7 +122,7 @@ def section_map(
     frequency_hz
         Drive frequencies, shape (n,) [Hz]; with a section by level crossing, 1 over the longest time to wait.
     points
-        Shape (n, n_states); the state that defines the section is set to its level. Rows that are not finite give NaN.
+        Shape (n, n_states); they are moved onto the section, see `on_section`. Rows that are not finite give NaN.
     n_periods
         Number of drive periods or returns: one number, or one per row; the derivative is that of the row's last image.
     rtol
@@ -168,20 +164,17 @@ def section_map(
     images, status = states[:, :, :n], cells.status[back, 0]
     # tangent vector k, the derivative by state k, is a column
     derivatives = states[rows, periods - 1, n:].reshape(len(starts), n, n).transpose(0, 2, 1) / sizes
-    crossed = crossed_state(system)
-    if crossed is None:
+    section = section_of(system)
+    if section is None:
         return Returns(images, derivatives, np.repeat(1.0 / frequency[:, None], most, axis=1), status)
-    slopes = rates_packed(system, images[rows, periods - 1], packed, frequency)
-    return Returns(images, on_section_derivative(derivatives, slopes, crossed), cells.return_times[back, 0], status)
-
-
-def crossed_state(system: System) -> int | None:
-    """Return the index of the state whose crossings define the Poincare section; None for a driven system."""
-    return None if system.section is None else system.section[0]
+    last = images[rows, periods - 1]
+    slopes = rates_packed(system, last, packed, frequency)
+    derivatives = section.of_map(derivatives, slopes, section.normals(starts, packed), section.normals(last, packed))
+    return Returns(images, derivatives, cells.return_times[back, 0], status)
 
 
 def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np.ndarray:
-    """Move points onto the Poincare section: set the state that defines it to its level. Points of a driven system stay
+    """Move points onto the Poincare section along one state; see `Section.placed`. Points of a driven system stay
     unchanged.
 
     Parameters
@@ -193,32 +186,10 @@ def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np
     system
         Whose section it is.
     """
-    crossed = crossed_state(system)
-    moved = np.array(points, dtype=np.float64)
-    if crossed is not None:
-        moved[..., crossed] = np.asarray(parameters)[..., system.parameter_names.index(LEVEL)]
-        moved = wrap_angles(moved, system)
-    return moved
-
-
-def on_section_derivative(monodromy: np.ndarray, slopes: np.ndarray, crossed: int) -> np.ndarray:
-    """Return the derivative of the return map, from the flow's derivative over the same time.
-
-    Parameters
-    ----------
-    monodromy
-        Derivative of the flow, shape (n, n_states, n_states).
-    slopes
-        Rates at the images, shape (n, n_states).
-    crossed
-        Number of the state that crosses; its row and column of the result are 0.
-    """
-    share = monodromy[:, crossed, :] / slopes[:, crossed, None]
-    found = monodromy - slopes[:, :, None] * share[:, None, :]
-    found[:, crossed, :] = 0.0
-    found[:, :, crossed] = 0.0
-    found[~np.isfinite(slopes).all(axis=1)] = np.nan
-    return np.asarray(found)
+    section = section_of(system)
+    if section is None:
+        return np.array(points, dtype=np.float64)
+    return wrap_angles(section.placed(points, np.asarray(parameters)), system)
 
 
 def wrap_angles(states: np.ndarray, system: System) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magpend_core.engine.checks import check_system
+from magpend_core.engine.crossing import slopes_of
 from magpend_core.engine.events import event_bindings
 from magpend_core.engine.jacobians import places_of, whole_jacobian
 from magpend_core.engine.jit import bound_part, entry, keeping
@@ -38,6 +39,10 @@ def _named(t: Any, y: Any, c: Any) -> Any:
 
 def _surfaces(t: Any, y: Any, c: Any) -> Any:
     return event_values(t, y, rhs(y, forcing(t, c), c), c, 0.0 * t)
+
+
+def _section(t: Any, y: Any, c: Any) -> Any:
+    return section_slopes(t, y, c)
 
 
 def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
@@ -111,7 +116,14 @@ def _forced(t: Any, y: Any, c: Any) -> Any:
     return (0.0 * y[0] + forcing(t, c),)
 
 
-_KINDS = {"rates": _rates, "jacobian": _slopes, "quantities": _named, "forcing": _forced, "surfaces": _surfaces}
+_KINDS = {
+    "rates": _rates,
+    "jacobian": _slopes,
+    "quantities": _named,
+    "forcing": _forced,
+    "surfaces": _surfaces,
+    "section": _section,
+}
 
 
 @cache
@@ -130,6 +142,7 @@ def _evaluator(system: System, kind: str) -> Any:
         "rhs_jacobian": system.jacobian,
         "constants": system.constants,
         "quantities": system.quantities,
+        **({} if system.surface is None else {"section_slopes": slopes_of(system)}),
     }
     label = f"{system.label}_{kind}"
     bindings["_set_modes"] = bound_part(_set_modes, bindings, True)
@@ -266,6 +279,34 @@ def rates_packed(system: System, states: np.ndarray, packed: np.ndarray, frequen
     for i in np.flatnonzero(np.isfinite(states).all(axis=1)):
         row = np.ascontiguousarray(states[i : i + 1])
         evaluator(time, row, float(frequency_hz[i]), np.ascontiguousarray(packed[i]), found[i : i + 1])
+    return found
+
+
+def surface_packed(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
+    """Return the `surface` of a system at many states, each with its own parameters, and its derivatives by the states.
+    Nothing is checked.
+
+    Parameters
+    ----------
+    system
+        With a surface.
+    states
+        Shape (n, n_states); rows that are not finite give NaN.
+    packed
+        Parameters, shape (n, n_parameters), or (n_parameters,) of all.
+
+    Returns
+    -------
+    ndarray, (n, 1 + n_states)
+    """
+    packed = np.broadcast_to(packed, (len(states), np.shape(packed)[-1]))
+    found = np.full((len(states), 1 + system.n_states), np.nan)
+    rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+    if len(rows):
+        sets, which = np.unique(packed[rows], axis=0, return_inverse=True)
+        for k, one in enumerate(sets):
+            own = rows[which.ravel() == k]
+            found[own] = _flow_at("section", found.shape[1], system, states[own], one)
     return found
 
 

@@ -36,6 +36,8 @@ def declaration(system: System) -> Iterator[str]:
     for name, needed in (("switches", system.n_switches), ("impacts", system.n_impacts), ("reset", system.n_impacts)):
         if needed and getattr(system, name) is None:
             yield f"{name} is missing."
+    if system.section is not None and system.section[0] is None and system.surface is None:
+        yield "surface is missing; the section is of no state."
     for direction in system.impact_directions:
         if direction not in (1, -1):
             yield f"impact_directions: {direction} must be 1 (rising) or -1 (falling)."
@@ -56,7 +58,8 @@ def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.n
 def motion_problems(motion: Any, rates: np.ndarray) -> None:
     """Check the event functions and impact maps at the samples of `checks._Motion`, and append the problems."""
     system, functions = motion.system, motion.functions
-    for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts)):
+    surfaces = int(system.surface is not None)
+    for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts), ("surface", surfaces)):
         if n:
             _check_pairs(motion, name, n, rates)
     for k in range(system.n_impacts + system.n_contacts):

@@ -12,8 +12,9 @@ at the ends allow this, the next attempt ends at the minimum of the cubic. But a
 the states: a ball flies along a parabola, which a step of any length follows, above a table that shakes. So the
 value in the middle of an attempt is compared with the cubic there. Where the difference is so large that two
 zeros may be hidden, the attempt is repeated with half the step. The check misses two zeros only if the
-excursion beyond zero is shorter than a step and does not include the step's middle. A step turns the angle of a
-section by half a turn at most, whatever length the error control allows.
+excursion beyond zero is shorter than a step and does not include the step's middle. A section at a level of a state
+needs no such check, since the states follow their cubics; one at a level of an expression has it. A step turns the
+angle of a section by half a turn at most, whatever length the error control allows.
 
 Each event function has a stored sign, its *side*: +1 or -1 as of the last step, reversed where a step ends
 beyond zero. Right after an event the side, not the computed value (which is zero up to rounding), says where
@@ -82,7 +83,10 @@ def _events_of(system: System) -> Callable[..., Any]:
             parts += [f"{name}[{k}][{j}]" for k in range(n) for j in range(2)]
     if system.section is not None:
         i = system.section[0]
-        if system.is_angle[i]:
+        if i is None:
+            lines.append("surface = _surface(t, y, dy, c)")
+            parts += ["surface[0][0] - level", "surface[0][1]"]
+        elif system.is_angle[i]:
             # the sine has a second zero half a turn away; `section_counts` excludes it
             lines.append(f"s, k = sincos(y[{i}] - level)")
             parts += ["s", f"k * dy[{i}]"]
@@ -93,6 +97,7 @@ def _events_of(system: System) -> Callable[..., Any]:
         "__name__": system.rhs.__module__,
         "_switches": system.switches,
         "_impacts": system.impacts,
+        "_surface": system.surface,
         "sincos": sincos,
     }
     exec("\n    ".join(lines), scope)
@@ -111,17 +116,18 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 def event_bindings(system: System) -> dict[str, Any]:
     """Return the values of this module's free global names (such as ``N_EVENTS``) for a system."""
-    of, direction = system.section or (0, 0)
+    of, direction = system.section or (None, 0)
+    turns = of is not None and system.is_angle[of]
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
     same = [0.0] * (system.n_switches + system.n_impacts)
     if system.section is not None:
         directions, starts = [*directions, float(direction)], [*starts, float(direction)]
-        same = [*same, SAME * (1.0 if system.is_angle[of] else system.units[of])]
+        same = [*same, SAME * (system.surface_unit if of is None else 1.0 if turns else system.units[of])]
     return {
         "HAS_EVENTS": system.n_events > 0,
         "HAS_SECTION": system.section is not None,
-        "SECTION_OF": of,
+        "SECTION_OF": of or 0,
         "N_EVENTS": system.n_events,
         "N_SWITCHES": system.n_switches,
         "N_IMPACTS": system.n_impacts,
@@ -130,8 +136,9 @@ def event_bindings(system: System) -> dict[str, Any]:
         "SAME_VALUE": np.array(same),
         "event_values": _events_of(system),
         "middle_of": _middle_of(system.known),
-        "HAS_SURFACES": system.n_switches + system.n_impacts > 0,
-        "SECTION_TURNS": system.section is not None and system.is_angle[of],
+        "N_SURFACES": system.n_surfaces,
+        "HAS_SURFACES": system.n_surfaces > 0,
+        "SECTION_TURNS": turns,
     }
 
 
@@ -213,7 +220,7 @@ def hides_events(w: Any, base: int) -> Any:
     store_rows(w, base + ROWS.halfway_events, middle)
     store_rows(w, base + ROWS.found, event_values(t + h, y1, dy1, c, level))
     hides = 0.0 * h
-    for k in range(N_SWITCHES + N_IMPACTS):
+    for k in range(N_SURFACES):
         known, found = pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k)
         a, da, b, db = margin(w, base, k, known, found)
         da, db = h * da, h * db
@@ -345,7 +352,7 @@ def section_counts(w: Any, base: int, lane: int) -> bool:
     """
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False
-    if not IS_ANGLE[SECTION_OF]:
+    if not SECTION_TURNS:
         return True
     x = w[base + ROWS.state + SECTION_OF * WIDTH + lane]
     return cos(x - w[base + ROWS.level + lane]) > 0.0

@@ -149,6 +149,7 @@ _SIZES = frozenset(
         "N_EVENTS",
         "N_SWITCHES",
         "N_IMPACTS",
+        "N_SURFACES",
         "N_ENTRIES",
         "N_VECTORS",
         "SECTION_OF",

@@ -154,7 +154,7 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
         system.n_states if n_watched else 0,
         *[n_watched] * 6,
         *[2 * n] * 3,
-        2 * n if system.n_switches + system.n_impacts else 0,
+        2 * n if system.n_surfaces else 0,
         *[n] * 3,
         *[1 if n else 0] * 4,
         (system.tableau.n_stages - 1) * n_entries(system),

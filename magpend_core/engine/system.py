@@ -159,9 +159,15 @@ class System:
         ``reset(k, t, y, c)``: the states after impact number `k` as a tuple, from the states before. Runs on plain
         numbers, so that ``if k == 0`` is allowed. If impact `i` sticks, ``k = n_impacts + i`` must return the states
         moved to rest on its surface.
-    section : (int, int) or None
-        Index of the state that defines the Poincare section, and the direction of its crossing, +1 rising or -1
-        falling; a period ends there. The level is the last parameter. See `crossing.with_section`.
+    section : (int or None, int) or None
+        Index of the state that defines the Poincare section, None if that is `surface`, and the direction of its
+        crossing, +1 rising or -1 falling; a period ends there. The level is the last parameter. See
+        `crossing.with_section`.
+    surface : callable or None
+        ``surface(t, y, dy, c)``: a tuple of one pair ``(value, rate)``, as for `switches`: the function of the states
+        that crosses the level of the Poincare section, where that is no state. It has the period 2 pi in each angle.
+    surface_unit : float
+        Typical change of this function as the states change by their `units`.
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.
@@ -237,7 +243,9 @@ class System:
     impact_directions: tuple[int, ...] = ()
     sticks: tuple[int, ...] = ()
     reset: Callable[..., Any] | None = None
-    section: tuple[int, int] | None = None
+    section: tuple[int | None, int] | None = None
+    surface: Callable[..., Any] | None = None
+    surface_unit: float = 1.0
     quantity_names: tuple[str, ...] = ()
     quantities: Callable[..., Any] | None = None
     is_map: bool = False
@@ -291,7 +299,7 @@ class System:
     def functions(self) -> tuple[Callable[..., Any], ...]:
         """All compiled functions of the system, as a tuple."""
         always = self.constants, self.forcing, self.rhs, self.edges, self.layers
-        others = self.jacobian, self.quantities, self.switches, self.impacts, self.reset
+        others = self.jacobian, self.quantities, self.switches, self.impacts, self.reset, self.surface
         return (*always, *(f for f in others if f is not None))
 
     @property
@@ -347,6 +355,14 @@ class System:
     def n_events(self) -> int:
         """Number of event functions; steps end at their zeros."""
         return self.n_switches + self.n_impacts + (self.section is not None)
+
+    @property
+    def n_surfaces(self) -> int:
+        """Number of event functions that do not follow the cubics of the states: those of switches, impacts, and a
+        section at a level of the `surface`.
+        """
+        is_expression = self.section is not None and self.section[0] is None
+        return self.n_switches + self.n_impacts + is_expression
 
     @property
     def n_contacts(self) -> int:

@@ -107,7 +107,7 @@ def _section(model: Assembled, definition: Definition, axis: str, span: tuple[fl
     source, settings = model.source, model.source.settings
     motions = _trials(model, definition, axis, span)
     state = settings.get("poivar", "")
-    if settings.get("poimap", "")[:1] == "s" and state in source.states:
+    if settings.get("poimap", "")[:1] == "s" and state in (*source.states, *source.quantities):
         sign = constant_setting(source, "poisgn", 1.0)
         level = constant_setting(source, "poipln", 0.0)
         found = {"of": model.names[state], "value": level, "direction": "down" if sign < 0 else "up"}

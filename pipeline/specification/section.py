@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from magpend_core.crossing import Crossing
-from magpend_core.models.parameters import near_names
+from magpend_core.models.parameters import ParameterError
 from magpend_core.models.sectioned import sectioned
 from magpend_core.sizes import LEVEL
 from pipeline.specification.tables import FREQUENCY, Table
@@ -20,13 +20,16 @@ if TYPE_CHECKING:
 
 
 class SectionTable(Table):
-    """The table ``[section]``: the level crossing of a state that defines the Poincare section of a flow without a
-    drive.
+    """The table ``[section]``: the level crossing of a state or an expression that defines the Poincare section of a
+    flow without a drive.
     """
 
-    of: str = Field(min_length=1, description="State that crosses the level.")
-    value: float = Field(default=0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
-    direction: Literal["up", "down"] = Field(default="up", description="Whether the state rises or falls there.")
+    of: str = Field(
+        min_length=1,
+        description="What crosses the level: a state, a quantity, or an expression of the states such as `x + y - 1`.",
+    )
+    value: float = Field(default=0.0, description="Level, in the unit of `of`; for an angle, modulo 2 pi.")
+    direction: Literal["up", "down"] = Field(default="up", description="Whether `of` rises or falls there.")
     longest: float = Field(
         default=100.0, gt=0, description="Longest time between crossings [s]; a cell that takes longer does not return."
     )
@@ -89,14 +92,10 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
             f"section: {model.name} has a parameter named {LEVEL}, which is the name of the level; rename it."
         )
         return None
-    if table.of not in model.state_names:
-        hint = near_names(table.of, model.state_names, "states")
-        if not table.of.isidentifier():
-            hint = (
-                "a section is a level of one state. Make the expression a state in place of one in it: for s = x + y, "
-                'define = { x = "s - y" }, as the rate of s the sum of both rates, and of = "s".'
-            )
-        problems.append(f"section.of = {table.of!r}: is not a state of {model.name}; {hint}")
+    try:
+        sectioned(model, table.crossing)
+    except ParameterError as error:
+        problems += error.problems
         return None
     return table
 

@@ -67,6 +67,8 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         impact_directions=tuple(i.direction for i in derived.impacts),
         sticks=derived.sticks,
         reset=functions["reset"] if n_impacts else None,
+        surface=functions["surface"] if derived.surface else None,
+        surface_unit=definition.surface_unit,
         quantity_names=tuple(definition.quantities),
         quantities=functions["quantities"] if definition.quantities else None,
     )

@@ -78,6 +78,8 @@ class Definition:
         The line of the text of each definition, function and state.
     is_map : bool
         Whether the equations give the next state, and not the rate of the state.
+    surface, surface_unit
+        Expression whose level is the Poincare section, if that is of no state, and its unit; see `System`.
     """
 
     name: str
@@ -98,6 +100,8 @@ class Definition:
     table: Mapping[str, Any] = field(repr=False)
     lines: Mapping[str, Line] = field(repr=False)
     is_map: bool = False
+    surface: Tree | None = None
+    surface_unit: float = 1.0
 
     def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
         """Return all names that expressions use, directly or through definitions, each after the names that

@@ -73,6 +73,8 @@ class Derived:
         See `System.sticks`.
     missed : tuple of str
         Steep places on which steps do not end and which limit none, for people.
+    surface : tuple of Node
+        Value and rate of the function whose level is the Poincare section; empty for none.
     """
 
     graph: Graph
@@ -88,6 +90,7 @@ class Derived:
     impacts: tuple[Jump, ...]
     sticks: tuple[int, ...]
     missed: tuple[str, ...]
+    surface: tuple[Node, ...] = ()
 
     @property
     def timed_layers(self) -> bool:
@@ -146,6 +149,7 @@ def derive(definition: Definition) -> Derived:
         tuple(jumps),
         sticks,
         (*(f"{form} beside a jump in time" for form in late), *(["square"] * len(sides.left))),
+        _surface(builder, sides, sliding),
     )
 
 
@@ -234,6 +238,14 @@ def _jump(builder: Builder, sides: Sides, sliding: Sliding, k: int) -> Jump:
     new = dict(zip(impact.set, changed, strict=True))
     states = [new.get(s.name, graph.leaf("state", i)) for i, s in enumerate(builder.definition.states)]
     return Jump(value, rate, impact.direction, tuple(states))
+
+
+def _surface(builder: Builder, sides: Sides, sliding: Sliding) -> tuple[Node, ...]:
+    tree = builder.definition.surface
+    if tree is None:
+        return ()
+    (value,) = sliding.lowered(sides.rewritten([builder.node(tree)], more=False))
+    return value, *along(builder.graph, (value,))
 
 
 DRIVE = "drive"

@@ -228,7 +228,7 @@ def source_of(derived: Derived) -> Source:
     impacts = [node for jump in derived.impacts for node in (jump.value, jump.rate)]
     resets = [node for jump in derived.impacts for node in (*jump.states, *jump.at_rest)]
     roots = (*derived.rates, *derived.jacobian, *derived.quantities, *forcing, *layers, *switches, *impacts, *resets)
-    constants = constants_of(roots)
+    constants = constants_of((*roots, *derived.surface))
     n_contacts = len(derived.sticks) if any(derived.sticks) else 0
     n_constants = max(1, len(constants))
     n_modes = len(derived.switches) + n_contacts + bool(derived.instants)
@@ -250,6 +250,8 @@ def source_of(derived: Derived) -> Source:
         _tuple("impacts", "t, y, dy, c", impacts, timed, 2),
         _reset(derived, timed),
     ]
+    if derived.surface:
+        parts.append(_tuple("surface", "t, y, dy, c", derived.surface, timed, 2))
     return Source("\n\n".join(parts) + "\n", n_constants, n_modes, derived.n_edges, entries)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from magpend_core.orbits import crossed_state, orbit_exponents
+from magpend_core.orbits import orbit_exponents
 from pipeline.analysis.attractors import features as feature
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
@@ -174,7 +174,7 @@ def _preserve_volume(slab: Slab, search: Search) -> np.ndarray:
         finite = np.isfinite(derivatives).all(axis=(1, 2))
         keeps[owner[rows[~finite]]] = False
         by_point = rows_by_number(np.where(finite, owner[rows], -1))
-        if crossed_state(search.dynamics.integrates) is None:  # without the rates at the points' parameters
+        if search.dynamics.integrates.section is None:  # without the rates at the points' parameters
             by_point = {0: np.flatnonzero(finite)}
         for k, own in by_point.items():
             volumes = points[k].volumes(derivatives[own], states[rows[own]], after[own])

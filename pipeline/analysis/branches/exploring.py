@@ -3,8 +3,8 @@
 At a pitchfork one branch passes straight through and the other turns back, so that its two arms lie on one side.
 The point belongs to the first.
 
-The section of the cycles that start at a Hopf point is the level of the crossing state there, so that small cycles
-cross it. The first cycle has a given amplitude along the critical eigenvector; Newton's method finds its parameter
+The section of the cycles that start at a Hopf point has the level of this point, so that small cycles cross it. The
+first cycle has a given amplitude along the critical eigenvector; Newton's method finds its parameter
 value. Larger cycles often cross the section of the run as well.
 """
 
@@ -16,7 +16,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from magpend_core.orbits import crossed_state, section_map
+from magpend_core.orbits import section_map
+from magpend_core.poincare import Section, section_of
 from magpend_core.precision import limits_at
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Point, Settings, correct
@@ -347,15 +348,16 @@ def cycle_family(equilibria: Family, at: Point, omega: float | None = None) -> F
 
     The cycles have the angular frequency `omega` [rad/s], by default that of the pair nearest to the imaginary axis.
 
-    There is none if the system has no section by crossing, or if the crossing state does not oscillate.
+    There is none if the system has no section by crossing, or if what crosses its level does not oscillate.
     """
-    same = 1e-9  # two sections this close are one [scales of the state that crosses]
-    crossed = crossed_state(equilibria.system)
-    if crossed is None or cycle_direction(equilibria, at, omega) is None:
+    same = 1e-9  # two sections this close are one [scales of the states]
+    section = section_of(equilibria.system)
+    if section is None or cycle_direction(equilibria, at, omega) is None:
         return None
-    level = equilibria.parameters.copy()
-    at_rest = float(at.value.images[0, crossed])
-    if abs(at_rest - level[-1]) > same * equilibria.system.scales[crossed]:
+    state, level = at.value.images[:1], equilibria.parameters.copy()
+    packed = equilibria.rows(at.u[None]).parameters
+    at_rest = float(section.values(state, packed)[0])
+    if abs(at_rest - level[-1]) > same * section.scaled_normals(state, packed)[1][0]:
         level[-1] = at_rest
     for name, value in zip(equilibria.free, equilibria.values(at.u), strict=True):
         level[equilibria.system.parameter_names.index(name)] = value
@@ -379,19 +381,20 @@ def cycle_direction(family: Family, at: Point, omega: float | None = None) -> np
     """Return the scaled direction from an equilibrium to the point where small limit cycles cross the section; None if
     they do not cross it. See `cycle_family` for `omega`.
 
-    It is the real part of the critical eigenvector at the phase at which the crossing state passes its level in
-    the section's direction; its largest component is 1.
+    It is the real part of the critical eigenvector at the phase at which it passes the section in its direction; its
+    largest component is 1.
     """
-    assert family.system.section is not None
-    crossed, sign = family.system.section
+    section = Section(family.system)
+    (normal,), _ = section.scaled_normals(at.value.images[:1], family.rows(at.u[None]).parameters)
     values, vectors = np.linalg.eig(family.scaled(at.value.monodromy))
     away = np.abs(values.real) if omega is None else np.abs(values - 1j * omega)
     vector = vectors[:, int(np.argmin(away + 1e300 * (values.imag <= 0.0)))]
-    if abs(vector[crossed]) < 1e-6 * np.abs(vector).max():
+    across = normal @ vector
+    if abs(across) < 1e-6 * np.abs(vector).max():
         return None
-    turned = vector * np.exp(-1j * (sign * np.pi / 2.0 + np.angle(vector[crossed])))
+    turned = vector * np.exp(-1j * (section.sign * np.pi / 2.0 + np.angle(across)))
     found = np.asarray(turned.real)
-    found[crossed] = 0.0
+    found -= (normal @ found) * normal
     largest = np.abs(found).max()
     return found / largest if largest > 1e-9 * np.abs(vector).max() else None
 

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from magpend_core.orbits import crossed_state
+from magpend_core.poincare import section_of
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstable, settle_sides
@@ -136,18 +136,19 @@ def end_of_crossings(family: Family, point: Point) -> str:
     """Return why a limit cycle cannot be followed on its Poincare section: ``tangent`` or ``equilibrium``; empty if it
     can be.
     """
-    # crossing speed times the period below which the branch ends [scales of the state that crosses]; there the cycle
-    # has shrunk to an equilibrium if this product is below `rest` for all states
+    # crossing speed times the period below which the branch ends [scales of the states]; there the cycle has shrunk to
+    # an equilibrium if this product is below `rest` for all states
     touching, rest = 0.01, 0.5
-    crossed = crossed_state(family.system)
-    if crossed is None:
+    section = section_of(family.system)
+    if section is None:
         return ""
     rows = family.rows(point.u[None])
     rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)[0]
-    reach = np.abs(rates) * point.value.seconds / np.asarray(family.system.scales)
-    if reach[crossed] >= touching:
+    reach = rates * point.value.seconds / np.asarray(family.system.scales)
+    (normal,), _ = section.scaled_normals(rows.states, rows.parameters)
+    if abs(normal @ reach) >= touching:
         return ""
-    return "equilibrium" if reach.max() < rest else "tangent"
+    return "equilibrium" if np.abs(reach).max() < rest else "tangent"
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from magpend_core.equilibria import find_equilibria
-from magpend_core.orbits import crossed_state, scaled_distance, wrap_angles
+from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
@@ -81,7 +81,7 @@ def settle_limits(branches: Sequence[Branch]) -> None:
 
 def has_cycles(branch: Branch) -> bool:
     """Return whether the orbits of a branch are limit cycles of a flow."""
-    return bool(branch.family.period) and crossed_state(branch.family.system) is not None
+    return bool(branch.family.period) and branch.family.system.section is not None
 
 
 def limit_of(branch: Branch, points: Sequence[Point], settings: LimitSettings = LimitSettings()) -> Limit | str:

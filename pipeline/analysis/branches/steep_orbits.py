@@ -22,11 +22,11 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
-from magpend_core.orbits import crossed_state, on_section_derivative, wrap_angles
+from magpend_core.orbits import wrap_angles
+from magpend_core.poincare import Section
 from magpend_core.pointwise import rates_packed
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
-from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.arclength import Point, Settings, correct, kernel_of
 from pipeline.analysis.branches.lockstep import Query, Steps, integrated
 from pipeline.analysis.branches.problems import ONE_SIDED_STEP, Ends, Family, Rows, Value
@@ -50,7 +50,7 @@ class CutSettings:
 
 def is_steep(point: Point, family: Family, cuts: CutSettings = CutSettings()) -> bool:
     """Return whether a limit cycle of a flow is too steep for shooting over its whole period."""
-    if not family.period or crossed_state(family.system) is None:
+    if not family.period or family.system.section is None:
         return False
     return bool(np.linalg.norm(family.scaled(point.value.monodromy), 2) > cuts.steep)
 
@@ -214,11 +214,12 @@ class CutProblem:
         by = self._by_unknowns(scaled, slopes, rates[m:])
         gaps = self._wrapped(images[:m] / scales - np.roll(nodes, -1, axis=0)).ravel()
         heights, by_heights = self._heights(nodes, rows.parameters[[0, m]])
+        monodromy = self._monodromy(scaled, rates[0] * scales, rows.states[0], rows.parameters[0])
         return CutValue(
             self._weight * np.concatenate([gaps, heights]),
             self._weight * np.concatenate([by, by_heights]),
             self._sections(nodes),
-            self._monodromy(scaled, rates[0] * scales),
+            monodromy,
             float(seconds.sum()),
             nodes=nodes,
             tangents=scaled,
@@ -240,30 +241,35 @@ class CutProblem:
 
     def _heights(self, nodes: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances of the returns from the section, with their derivatives."""
-        crossed, n = crossed_state(self.system), self.system.n_states
-        assert crossed is not None
-        scale, weight = self.system.scales[crossed], self._weight
-        levels = packed[:, self.system.parameter_names.index(LEVEL)] / scale
+        section, n, scales = Section(self.system), self.system.n_states, np.asarray(self.system.scales)
         firsts = np.searchsorted(self.returns, np.arange(self.family.period))
-        away = np.zeros((len(firsts), n))
-        away[:, crossed] = nodes[firsts, crossed] - levels[0]
+        states = nodes[firsts] * scales
+        normals, lengths = section.scaled_normals(states, packed[0])
         by = np.zeros((len(firsts), self.size))
-        by[np.arange(len(firsts)), firsts * n + crossed] = 1.0 / weight
+        for k, first in enumerate(firsts):
+            by[k, n * first : n * (first + 1)] = normals[k] / self._weight
+        if section.state is None:
+            here, beside = (section.values(states, one) - section.levels(one) for one in packed)
+            by[:, -1] = (beside - here) / lengths / ONE_SIDED_STEP
+            return here / lengths, by
+        levels = section.levels(packed) / lengths[0]
+        away = np.zeros((len(firsts), n))
+        away[:, section.state] = nodes[firsts, section.state] - levels[0]
         by[:, -1] = (levels[0] - levels[1]) / ONE_SIDED_STEP
-        return self._wrapped(away)[:, crossed], by
+        return self._wrapped(away)[:, section.state], by
 
     def _sections(self, nodes: np.ndarray) -> np.ndarray:
         firsts = np.searchsorted(self.returns, np.arange(self.family.period))
         return wrap_angles(np.roll(nodes[firsts], -1, axis=0) * np.asarray(self.system.scales), self.system)
 
-    def _monodromy(self, tangents: np.ndarray, rates: np.ndarray) -> np.ndarray:
-        """Return the derivative of the return map, from the segments' derivatives and the rates at the section."""
+    def _monodromy(self, tangents: np.ndarray, rates: np.ndarray, state: np.ndarray, packed: np.ndarray) -> np.ndarray:
+        """Return the derivative of the return map, from the segments' derivatives and the rates at a section point."""
         scales, product = np.asarray(self.system.scales), np.eye(self.system.n_states)
         for one in tangents:
             product = one @ product
-        crossed = crossed_state(self.system)
-        assert crossed is not None
-        return np.asarray(on_section_derivative((product * scales[:, None] / scales)[None], rates[None], crossed)[0])
+        section = Section(self.system)
+        normals = section.normals(state[None], packed)
+        return section.of_map((product * scales[:, None] / scales)[None], rates[None], normals, normals)[0]
 
     def _wrapped(self, difference: np.ndarray) -> np.ndarray:
         scales = np.asarray(self.system.scales)
@@ -285,19 +291,39 @@ class CutProblem:
         """Return a point in the unknowns of `OrbitProblem`: the section point and the parameter."""
         n, value = self.system.n_states, point.value
         assert isinstance(value, CutValue)
-        crossed = crossed_state(self.system)
         found = [np.append(nodes[0], at) for nodes, _, at in (self.parts(point.u), self.parts(point.tangent))]
         by = np.eye(n, n + 1)
         for tangent, slope in zip(value.tangents, value.slopes, strict=True):
             by = tangent @ by
             by[:, -1] += slope
-        by = by - np.outer(value.speeds[0], by[crossed] / value.speeds[0, crossed])
-        by[crossed], by[:, crossed] = 0.0, 0.0
+        by = self._of_map(by, value.speeds[0], found[0])
         gaps = np.abs(value.residual[: len(self.shares) * n] / self._weight).reshape(-1, n).max(axis=0)
         whole = Value(
             gaps, by - np.eye(n, n + 1), value.images, value.monodromy, value.seconds, graded=value.multipliers
         )
         return Point(found[0], found[1] / np.linalg.norm(found[1]), whole, point.n_iterations)
+
+    def _of_map(self, by: np.ndarray, speed: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the scaled derivative of the return map by the section point and the parameter, from that of the flow
+        over the orbit's period.
+        """
+        section, scales = Section(self.system), np.asarray(self.system.scales)
+        if (crossed := section.state) is not None:
+            by = by - np.outer(speed, by[crossed] / speed[crossed])
+            by[crossed], by[:, crossed] = 0.0, 0.0
+            return by
+        rows = self.family.rows(np.stack([u, u + ONE_SIDED_STEP * np.eye(len(u))[-1]]))
+        normals, here = section.normals(rows.states[:1], rows.parameters[:1]), rows.states[[0, 0]]
+        column, across = int(section.moved_state(normals)[0]), np.append(normals[0] * scales, 0.0)
+        # the parameter moves the section as well
+        across[-1] = (
+            np.diff(section.values(here, rows.parameters) - section.levels(rows.parameters))[0] / ONE_SIDED_STEP
+        )
+        by = by - np.outer(by[:, column], across / across[column])
+        by[:, column] = 0.0
+        crossing = across[:-1] @ by
+        crossing[-1] += across[-1]
+        return by - np.outer(speed, crossing / (across[:-1] @ speed))
 
 
 def whole_orbit(family: Family, point: Point) -> tuple[CutProblem, np.ndarray]:

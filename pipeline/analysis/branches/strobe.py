@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from magpend_core.engine.system import System
-from magpend_core.orbits import crossed_state, scaled_distance, wrap_angles
+from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.results.tolerances import BRANCH_RTOL
@@ -43,7 +43,7 @@ def other_side(
     shares = (1e-5, 1e-4, 1e-3, 1e-2)
     # least scaled jump that is an impact, and the largest error of the extrapolated state in units of the jump
     least_jump, unsure = 1e-4, 0.1
-    if not system.n_impacts or crossed_state(system) is not None:
+    if not system.n_impacts or system.section is not None:
         return None
     drive = Drive(np.full(period, 1.0 / frequency_hz))
     for share in shares:

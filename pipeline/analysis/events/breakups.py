@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.placeholders import no_forcing
-from magpend_core.orbits import crossed_state, section_map
+from magpend_core.orbits import section_map
 from pipeline.analysis.attractors.extension.growth import growth_of, kind_of
 from pipeline.analysis.events.contact import SectionMap, map_along
 from pipeline.analysis.events.kinds import BREAKUP, UNDECIDED
@@ -157,7 +157,7 @@ def _kind(along: SectionMap, value: float, path: np.ndarray) -> _Found:
         return _Found(BOUNDED_SET, np.nan)
     system, rows = along.family.system, along.rows(value, path[:-1])
     ends = section_map(rows.parameters, rows.frequency_hz, rows.states, 1, rtol=along.rtol, system=system)
-    is_at_even_times = system.forcing is no_forcing and not system.is_map and crossed_state(system) is None
+    is_at_even_times = system.forcing is no_forcing and not system.is_map and system.section is None
     slopes = along.family.scaled(ends.derivatives)
     growth = growth_of(slopes[None], int(is_at_even_times), np.zeros((1, len(slopes))))
     kind = LOCKED if growth.contracts else kind_of(growth, path[::2], along.geometry)

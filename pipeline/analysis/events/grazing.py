@@ -17,7 +17,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import surfaces_at
 from magpend_core.precision import tolerances_at
 from magpend_core.sampling import Drive, sample
@@ -127,7 +126,7 @@ def _heights(family: Family, point: Point, times: np.ndarray) -> tuple[np.ndarra
     """Return the functions of all surfaces and their rates at some instants of an orbit, shape (n, surface)."""
     system, rows, seconds = family.system, family.rows(point.u[None]), point.value.seconds
     frequency, packed = float(rows.frequency_hz[0]), rows.parameters
-    is_flow = crossed_state(system) is not None
+    is_flow = system.section is not None
     drive = Drive(np.array([seconds]) if is_flow else np.full(family.period, 1.0 / frequency))
     orbit = sample(system, packed, rows.states, [times], drives=[drive], **tolerances_at(BRANCH_RTOL))
     return surfaces_at(system, np.mod(times, 1.0 / frequency), orbit.states[0], packed[0], frequency)

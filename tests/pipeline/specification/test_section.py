@@ -43,6 +43,17 @@ def test_parse_spec__section():
     assert default.model_dump() == {"of": "x", "value": 0.0, "direction": "up", "longest": 100.0}
 
 
+def test_parse_spec__section_of_an_expression():
+    spec = Spec.parse({**SPEC, "section": {"of": "x + mu*v - 1", "longest": 50.0}})
+    assert spec.model.crossing.sentence == "x + mu*v - 1 = 0 going up"
+    assert spec.values.as_dict() == {"mu": 1.0, "section_value": 0.0}
+    again = Spec.parse(spec.as_dict())
+    assert again == spec
+    assert again.model is spec.model
+    assert pickle.loads(pickle.dumps(spec.values)) == spec.values
+    assert spec.model.system.surface is not None
+
+
 def test_cells__no_frequency():
     """The cube has no drive, the engine gets the longest wait and the level."""
     spec = Spec.parse(SPEC)
@@ -90,12 +101,9 @@ FREQUENCY = "a section by crossing needs no frequency; drop one of the two."
     ("changes", "text"),
     [
         ({"section": {"of": "w"}}, "section.of = 'w': is not a state of van_der_pol; known states: x, v."),
-        (
-            {"section": {"of": "x + v"}},
-            "section.of = 'x + v': is not a state of van_der_pol; a section is a level of one state. Make the "
-            'expression a state in place of one in it: for s = x + y, define = { x = "s - y" }, as the rate of s the '
-            'sum of both rates, and of = "s".',
-        ),
+        ({"section": {"of": "x + w"}}, "section.of: \"x + w\": unknown name 'w' at character 5; known names: x, v"),
+        ({"section": {"of": "2*mu"}}, "section.of = '2*mu': names no state of van_der_pol, so nothing crosses"),
+        ({"section": {"of": "x + 0*v - x"}}, "section.of = 'x + 0*v - x': is the same at all states"),
         ({"section": {"of": "x", "direction": "left"}}, "section.direction = 'left': must be 'up' or 'down'."),
         ({"section": {"of": "x", "longest": 0.0}}, "section.longest = 0.0: must be greater than 0.0."),
         ({"section": {"value": 0.0}}, "section.of: missing"),

@@ -16,7 +16,7 @@ always 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -217,7 +217,7 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 
 
 def volumes_of(
-    derivatives: np.ndarray, before: np.ndarray, after: np.ndarray, crossed: int | None, flow: Rates
+    derivatives: np.ndarray, before: np.ndarray, after: np.ndarray, normals: Sequence[np.ndarray] | None, flow: Rates
 ) -> np.ndarray:
     """Compute the logarithm of the factor by which the flow changes a phase volume over one period or return, shape
     (n,).
@@ -231,16 +231,18 @@ def volumes_of(
         Derivatives of the section map, shape (n, state, state).
     before, after
         Points and their images, shape (n, state).
-    crossed
-        Index of the state that crosses; None if sections are at equal times.
+    normals
+        Normals of the section of crossings before and after, shape (n, state); None if sections are at equal times.
     flow
         Function that returns the rates at states (n, state).
     """
-    if crossed is None:
+    if normals is None:
         return _log_areas(derivatives)
-    kept = [k for k in range(derivatives.shape[-1]) if k != crossed]
-    areas = _log_areas(derivatives[:, kept][:, :, kept]) if kept else np.zeros(len(before))
-    speeds = np.abs(np.stack([flow(before)[:, crossed], flow(after)[:, crossed]]))
+    first, last = (n / np.sqrt((n**2).sum(axis=1, keepdims=True)) for n in normals)
+    # vectors along the section as they are, and the normal before to the normal after
+    along = derivatives - np.einsum("nij,nj,nk->nik", derivatives, first, first)
+    areas = _log_areas(along + last[:, :, None] * first[:, None, :])
+    speeds = np.abs(np.stack([(first * flow(before)).sum(axis=1), (last * flow(after)).sum(axis=1)]))
     return np.asarray(areas + np.log(speeds[1] / speeds[0]))
 
 

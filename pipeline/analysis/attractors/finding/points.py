@@ -12,7 +12,7 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
-from magpend_core.orbits import crossed_state
+from magpend_core.poincare import section_of
 from magpend_core.pointwise import rates_at
 from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.growth import volumes_of
@@ -140,7 +140,9 @@ class Point:
         def flow(states: np.ndarray) -> np.ndarray:
             return rates_at(self.integrates, states, self.packed)
 
-        return volumes_of(derivatives, before, after, crossed_state(self.integrates), flow)
+        section = section_of(self.integrates)
+        normals = None if section is None else [section.normals(states, self.packed) for states in (before, after)]
+        return volumes_of(derivatives, before, after, normals, flow)
 
     @property
     def integrates(self) -> System:
