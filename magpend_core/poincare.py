@@ -80,7 +80,8 @@ class Section:
             moved[..., self.state] = self.levels(packed)
             return moved
         flat = moved.reshape(-1, moved.shape[-1])
-        rows = np.broadcast_to(packed, (*moved.shape[:-1], packed.shape[-1])).reshape(len(flat), -1)
+        n = packed.shape[-1]
+        rows = np.broadcast_to(packed, (*moved.shape[:-1], n)).reshape(len(flat), n)
         levels, column = self.levels(rows), None
         at = np.arange(len(flat))
         for _ in range(STEPS):

@@ -251,7 +251,7 @@ class Model:
 
     @property
     def crossing(self) -> Crossing | None:
-        """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
+        """Return the model's Poincare section by crossing; None if the section is stroboscopic."""
         return self.clock.crossing
 
     @property

@@ -106,11 +106,12 @@ def _section(model: Assembled, definition: Definition, axis: str, span: tuple[fl
     """Return a section across the motion, from the file's options or a trial; None if all motions come to rest."""
     source, settings = model.source, model.source.settings
     motions = _trials(model, definition, axis, span)
-    state = settings.get("poivar", "")
-    if settings.get("poimap", "")[:1] == "s" and state in (*source.states, *source.quantities):
+    given = settings.get("poivar", "")
+    crossing = [key for key in (given, f"aux {given}") if key in source.states or key in source.quantities]
+    if settings.get("poimap", "")[:1] == "s" and crossing:
         sign = constant_setting(source, "poisgn", 1.0)
         level = constant_setting(source, "poipln", 0.0)
-        found = {"of": model.names[state], "value": level, "direction": "down" if sign < 0 else "up"}
+        found = {"of": model.names[crossing[0]], "value": level, "direction": "down" if sign < 0 else "up"}
     elif (chosen := _across(model, motions)) is not None:
         found = chosen
     else:

@@ -379,7 +379,7 @@ class Spec:
         return self._replaced("initial_conditions", {**own, **named})
 
     with_parameters = TableMethod(ParametersTable, "Set values of the model's parameters.")
-    with_section = TableMethod(SectionTable, "Take sections where a state crosses a level.")
+    with_section = TableMethod(SectionTable, "Take sections where a state or an expression crosses a level.")
     with_continuation = TableMethod(Continuation, "Choose the axis that branches follow.")
     with_drive = TableMethod(DriveTable, "Replace the model's drive by a recorded one.")
     # type checkers know the key `from_` by its alias, which is no name

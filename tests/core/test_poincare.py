@@ -135,6 +135,7 @@ def test_on_section__along_one_state():
     np.testing.assert_allclose(moved[1], [np.sqrt(5.0 + 3.6), -0.9, 2.0], rtol=1e-14)
     assert np.isnan(moved[2]).any()
     np.testing.assert_array_equal(on_section(moved[:2], parameters.pack(), parameters.model.system), moved[:2])
+    assert on_section(np.zeros((0, 3)), parameters.pack(), parameters.model.system).shape == (0, 3)
     # x**2 = -5 has no point
     assert np.isnan(on_section([[1.0, 0.0, 0.0]], seen(ROSSLER, "x**2", -5.0).pack(), _square())).any()
 

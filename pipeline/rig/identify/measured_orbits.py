@@ -14,6 +14,7 @@ import xarray as xr
 
 from magpend_core.crossing import Crossing
 from magpend_core.models.model import Model, Parameters
+from magpend_core.models.parameters import ParameterError
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.carrying import ORBIT, PARAMETER, Along, Array, Datum, OrbitData, Solution, settled
 from pipeline.analysis.branches.kinds import DOUBLING, FOLD, HOPF, KINDS, TORUS
@@ -170,9 +171,10 @@ def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
         raise SpecError(
             f"{where}.section: missing; {model.name} has no drive: give section = {{ of = ..., value = ... }}."
         )
-    if section.of not in model.state_names:
-        raise SpecError(f"{where}.section.of = {section.of!r}: is not a state of {model.name}.")
-    return sectioned(model, section.crossing)
+    try:
+        return sectioned(model, section.crossing)
+    except ParameterError as error:
+        raise SpecError([f"{where}.{problem}" for problem in error.problems]) from None
 
 
 def _section_of(spec: IdentificationSpec, table: OrbitsTable) -> SectionTable | None:

@@ -126,6 +126,9 @@ def test_read__options_choose_section_and_range(imported):
     found = imported(text + "@ poimap=section,poivar=y,poipln=.25,poisgn=-1,parmin=.5,parmax=3").spec.tables
     assert found["section"] == {"of": "y", "value": 0.25, "direction": "down", "longest": 100.0}
     assert found["axes"] == {"a": {"start": 0.5, "stop": 3.0, "num": 51}}
+    found = imported(text + "aux r=x^2+y^2\n@ poimap=section,poivar=r,poipln=2").spec
+    assert found.tables["section"] == {"of": "r", "value": 2.0, "direction": "up", "longest": 100.0}
+    assert found.model.section == "r = 2 going up"
     found = imported(text + "@ rangeover=b,rangelow=1,rangehigh=2").spec.tables
     assert found["axes"] == {"b": {"start": 1.0, "stop": 2.0, "num": 51}}
 

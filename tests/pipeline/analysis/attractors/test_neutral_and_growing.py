@@ -5,12 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from magpend_core import load_model
+from magpend_core.crossing import Crossing
 from magpend_core.engine.vecmath import TWO_PI
+from magpend_core.models.sectioned import sectioned
+from magpend_core.orbits import section_map
 from pipeline.analysis.attractors.extension.bounded_sets import _is_in_family
 from pipeline.analysis.attractors.extension.conservative import _split, conservative_sets
 from pipeline.analysis.attractors.extension.courses import COURSE_GROWS
 from pipeline.analysis.attractors.extension.growth import Escape
-from pipeline.analysis.attractors.finding.points import Slab
+from pipeline.analysis.attractors.finding.points import Point, Slab
 from pipeline.analysis.attractors.finding.requests import Settings
 from pipeline.analysis.attractors.labelling import _preserve_volume
 from pipeline.layout.vocabulary import BOUNDED_SET, CHAOTIC_SET, NEUTRAL
@@ -148,3 +152,18 @@ def test_is_in_family__an_orbit_with_a_zero_exponent_is_no_torus(can_rest):
     assert _is_in_family(scattered, 2, point, settings)
     assert not _is_in_family(np.stack([np.cos(turns), np.sin(turns)], axis=1), 2, point, settings)
     assert not _is_in_family(scattered, 0, point, settings)
+
+
+@pytest.mark.parametrize("of", ["z", "z + 0.4*x - y", "z - 0.02*x*y"])
+def test_volumes_of__the_divergence_over_a_return(of):
+    """Lorenz's flow shrinks volumes by exp(-(sigma + 1 + beta) t), whatever the section and its speeds."""
+    parameters = sectioned(load_model("lorenz"), Crossing(of, 27.0, longest=50.0)).load()
+    system, packed = parameters.model.system, parameters.pack()
+    hertz, starts = np.full(6, 0.02), np.random.default_rng(2).uniform(-9.0, 9.0, (6, 3)) + [0.0, 0.0, 25.0]
+    before = section_map(np.tile(packed, (6, 1)), hertz, starts, 3, system=system).images[:, -1]
+    found = section_map(np.tile(packed, (6, 1)), hertz, before, 1, system=system)
+    point, short = SimpleNamespace(integrates=system, packed=packed), found.times[:, 0] < 0.8
+    volumes = Point.volumes(point, found.derivatives, before, found.images[:, 0])
+    known = -(10.0 + 1.0 + 8.0 / 3.0) * found.times[:, 0]
+    assert short.sum() > 3
+    np.testing.assert_allclose(volumes[short], known[short], rtol=1e-5)

@@ -81,6 +81,33 @@ def test_explore__torus():
     assert row["normal_form"] == pytest.approx(-2.0 * np.pi, rel=1e-7)
 
 
+def test_explore__folds_and_doublings_on_slanted_and_curved_sections():
+    """What is known of the branches is as on a level of a state; the section moves with the parameter."""
+    (fold,) = table_of(followed(BAUTIN, "y - 0.4*x**2 + mu", [1.0, 0.3], "mu", -0.4, 0.2, mu=0.1))
+    assert fold["type"] == "fold"
+    assert fold["mu"] == pytest.approx(-0.25, abs=1e-10)
+    assert fold["period_s"] == pytest.approx(np.pi, rel=1e-10)
+    assert fold["normal_form"] == pytest.approx(np.sqrt(2.0) * np.pi, rel=1e-6)
+    found = []
+    for of, state in (("x", [0.0, -4.34, 0.058]), ("x + 0.5*y", [2.0, -4.0, 0.1])):
+        ds = followed(ROSSLER, of, state, "c", 2.4, 4.0, max_period=2, step=0.1, c=2.5)
+        found.append([(row["type"], row["c"], row["normal_form"]) for row in table_of(ds)])
+    assert [kind for kind, *_ in found[0]] == ["period_doubling", "period_doubling"]
+    for (kind, c, form), (other, c_other, form_other) in zip(*found, strict=True):
+        assert (kind, c) == (other, pytest.approx(c_other, abs=1e-9))
+        assert form == pytest.approx(form_other, rel=1e-5)
+
+
+def test_explore__cycles_from_a_hopf_point_on_a_slanted_section():
+    """Small cycles are followed on the section through the equilibrium, with the squared radius mu."""
+    ds = followed(HOPF, "x + y", [0.4, -0.4], "mu", -0.2, 0.5, level=0.0, mu=0.32)
+    values = ds["parameter"].values[0]
+    radius = (ds["section"].values[0, :, 0] ** 2).sum(axis=1)
+    good = np.isfinite(values)
+    np.testing.assert_allclose(radius[good], values[good], atol=1e-9)
+    assert values[good].min() < 1e-3
+
+
 HOMOCLINIC = table(
     "homoclinic",
     {"x": "-x + 2*y + x**2", "y": "(2 - alpha)*x - y - 3*x**2 + 1.5*x*y"},

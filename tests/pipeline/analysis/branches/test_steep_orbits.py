@@ -46,12 +46,14 @@ def test_graded_multipliers__as_many_digits_for_the_small_ones():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("period", [1, 2])
-def test_cut_problem__is_the_orbit_of_the_whole_period(period):
+@pytest.mark.parametrize(
+    ("of", "period"), [("y", 1), ("y", 2), ("y + x*y - 3*(mu - 0.1)", 1), ("y + x*y - mu + 0.1", 2)]
+)
+def test_cut_problem__is_the_orbit_of_the_whole_period(of, period):
     """The circle whose squared radius s has mu + s - s^2 = 0, once and twice; a turn has the multiplier
-    exp(2 pi s (1 - 2 s)).
+    exp(2 pi s (1 - 2 s)). The curved sections lie at y = 0 as well, and move with the parameter.
     """
-    parameters = sectioned(flow(BAUTIN), Crossing("y", 0.0, longest=50.0)).load(mu=0.1)
+    parameters = sectioned(flow(BAUTIN), Crossing(of, 0.0, longest=50.0)).load(mu=0.1)
     family = family_of(parameters.model.system, 1, 0.02, parameters.pack(), "mu", 0.6)
     family = replace(family, period=period)
     s = 0.5 + np.sqrt(0.35)
