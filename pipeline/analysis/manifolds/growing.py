@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magpend_core.engine.system import System
-from magpend_core.orbits import section_map, wrap_angles
+from magpend_core.orbits import on_section, section_map, wrap_angles
 from pipeline.results.tolerances import BRANCH_RTOL, SAME_POINT
 
 
@@ -321,7 +321,8 @@ def _preimages(saddle: Saddle, points: np.ndarray, guesses: np.ndarray, n_period
         if not len(rows):
             break
     found[~converged] = np.nan
-    return np.asarray(wrap_angles(found, saddle.system))
+    # Newton's method leaves one state of a point on a section of an expression as it was
+    return np.asarray(wrap_angles(on_section(found, saddle.packed, saddle.system), saddle.system))
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

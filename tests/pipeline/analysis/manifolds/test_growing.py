@@ -43,7 +43,7 @@ def saddle_of(step, slope, state, *, scales=(1.0, 1.0), angles=(False, False), p
     for _ in range(period):
         monodromy = slope(state[None])[0] @ monodromy
         state = step(state[None])[0]
-    system = SimpleNamespace(scales=scales, is_angle=np.array(angles), n_states=2)
+    system = SimpleNamespace(scales=scales, is_angle=np.array(angles), n_states=2, section=None)
     return MapSaddle(system, 1.0, np.zeros(0), state, period, monodromy, step, slope)
 
 
