@@ -132,7 +132,7 @@ class Section:
         """Return for each normal the state along which points are moved onto the surface: the one, in units of its
         scale, by which it changes most.
         """
-        return np.argmax(np.abs(normals) * np.asarray(self.system.scales), axis=1)
+        return np.asarray(np.argmax(np.abs(normals) * np.asarray(self.system.scales), axis=1))
 
 
 def section_of(system: System) -> Section | None:

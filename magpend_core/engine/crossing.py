@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -78,7 +77,7 @@ def _suffix(index: int | None, direction: int) -> str:
     return f"_section{'' if index is None else index}_{'up' if direction > 0 else 'down'}"
 
 
-def slopes_of(system: System) -> Callable[..., Any]:
+def slopes_of(system: System) -> Any:
     """Return a function (t, y, c) that gives a system's `surface` and its derivatives by the states as one tuple."""
     n = range(system.n_states)
     along = [", ".join("one" if j == i else "zero" for j in n) for i in n]

@@ -107,7 +107,7 @@ def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
         raise ValueError(f"{model.name} has a parameter named {LEVEL}, which is the level's name; rename it.")
     expressed = _expressed(model, crossing.of)
     own = {f.name: getattr(model, f.name) for f in dataclasses.fields(Model)}
-    units = {named.name: named.unit for named in (*model.quantities, *model.states)}
+    units = {q.name: q.unit for q in model.quantities} | {s.name: s.unit for s in model.states}
     level = Parameter(LEVEL, units.get(crossing.of, "1"), f"level of {crossing.of} at the section")
     changes: dict[str, Any] = {
         "parameters": (*model.parameters, level),

@@ -156,6 +156,8 @@ class _Reading(ViewsReader):
             classifier=classifier,
             table=_plain(table),
             lines=self.lines,
+            surface=None,
+            surface_unit=1.0,
         )
 
     def _free_names(self, table: Mapping[str, Any]) -> None:

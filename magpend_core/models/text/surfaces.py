@@ -132,7 +132,7 @@ class _Looked:
 
     def change(self, way: np.ndarray) -> np.ndarray:
         """Return the differences of the values at the ends of steps to both sides."""
-        return self.at(self.states + way) - self.at(self.states - way)
+        return np.asarray(self.at(self.states + way) - self.at(self.states - way))
 
     def changes(self, way: np.ndarray) -> np.ndarray:
         """Return the sums of the sizes of the changes by each state alone."""

@@ -269,7 +269,7 @@ class CutProblem:
             product = one @ product
         section = Section(self.system)
         normals = section.normals(state[None], packed)
-        return section.of_map((product * scales[:, None] / scales)[None], rates[None], normals, normals)[0]
+        return np.asarray(section.of_map((product * scales[:, None] / scales)[None], rates[None], normals, normals)[0])
 
     def _wrapped(self, difference: np.ndarray) -> np.ndarray:
         scales = np.asarray(self.system.scales)
