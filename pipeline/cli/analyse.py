@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import Csv, Directory, Json, check_csv
+from pipeline.cli.common import Csv, Directory, Json, Saved, check_csv, check_saved
 from pipeline.cli.groups import Groups, add_command, command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.running import ClusterFile, Scheduler, Workers, show
@@ -32,11 +32,13 @@ def _make(name: str) -> Any:
         cluster: ClusterFile = None,
         csv: Csv = None,
         json: Json = None,
+        out: Saved = None,
     ) -> None:
         from pipeline.compute.clients import Where
 
         check_csv(csv)
-        show(directory, name, options, workers, Where(scheduler, cluster), csv, json)
+        check_saved(out)
+        show(directory, name, options, workers, Where(scheduler, cluster), csv, json, out)
 
     command.__name__ = name
     return made(name, taking(analysis.options, command), analysis.help)

@@ -26,6 +26,14 @@ Csv = Annotated[
     str | None,
     typer.Option("--csv", metavar="FILE", help="Write the table as CSV; - writes it to the standard output."),
 ]
+Saved = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="FILE",
+        help="Write the whole result: .nc (NetCDF), .mat (MATLAB); branches also as b.NAME (AUTO).",
+    ),
+]
 MAPPING = "Mapping file (TOML) from channels to states."
 PresetName = Annotated[
     str | None, typer.Option(help="Parameter preset, or a preset's file, FILE.toml; by default the model's first.")
@@ -90,6 +98,15 @@ def check_csv(path: str | None) -> None:
     check_target(path, "--csv")
     if path not in (None, PRINTED):
         check_file(Path(str(path)), "--csv")
+
+
+def check_saved(path: Path | None) -> None:
+    """Raise an error if the file of a result cannot be written, before anything is computed."""
+    if path is not None:
+        from pipeline.runs.exporting import format_of
+
+        format_of(path)
+        check_file(path)
 
 
 def check_target(path: str | None, option: str) -> None:

@@ -192,8 +192,9 @@ def show(
     where: Where,
     csv: str | None = None,
     json: str | None = None,
+    out: Path | None = None,
 ) -> None:
-    """Compute an analysis, or read it if it is stored, and print its table."""
+    """Compute an analysis, or read it if it is stored, print its table, and write it to the file `out`."""
     from pipeline.runs.derive import derive, shown_table
     from pipeline.specification.problems import SpecError
 
@@ -202,6 +203,10 @@ def show(
     if table.nothing:
         raise SpecError(f"{directory}: {table.nothing}")
     tell(table, csv, json)
+    if out is not None:
+        from pipeline.runs.exporting import save
+
+        console.note(f"result: {save(ds, out)}")
     if "source" in ds.encoding:
         console.note(f"stored: {ds.encoding['source']}")
 

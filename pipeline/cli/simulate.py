@@ -56,7 +56,9 @@ def simulate(
     samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
     rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = RTOL,
     atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = ATOL,
-    out: Annotated[Path, typer.Option(help="Series, .csv or .nc.")] = Path("trajectory.csv"),
+    out: Annotated[
+        Path, typer.Option(help="Series: .csv, .nc (NetCDF), .mat (MATLAB) or .dat (a start of AUTO).")
+    ] = Path("trajectory.csv"),
     figure: Annotated[
         Path | None, typer.Option(help="Figure, .png, .pdf or .svg; by default beside the series.")
     ] = None,
@@ -70,12 +72,12 @@ def simulate(
     of the recording, and time is the recording's.
     """
     from pipeline.compute import simulate as simulation
-    from pipeline.specification.files import check_new_file
+    from pipeline.runs.exporting import format_of, save
     from pipeline.specification.models import find_model
     from pipeline.store.provenance import provenance, versions
 
     chosen = find_model(model or DEFAULT, at="--model")
-    check_new_file(out, simulation.SUFFIXES)
+    format_of(out)
     check_file(out)
     target = figure or out.with_suffix(".png")
     if not no_figure:
@@ -98,7 +100,7 @@ def simulate(
         atol=atol,
     )
     ds = ds.assign_attrs(versions=json.dumps(versions()), **provenance())
-    console.result(f"series: {simulation.write_series(ds, out)}")
+    console.result(f"series: {save(ds, out)}")
     if "closing" in ds.attrs:
         console.note(ds.attrs["closing"])
     if not no_figure:

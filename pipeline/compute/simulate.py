@@ -19,8 +19,6 @@ from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
 from pipeline.layout.evaluation import check_states
 from pipeline.layout.vocabulary import model_attribute
-from pipeline.layout.writing import write_atomically, write_netcdf
-from pipeline.specification.files import check_new_file
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.specification.recorded_drive import RecordedDrive, load_drive, model_problems
 from pipeline.specification.tables import FREQUENCY, RATES, Integration
@@ -131,7 +129,6 @@ def _judged(p: int, distances: np.ndarray) -> Closing:
 
 # ---- time series -----------------------------------------------------------------------------------
 
-SUFFIXES = (".csv", ".nc")
 MAX_SAMPLES = 100_000_000
 DEGREES = "_deg"
 DEFAULT_PERIODS = 10
@@ -284,7 +281,7 @@ def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray
     states = states[len(before) :]
     names = [q.name for q in parameters.model.quantities]
     values = evaluate(names, time, states, parameters, frequency_hz)
-    ds = _labelled(parameters, time, f"time since {parameters.model.section}", states, values)
+    ds = labelled(parameters, time, f"time since {parameters.model.section}", states, values)
     if not parameters.model.clock.has_drive:  # no period to close on
         return ds
     return ds.assign_attrs(frequency_hz=float(frequency_hz), **_closing(sections, parameters, series))
@@ -309,7 +306,7 @@ def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.nda
     states = recorded_trajectory(parameters, drive.intervals, state, since, rtol=series.rtol, atol=series.atol)
     names = [q.name for q in parameters.model.quantities]
     values = evaluate_recorded(names, since, states, parameters, drive.intervals)
-    ds = _labelled(parameters, since + drive.start_s, f"time by the clock of {drive.file}", states, values)
+    ds = labelled(parameters, since + drive.start_s, f"time by the clock of {drive.file}", states, values)
     inside = marks[(marks >= begin) & (marks <= end)]
     attrs = {"units": "s", "long_name": "instants of the sections"}
     return ds.assign_coords(section_times=("section", inside, attrs)).assign_attrs(
@@ -317,7 +314,7 @@ def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.nda
     )
 
 
-def _labelled(
+def labelled(
     parameters: Parameters, time: np.ndarray, clock: str, states: np.ndarray, values: np.ndarray
 ) -> xr.Dataset:
     """Build the dataset of a time series: states and quantities with their names and units, and the parameters."""
@@ -388,17 +385,12 @@ def _problems(series: Series) -> list[str]:
     return found
 
 
-def write_series(ds: xr.Dataset, path: Path) -> Path:
-    """Write a time series as CSV or NetCDF; the suffix of the file decides."""
-    check_new_file(path, SUFFIXES)
-    if path.suffix.lower() == ".nc":
-        write_netcdf(path, ds)
-        return path
+def series_csv(ds: xr.Dataset) -> str:
+    """Return a time series as CSV text, with the units in the names of the columns."""
     names = ["time", *map(str, ds.data_vars)]
     units = [re.sub(r"\W+", "_", ds[name].attrs["units"].replace("/", "_per_")) for name in names]
     table = np.column_stack([ds[name].values for name in names])
     header = ",".join(f"{name}_{unit}" for name, unit in zip(names, units, strict=True))
     text = io.StringIO()
     np.savetxt(text, table, delimiter=",", header=header, comments="", fmt="%.17g")
-    write_atomically(path, text.getvalue())
-    return path
+    return text.getvalue()

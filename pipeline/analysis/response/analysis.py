@@ -69,10 +69,10 @@ def response(run: OpenRun, options: ResponseOptions) -> xr.Dataset:
     places = [(i, j) for i in range(located.sizes["branch"]) for j in range(int(located["n_points"][i]))]
     run.echo(f"response: {len(places)} orbits")
     flow = of_flow(base).model
-    orbits = {place: _at_point(located, base, *place) for place in places}
+    orbits = {place: orbit_at(located, base, *place) for place in places}
     sizes = {d: located.sizes[d] for d in ("branch", "point")}
     variables: dict[str, Any] = measured_along(orbits, sizes, flow, options.harmonics)
-    events = [_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
+    events = [orbit_at_bifurcation(located, base, k) for k in range(located.sizes["bifurcation"])]
     there = measured(events, flow, options.harmonics)
     variables |= {f"bifurcation_{name}": (("bifurcation", *dims), *rest) for name, (dims, *rest) in there.items()}
     low, high = interval_along(run, options.parameter)
@@ -130,13 +130,15 @@ def measured_along(
     return variables
 
 
-def _at_point(located: xr.Dataset, base: Parameters, branch: int, point: int) -> Orbit:
+def orbit_at(located: xr.Dataset, base: Parameters, branch: int, point: int) -> Orbit:
+    """Return the orbit at a point of a branch, from branches with plain names and the parameters of their run."""
     state = located["section"].values[branch, point, 0]
     value, seconds = (float(located[name].values[branch, point]) for name in ("parameter", "period_s"))
     return _orbit(located, base, branch, value, state, seconds)
 
 
-def _at_bifurcation(located: xr.Dataset, base: Parameters, k: int) -> Orbit:
+def orbit_at_bifurcation(located: xr.Dataset, base: Parameters, k: int) -> Orbit:
+    """Return the orbit at a located bifurcation."""
     state = located["bifurcation_section"].values[k, 0]
     value, seconds = (float(located[name].values[k]) for name in ("value", "bifurcation_period_s"))
     return _orbit(located, base, int(located["of_branch"].values[k]), value, state, seconds)

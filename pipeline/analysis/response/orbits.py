@@ -101,23 +101,8 @@ def _blocks(orbits: Sequence[Orbit], rows: Array, n: int) -> Iterator[Array]:
 
 def sampled(orbits: Sequence[Orbit], n: int) -> Array:
     """Return states and quantities at even instants of a period, (orbit, sample, channel), without an angle's turns."""
-    period = max(orbits[0].period, 1)
+    times, states = flown(orbits, n)
     flows = [of_flow(orbit.parameters) for orbit in orbits]
-    share = np.arange(n * period + 1) / (n * period)
-    times = [share * orbit.seconds for orbit in orbits]
-    starts = np.array([orbit.state for orbit in orbits])
-    if orbits[0].period:
-        states = sample(
-            flows[0].model.system,
-            np.array([flow.pack() for flow in flows]),
-            starts,
-            times,
-            drives=[Drive(np.full(period, orbit.seconds / period)) for orbit in orbits],
-            **tolerances_at(BRANCH_RTOL),
-            limits_first_step=False,
-        ).states
-    else:
-        states = np.repeat(starts[:, None], len(share), axis=1)
     names = [q.name for q in flows[0].model.quantities]
     quantities = [
         evaluate(names, time, own, flow, orbit.frequency_hz)
@@ -127,8 +112,32 @@ def sampled(orbits: Sequence[Orbit], n: int) -> Array:
     ]
     is_angle = np.asarray(flows[0].model.system.is_angle, bool)
     turns = np.where(is_angle, np.round((states[:, -1] - states[:, 0]) / (2.0 * np.pi)), 0.0)
+    share = np.arange(states.shape[1]) / (states.shape[1] - 1)
     states = states - 2.0 * np.pi * turns[:, None] * share[:, None]
     return np.concatenate([states, np.array(quantities)], axis=-1)[:, :-1]
+
+
+def flown(orbits: Sequence[Orbit], n: int) -> tuple[list[Array], Array]:
+    """Integrate orbits of equal period over this period; return the instants of each and the states there, both ends
+    included, (orbit, sample, state).
+    """
+    period = max(orbits[0].period, 1)
+    flows = [of_flow(orbit.parameters) for orbit in orbits]
+    share = np.arange(n * period + 1) / (n * period)
+    times = [share * orbit.seconds for orbit in orbits]
+    starts = np.array([orbit.state for orbit in orbits])
+    if not orbits[0].period:
+        return times, np.repeat(starts[:, None], len(share), axis=1)
+    states = sample(
+        flows[0].model.system,
+        np.array([flow.pack() for flow in flows]),
+        starts,
+        times,
+        drives=[Drive(np.full(period, orbit.seconds / period)) for orbit in orbits],
+        **tolerances_at(BRANCH_RTOL),
+        limits_first_step=False,
+    ).states
+    return times, states
 
 
 def _measure(found: Measures, rows: Array, values: Array, base: int, n_harmonics: int) -> None:
@@ -146,10 +155,11 @@ def _measure(found: Measures, rows: Array, values: Array, base: int, n_harmonics
 
 def _amplitude(values: Array) -> Array:
     """Return half of peak to peak, each extreme being that of a parabola through three samples."""
-    return np.asarray(0.5 * (_highest(values) + _highest(-values)))
+    return np.asarray(0.5 * (highest(values) + highest(-values)))
 
 
-def _highest(values: Array) -> Array:
+def highest(values: Array) -> Array:
+    """Return the maximum along the samples (axis 1) of periodic values, of a parabola through three samples."""
     at = values.argmax(axis=1)[:, None]
     n = values.shape[1]
     before, here, after = (np.take_along_axis(values, (at + k) % n, axis=1)[:, 0] for k in (-1, 0, 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -109,6 +110,64 @@ class DatasetAccessor:
         if graph is None:
             raise ValueError("ds.magpend.graph: the Dataset is not the result of events.")
         return dict(json_value(graph))
+
+    def save(self, path: str | Path) -> Path:
+        """Write the Dataset to a file in the format of its name, such as ``result.mat``.
+
+        Parameters
+        ----------
+        path
+            ``*.nc`` (NetCDF), ``*.mat`` (MATLAB and Octave), ``*.csv`` (the table of an analysis, or a time series),
+            ``b.*`` (branches as the table of AUTO), or ``*.dat`` (a time series from which AUTO starts).
+
+        Returns
+        -------
+        Path
+            The file written.
+
+        Raises
+        ------
+        SpecError
+            If the name has no format, the format holds no such Dataset, or the folder does not exist.
+
+        Examples
+        --------
+        >>> run.cube().magpend.save("cube.mat")                                            # doctest: +SKIP
+        """
+        from pipeline.runs.exporting import save
+
+        return save(self._ds, path)
+
+    def orbit(self, branch: int, point: int, *, samples: int = 200) -> xr.Dataset:
+        """Return the periodic orbit at a point of a branch, stable or not, as a time series over one period.
+
+        Parameters
+        ----------
+        branch, point
+            Place in the result of `magpend.branches`.
+        samples
+            Samples per drive period or return.
+
+        Returns
+        -------
+        Dataset
+            States and quantities over ``time``, as `magpend.simulate` returns them; both ends of the period included.
+
+        Raises
+        ------
+        SpecError
+            If there is no such point, if it is an equilibrium, or if the result is not kept in a run directory.
+
+        Examples
+        --------
+        >>> run.branches().magpend.orbit(2, 5).magpend.save("ab.dat")                      # doctest: +SKIP
+        """
+        from pipeline.runs.auto_files import orbit
+        from pipeline.runs.exporting import run_of
+
+        if self._ds.attrs.get("derived_product") != "branches":
+            raise ValueError("ds.magpend.orbit: needs the result of magpend.branches.")
+        return orbit(self._ds, run_of(self._ds), branch, point, samples)
 
     def sets(self) -> xr.Dataset:
         """Return the sets of a result that has one row for each set at each parameter point.

@@ -13,7 +13,8 @@ import xarray as xr
 
 from magpend_core import load_preset, run_branches, trajectory
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from pipeline.compute.simulate import TOLERANCE, closing_of, simulate, write_series
+from pipeline.compute.simulate import TOLERANCE, closing_of, simulate
+from pipeline.runs.exporting import save
 from pipeline.specification.problems import SpecError
 from pipeline.specification.recorded_drive import load_drive
 from tests.pipeline.factories import edges
@@ -38,13 +39,13 @@ def test_simulate__is_the_cores_trajectory(series):
     assert all(series[name].attrs["units"] for name in (*series.data_vars, "time"))
 
 
-def test_write_series__csv_and_netcdf_read_back(series, tmp_path):
-    table = np.genfromtxt(write_series(series, tmp_path / "a.csv"), delimiter=",", names=True)
+def test_series__csv_and_netcdf_read_back(series, tmp_path):
+    table = np.genfromtxt(save(series, tmp_path / "a.csv"), delimiter=",", names=True)
     states = ("psi1_rad", "psi2_rad", "psi1_dot_rad_per_s", "psi2_dot_rad_per_s")
     assert table.dtype.names[:7] == ("time_s", *states, "energy_J", "power_in_W")
     assert len(table.dtype.names) == 1 + len(series.data_vars)
     assert (table["psi1_rad"] == series.psi1.values).all()
-    with xr.open_dataset(write_series(series, tmp_path / "a.nc"), engine="scipy") as read:
+    with xr.open_dataset(save(series, tmp_path / "a.nc"), engine="scipy") as read:
         assert read.attrs["frequency_hz"] == 2.2
         assert (read.psi2.values == series.psi2.values).all()
 

@@ -22,7 +22,7 @@ from pipeline.analysis.response.backbone import (
     backbone_table,
 )
 from pipeline.analysis.response.declaration import BackboneOptions
-from pipeline.analysis.response.orbits import Measures, Orbit, _amplitude, _highest, _measure, harmonics_of, lags_of
+from pipeline.analysis.response.orbits import Measures, Orbit, _amplitude, _measure, harmonics_of, highest, lags_of
 from pipeline.analysis.response.resonance import (
     ENDS,
     NEUTRAL,
@@ -61,11 +61,11 @@ def test_harmonics_of__a_subharmonic_are_those_of_the_drive() -> None:
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.01, 0.02, 0.04, 1.0])
-def test_highest__lies_between_samples(lag: float) -> None:
+def testhighest__lies_between_samples(lag: float) -> None:
     """A parabola through samples h apart, the nearest d beside the top of a cosine, misses it by d^2 (h^2 - d^2)/8."""
     h = TURN / 100
     d = lag - h * round(lag / h)
-    assert _highest(waves(100, (1, 1.0, lag)))[0, 0] == pytest.approx(1.0 - d**2 * (h**2 - d**2) / 8.0, abs=h**6)
+    assert highest(waves(100, (1, 1.0, lag)))[0, 0] == pytest.approx(1.0 - d**2 * (h**2 - d**2) / 8.0, abs=h**6)
 
 
 def test_amplitude__is_half_of_peak_to_peak_also_of_a_constant() -> None:
