@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated, Any
+from typing import Any
 
 from pipeline.cli.console import LOG
 from pipeline.runs import stopping
@@ -23,7 +23,7 @@ from pipeline.cli.extend import extend
 from pipeline.cli.groups import SETTINGS, TopGroup, add_command
 from pipeline.cli.model import model_app
 from pipeline.cli.models import models, presets
-from pipeline.cli.options import drawing
+from pipeline.cli.options import VERSION, VERSIONS, drawing
 from pipeline.cli.plot import plot_app
 from pipeline.cli.report import report
 from pipeline.cli.reproduce import reproduce
@@ -47,34 +47,8 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
-        from importlib import metadata
-
-        typer.echo(f"magpend {metadata.version('magpend')}")
-        raise typer.Exit
-
-
-def _versions(wanted: bool) -> None:
-    if wanted:
-        from pipeline.runs.environment import show_versions
-
-        show_versions()
-        raise typer.Exit
-
-
 @app.callback()
-def _main(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-    versions: Annotated[
-        bool,
-        typer.Option(
-            "--versions", callback=_versions, is_eager=True, help="Print what a report of an error needs, and exit."
-        ),
-    ] = False,
-) -> None:
+def _main(version: VERSION = False, versions: VERSIONS = False) -> None:
     pass
 
 

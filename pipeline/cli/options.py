@@ -43,6 +43,33 @@ DPI = Annotated[
         metavar="X", help="Resolution; by default 200, or that of the style [1/in]; 20 or more, at most 2400."
     ),
 ]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib import metadata
+
+        typer.echo(f"magpend {metadata.version('magpend')}")
+        raise typer.Exit
+
+
+def _print_versions(wanted: bool) -> None:
+    if wanted:
+        from pipeline.runs.environment import show_versions
+
+        show_versions()
+        raise typer.Exit
+
+
+VERSION = Annotated[
+    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+]
+VERSIONS = Annotated[
+    bool,
+    typer.Option(
+        "--versions", callback=_print_versions, is_eager=True, help="Print what a report of an error needs, and exit."
+    ),
+]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
 _IMPORTED = "import_object"

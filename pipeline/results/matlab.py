@@ -21,10 +21,10 @@ from pipeline.specification.problems import SpecError
 if TYPE_CHECKING:
     import xarray as xr
 
-LONGEST = 63
+NAME_LENGTH = 63
 """Most characters of a name in MATLAB (``namelengthmax``)."""
 
-MOST_BYTES = 2**31 - 1
+VARIABLE_BYTES = 2**31 - 1
 """Largest variable of a MAT-file of version 7."""
 
 _KEYWORDS = frozenset(
@@ -34,7 +34,7 @@ _KEYWORDS = frozenset(
     )
 )
 
-_HEADER = 116
+DESCRIPTION_BYTES = 116
 """Bytes of the description with which a MAT-file begins."""
 
 
@@ -45,10 +45,10 @@ def legal_names(names: Iterable[str]) -> dict[str, str]:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
         plain = plain if re.match(r"[A-Za-z]", plain) else f"x{plain}"
         plain = f"{plain}_" if plain in _KEYWORDS else plain
-        own, n = plain[:LONGEST], 1
+        own, n = plain[:NAME_LENGTH], 1
         while own in found.values():
             n += 1
-            own = f"{plain[: LONGEST - len(str(n)) - 1]}_{n}"
+            own = f"{plain[: NAME_LENGTH - len(str(n)) - 1]}_{n}"
         found[name] = own
     return found
 
@@ -64,10 +64,10 @@ def matlab_bytes(ds: xr.Dataset) -> bytes:
     from scipy.io import savemat
 
     for name, variable in ds.variables.items():
-        if variable.nbytes > MOST_BYTES:
+        if variable.nbytes > VARIABLE_BYTES:
             raise SpecError(
-                f"{name}: has {variable.nbytes:,} bytes, and a variable of a MAT-file at most {MOST_BYTES:,}; select a "
-                "part of the Dataset, or write NetCDF (.nc)."
+                f"{name}: has {variable.nbytes:,} bytes, and a variable of a MAT-file at most {VARIABLE_BYTES:,}; "
+                "select a part of the Dataset, or write NetCDF (.nc)."
             )
     names = legal_names(["about", *map(str, ds.variables)])
     about = {names[str(name)]: _about(ds, str(name)) for name in ds.variables}
@@ -75,8 +75,8 @@ def matlab_bytes(ds: xr.Dataset) -> bytes:
     file = io.BytesIO()
     whole = {**data, "about": {"attributes": _struct(ds.attrs), "variables": about}}
     savemat(file, whole, long_field_names=True, do_compression=True, oned_as="column")
-    text = f"MATLAB 5.0 MAT-file, written by magpend {metadata.version('magpend')}".ljust(_HEADER)
-    return text.encode() + file.getvalue()[_HEADER:]
+    text = f"MATLAB 5.0 MAT-file, written by magpend {metadata.version('magpend')}".ljust(DESCRIPTION_BYTES)
+    return text.encode() + file.getvalue()[DESCRIPTION_BYTES:]
 
 
 def _about(ds: xr.Dataset, name: str) -> dict[str, Any]:

@@ -44,11 +44,12 @@ Row = tuple[int, bool, float, Orbit]
 """A point of a branch: its type, whether it is stable, the value of the parameter, and its orbit."""
 
 
-def branches_text(ds: xr.Dataset, run: RunDirectory) -> str:
+def branches_text(ds: xr.Dataset) -> str:
     """Return the branches of a run as the text of AUTO's file ``b.NAME``.
 
     Located bifurcations are points of their branch. Values of the parameter are in the words of the specification.
     """
+    run = _run_of(ds)
     plain, shown = with_plain_names(ds), in_own_words(ds)
     base = parameters_of(run.cube())
     name = parameter_name(str(shown.attrs["parameter"]))
@@ -76,9 +77,9 @@ def start_text(ds: xr.Dataset) -> str:
     return "".join(" ".join(f"{x:24.16E}" for x in row) + "\n" for row in table)
 
 
-def orbit(ds: xr.Dataset, run: RunDirectory, branch: int, point: int, samples: int) -> xr.Dataset:
+def orbit(ds: xr.Dataset, branch: int, point: int, samples: int) -> xr.Dataset:
     """Return the orbit at a point of a branch as a time series over one period, as `simulate` returns it."""
-    plain = with_plain_names(ds)
+    run, plain = _run_of(ds), with_plain_names(ds)
     n_points = plain["n_points"].values
     if not 0 <= branch < len(n_points) or not 0 <= point < n_points[branch]:
         has = f"branch {branch} has {n_points[branch]} points" if 0 <= branch < len(n_points) else ""
@@ -91,6 +92,16 @@ def orbit(ds: xr.Dataset, run: RunDirectory, branch: int, point: int, samples: i
     values = evaluate([q.name for q in flow.model.quantities], time, states, flow, found.frequency_hz)
     series = labelled(flow, time, "time from a section point on", states, values)
     return series.assign_attrs(frequency_hz=found.frequency_hz, orbit_period=found.period)
+
+
+def _run_of(ds: xr.Dataset) -> RunDirectory:
+    """Return the run in whose directory its branches are kept; raise `SpecError` for any other Dataset."""
+    if ds.attrs.get("derived_product") != "branches":
+        raise SpecError("AUTO's table, and an orbit by its branch, need the result of branches; this is another one.")
+    place, is_kept, _ = str(ds.encoding.get("source", "")).partition("/derived/")
+    if not is_kept:
+        raise SpecError("the branches were not read from a run directory, so that their parameters are unknown.")
+    return RunDirectory.open(place)
 
 
 def _rows(plain: xr.Dataset, shown: xr.Dataset, run: RunDirectory, branch: int) -> Iterator[Row]:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.compute.simulate import series_csv
 from pipeline.layout.conventions import netcdf_safe
 from pipeline.layout.writing import netcdf_bytes, write_atomically
+from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
-from pipeline.results.matlab import matlab_bytes
-from pipeline.runs.auto_files import branches_text, start_text
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import RunDirectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,43 +19,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file: names that it has, what it is, and the function that makes its content of a Dataset."""
+    """A kind of file: the names that it has, what it is, and ``"module:function"``, which makes the content of a
+    Dataset.
+    """
 
     pattern: str
     text: str
-    content: Callable[[xr.Dataset], str | bytes]
-
-
-def _csv(ds: xr.Dataset) -> str:
-    """Return a result as the table that ``--csv`` writes, a time series with a column for each variable."""
-    from pipeline.runs.derive import shown_table
-
-    name = str(ds.attrs.get("derived_product", ""))
-    if name in ANALYSES and ANALYSES[name].table:
-        return shown_table(name, ds).csv()
-    if "time" in ds.sizes:
-        return series_csv(ds)
-    raise SpecError("*.csv: only tables of analyses and time series are; write .nc or .mat, which hold any Dataset.")
-
-
-def _netcdf(ds: xr.Dataset) -> bytes:
-    # NetCDF reads a dim of length 0 as an unlimited one
-    return netcdf_bytes(netcdf_safe(ds.drop_vars([name for name, one in ds.variables.items() if one.size == 0])))
-
-
-def _auto(ds: xr.Dataset) -> str:
-    if ds.attrs.get("derived_product") != "branches":
-        raise SpecError("b.*: AUTO's table is one of branches; this is another result. Write .nc or .mat.")
-    return branches_text(ds, run_of(ds))
+    content: str
 
 
 FORMATS = (
-    Format("*.csv", "CSV, the table of an analysis or a time series", _csv),
-    Format("*.nc", "NetCDF", _netcdf),
-    Format("*.mat", "MATLAB and Octave", matlab_bytes),
-    Format("*.dat", "a time series from which AUTO starts", start_text),
-    Format("b.*", "AUTO's table of branches", _auto),
+    Format("*.csv", "CSV, the table of an analysis or a time series", "pipeline.runs.exporting:csv_text"),
+    Format("*.nc", "NetCDF", "pipeline.runs.exporting:netcdf_content"),
+    Format("*.mat", "MATLAB and Octave", "pipeline.results.matlab:matlab_bytes"),
+    Format("*.dat", "a time series from which AUTO starts", "pipeline.runs.auto_files:start_text"),
+    Format("b.*", "AUTO's table of branches", "pipeline.runs.auto_files:branches_text"),
 )
+"""Formats; the first whose pattern a name has is taken."""
 
 
 def format_of(path: str | Path) -> Format:
@@ -76,14 +52,24 @@ def format_of(path: str | Path) -> Format:
 
 def save(ds: xr.Dataset, path: str | Path) -> Path:
     """Write a Dataset to a file in the format of its name, complete or not at all; return the path."""
-    content = format_of(path).content(ds)
+    content = function_of(format_of(path).content)(ds)
     write_atomically(Path(path), content)
     return Path(path)
 
 
-def run_of(ds: xr.Dataset) -> RunDirectory:
-    """Return the run in whose directory a result is kept; raise `SpecError` if it is not."""
-    place, is_kept, _ = str(ds.encoding.get("source", "")).partition("/derived/")
-    if not is_kept:
-        raise SpecError("the result was not read from a run directory, so that its parameters are unknown.")
-    return RunDirectory.open(place)
+def csv_text(ds: xr.Dataset) -> str:
+    """Return a result as the table that ``--csv`` writes, a time series with a column for each variable."""
+    from pipeline.compute.simulate import series_csv
+    from pipeline.runs.derive import shown_table
+
+    name = str(ds.attrs.get("derived_product", ""))
+    if name in ANALYSES and ANALYSES[name].table:
+        return shown_table(name, ds).csv()
+    if "time" in ds.sizes:
+        return series_csv(ds)
+    raise SpecError("*.csv: only tables of analyses and time series are; write .nc or .mat, which hold any Dataset.")
+
+
+def netcdf_content(ds: xr.Dataset) -> bytes:
+    """Return any Dataset as NetCDF, without empty variables: NetCDF reads a dim of length 0 as an unlimited one."""
+    return netcdf_bytes(netcdf_safe(ds.drop_vars([name for name, one in ds.variables.items() if one.size == 0])))

@@ -156,18 +156,15 @@ class DatasetAccessor:
         Raises
         ------
         SpecError
-            If there is no such point, if it is an equilibrium, or if the result is not kept in a run directory.
+            If there is no such point, if it is an equilibrium, or if this is no result of branches that a run keeps.
 
         Examples
         --------
         >>> run.branches().magpend.orbit(2, 5).magpend.save("ab.dat")                      # doctest: +SKIP
         """
         from pipeline.runs.auto_files import orbit
-        from pipeline.runs.exporting import run_of
 
-        if self._ds.attrs.get("derived_product") != "branches":
-            raise ValueError("ds.magpend.orbit: needs the result of magpend.branches.")
-        return orbit(self._ds, run_of(self._ds), branch, point, samples)
+        return orbit(self._ds, branch, point, samples)
 
     def sets(self) -> xr.Dataset:
         """Return the sets of a result that has one row for each set at each parameter point.

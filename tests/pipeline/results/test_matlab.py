@@ -100,7 +100,7 @@ def test_matlab__depends_on_the_dataset_alone_and_names_magpend():
     content = matlab.matlab_bytes(ds)
     assert content == matlab.matlab_bytes(ds)
     assert content.startswith(b"MATLAB 5.0 MAT-file, written by magpend ")
-    assert len(content[: matlab._HEADER].rstrip()) < matlab._HEADER
+    assert len(content[: matlab.DESCRIPTION_BYTES].rstrip()) < matlab.DESCRIPTION_BYTES
 
 
 def test_matlab__a_variable_that_is_too_large_is_refused_before_it_is_read():
