@@ -107,7 +107,7 @@ BASINS = Analysis(
     builds_on=("attractors",),
     figure="basins",
     by_point=True,
-    version=3,
+    version=4,
 )
 
 
