@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,4 +73,6 @@ def csv_text(ds: xr.Dataset) -> str:
 
 def netcdf_content(ds: xr.Dataset) -> bytes:
     """Return any Dataset as NetCDF, without empty variables: NetCDF reads a dim of length 0 as an unlimited one."""
-    return netcdf_bytes(netcdf_safe(ds.drop_vars([name for name, one in ds.variables.items() if one.size == 0])))
+    filled = ds.drop_vars([name for name, one in ds.variables.items() if one.size == 0])
+    filled.attrs = {"source": f"magpend {metadata.version('magpend')}", **ds.attrs}
+    return netcdf_bytes(netcdf_safe(filled))

@@ -107,7 +107,8 @@ def test_auto__a_driven_oscillator_in_the_word_of_its_specification(tmp_path_fac
     model = magpend.model("x'' = cos(omega*t) - 0.2*x' - x")
     spec = magpend.Spec("sweep", model).with_axis("omega", 0.5, 1.5, 3).with_start_random(n=1, x=(0.0, 1.0), x_dot=0.0)
     run = run_of(tmp_path_factory, spec.with_integration(n_transient=100, n_keep=4))
-    command(tmp_path, "analyse", "branches", run.name, "--out", "b.forced", "--quiet")
+    for name in ("b.forced", "b.forced", "forced.nc", "forced.nc", "forced.mat", "forced.mat"):  # its own are replaced
+        command(tmp_path, "analyse", "branches", run.name, "--out", name, "--quiet")
     (block,) = read_auto(tmp_path / "b.forced")
     assert len(block) > 5
     for row in block:
