@@ -64,7 +64,7 @@ def simulate(
     ] = None,
     no_figure: Annotated[bool, typer.Option("--no-figure", help="Draw no figure.")] = False,
 ) -> None:
-    """Integrate one trajectory: states and the model's quantities as CSV or NetCDF, and a figure.
+    """Integrate one trajectory: states and the model's quantities in a file, and a figure.
 
     Give the initial state by the model's names: --NAME VALUE, or --NAME-deg VALUE for an angle or its rate;
     other states are 0. Time 0 is the time of a section. The command prints whether the motion has closed on a
