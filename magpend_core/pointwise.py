@@ -275,10 +275,13 @@ def rates_packed(system: System, states: np.ndarray, packed: np.ndarray, frequen
     ndarray, (n, n_states)
     """
     found = np.full(states.shape, np.nan)
-    evaluator, time = _evaluator(system, "rates"), np.zeros(1)
-    for i in np.flatnonzero(np.isfinite(states).all(axis=1)):
-        row = np.ascontiguousarray(states[i : i + 1])
-        evaluator(time, row, float(frequency_hz[i]), np.ascontiguousarray(packed[i]), found[i : i + 1])
+    evaluator, known = _evaluator(system, "rates"), np.flatnonzero(np.isfinite(states).all(axis=1))
+    changes = (packed[known[1:]] != packed[known[:-1]]).any(axis=1) | (np.diff(frequency_hz[known]) != 0.0)
+    for rows in np.split(known, 1 + np.flatnonzero(changes)) if len(known) else ():  # neighbours with equal parameters
+        out = np.empty((len(rows), system.n_states))
+        parameters = np.ascontiguousarray(packed[rows[0]])
+        evaluator(np.zeros(len(rows)), states[rows], float(frequency_hz[rows[0]]), parameters, out)
+        found[rows] = out
     return found
 
 

@@ -66,7 +66,8 @@ interval at which a branch was cut off, with what was met there, and for each bo
 
 ``first_end`` and ``last_end`` say why a branch ends: ``bound`` of the parameter, ``closed`` on itself, ``start`` (it
 sprang off there), ``period_halving`` (on the orbit of half the period), ``max_points``, ``stuck`` (Newton's method
-fails for the shortest step), ``equilibrium`` (a cycle of a flow that shrinks to a point, as at a Hopf bifurcation),
+fails for the shortest step, or the last steps led nowhere), ``equilibrium`` (a cycle of a flow that shrinks to a
+point, as at a Hopf bifurcation),
 ``tangent`` (its cycles only touch the section), ``other_section`` (its cycles go on as a branch on the run's section),
 ``homoclinic`` or ``snic`` (their period grows without bound, see `limits`), ``unstable`` (with --stable: some points
 beyond its stable part).

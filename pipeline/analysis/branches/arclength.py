@@ -12,7 +12,7 @@ scale is the interval that it stays in.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +48,7 @@ class Settings:
     amplitudes: tuple[float, ...] = (0.02, 0.05, 0.1)
     # step across an impact at the strobe, in units of `shortest_step`; it is tried again with multiples of this step
     across: float = 100.0
+    longest_cut: float = 0.05  # `longest_step` of cut orbits, whose nodes and periods are unknowns that vary smoothly
     longest_at_rest: float = 0.05  # `longest_step` of equilibria, on whose branches tests see two zeros within a step
 
 
@@ -186,6 +187,15 @@ def trace(
         step = min(step, longest)
     found.end = "max_points"
     return found
+
+
+def crawls(points: Sequence[Point], many: int = 20) -> bool:
+    """Return whether the last `many` steps of a curve led nowhere: Newton's method converges from no other point.
+
+    So it is near canards, where the cycles change by as much as they are large within differences of the parameters.
+    """
+    nowhere = 1e-4  # distance that the steps cover [arclength]
+    return len(points) > many and bool(np.linalg.norm(points[-1].u - points[-1 - many].u) < nowhere)
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:

@@ -63,14 +63,16 @@ def _branching_test(point: Point) -> float:
     return float(np.linalg.det(np.vstack([point.value.derivative, point.tangent])))
 
 
-def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
-    """Turn a test of the monodromy matrix into a test function for points of a branch; at equilibria its value is 1."""
-    return lambda point: 1.0 if point.value.is_rest else test(point.value.monodromy)
+def _doubling_test(point: Point) -> float:
+    if point.value.is_rest:
+        return 1.0
+    value = point.value
+    return float(np.prod(1.0 + value.multipliers).real if value.is_graded else doubling_test(value.monodromy))
 
 
 TESTS: dict[str, Test] = {
     FOLD: lambda point: float(point.tangent[-1]),
-    DOUBLING: _of_orbits(doubling_test),
+    DOUBLING: _doubling_test,
     TORUS: lambda point: 1.0 if point.value.is_rest else torus_product(point.value.multipliers),
     BRANCHING: _branching_test,
     HOPF: lambda point: hopf_test(point.value.multipliers) if point.value.is_rest else 1.0,
@@ -363,13 +365,15 @@ def _doubt(chain: Sequence[int], last: int, ones: Sequence[Bifurcation]) -> tupl
 
 
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
-    """Keep the true bifurcations in the order of the branch. Drop neutral saddles, and folds that are really branch
-    points.
+    """Keep the true bifurcations in the order of the branch. Drop neutral saddles, folds that are really branch
+    points, and changes of sign by rounding.
     """
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
         if (one.kind == TORUS and not has_torus(one.point)) or (one.kind == HOPF and not _is_pair(one)):
+            continue
+        if one.kind in (FOLD, DOUBLING) and one.point.value.is_graded and not _is_critical(one):
             continue
         if one.kind == FOLD and any(np.abs(one.point.u - u).max() < SAME_PLACE for u in branching):
             continue
@@ -384,6 +388,13 @@ def has_torus(point: Point) -> bool:
     multipliers = multipliers_of(point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)
+
+
+def _is_critical(one: Bifurcation) -> bool:
+    """Return whether a multiplier is near +1 at a fold, near -1 at a doubling. Else rounding has changed a sign, as it
+    does on a canard, where the parameter stands still.
+    """
+    return bool(abs(one.critical_multiplier - (1.0 if one.kind == FOLD else -1.0)) < 0.1)
 
 
 def _is_pair(one: Bifurcation) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
-from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
+from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, crawls, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import has_torus
 from pipeline.analysis.branches.center_manifold import null_vectors
 from pipeline.analysis.branches.codimension_two import (
@@ -414,15 +414,6 @@ def _follow(
     if found.end in ("resonance", BT):
         found.points += [one.point for one in special if one.kind in (R1, R2, BT)][-1:]
     return found, special, detector.n_missed
-
-
-def crawls(points: Sequence[Point]) -> bool:
-    """Return whether the last steps of a curve led nowhere: Newton's method converges from no other point.
-
-    So it is near canards, where the cycles change by as much as they are large within differences of the parameters.
-    """
-    many, nowhere = 20, 1e-4  # number of steps, and the distance that they cover [arclength]
-    return len(points) > many and bool(np.linalg.norm(points[-1].u - points[-1 - many].u) < nowhere)
 
 
 def _passes(curve: Curve, problem: CurveProblem, start: Point) -> bool:

@@ -7,14 +7,22 @@ from itertools import product
 
 import numpy as np
 
-from magpend_core.poincare import section_of
+from magpend_core.poincare import Section
 from magpend_core.pointwise import rates_packed
-from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
+from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, crawls, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import Bifurcation, Watch, n_unstable, settle_sides
 from pipeline.analysis.branches.kinds import FOLD, LIMITS
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import EquilibriumProblem, Family, OneParameter, OrbitProblem, Problem
-from pipeline.analysis.branches.steep_orbits import CutProblem, cut_where_steep, is_steep, is_steeper, whole_orbit
+from pipeline.analysis.branches.resting import RestSettings, last_orbit, saddles_near
+from pipeline.analysis.branches.steep_orbits import (
+    CutProblem,
+    cut_where_steep,
+    is_small,
+    is_steep,
+    is_steeper,
+    whole_orbit,
+)
 from pipeline.analysis.branches.strobe import other_side
 
 ENDS = (
@@ -139,16 +147,23 @@ def end_of_crossings(family: Family, point: Point) -> str:
     # crossing speed times the period below which the branch ends [scales of the states]; there the cycle has shrunk to
     # an equilibrium if this product is below `rest` for all states
     touching, rest = 0.01, 0.5
-    section = section_of(family.system)
-    if section is None:
+    if family.system.section is None:
         return ""
-    rows = family.rows(point.u[None])
+    across, most = _reach(family, point)
+    if across >= touching:
+        return ""
+    return "equilibrium" if most < rest else "tangent"
+
+
+def _reach(family: Family, point: Point) -> tuple[float, float]:
+    """Return the crossing speed of a cycle times its period, positive in the section's direction, and the largest such
+    product of all states [scales of the states].
+    """
+    section, rows = Section(family.system), family.rows(point.u[None])
     rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)[0]
     reach = rates * point.value.seconds / np.asarray(family.system.scales)
     (normal,), _ = section.scaled_normals(rows.states, rows.parameters)
-    if abs(normal @ reach) >= touching:
-        return ""
-    return "equilibrium" if np.abs(reach).max() < rest else "tangent"
+    return float(section.sign * (normal @ reach)), float(np.abs(reach).max())
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
@@ -199,7 +214,12 @@ def half_branch(
     watch = Watch(problem, settings, skip_first=from_bifurcation)
     stop = _Stop(family, low, high, settings.beyond)
     found = yield from trace(
-        problem, start, settings, stop, watch.between, lambda here: beyond_strobe(problem, here, settings)
+        problem,
+        start,
+        settings,
+        lambda points: stop(points) or ("stuck" if leads_nowhere(family, points) else ""),
+        watch.between,
+        lambda here: beyond_strobe(problem, here, settings),
     )
     steep = yield from _past_steep(family, found, watch, stop, settings)
     n_last = len(found.points) - 2
@@ -219,10 +239,22 @@ def half_branch(
         # the half-period orbit is a singular point of these equations: drop what was located there
         found.points.pop()
         watch.found = [b for b in watch.found if b.after < n_last]
+    elif found.end == "tangent" and _reach(family, found.points[-1])[0] < 0.0:
+        # cut orbits have passed the touch: the last one starts where it crosses the section against its direction
+        found.points.pop()
+        watch.found = [b for b in watch.found if b.after < n_last]
     elif found.end == "closed":
         # the last step repeats the first one
         watch.found = [b for b in watch.found if b.after < n_last or not _is_known(b, watch.found)]
     return Half(found, watch.found)
+
+
+def leads_nowhere(family: Family, points: list[Point]) -> bool:
+    """Return whether a branch crawls. One that may be followed on with cuts is left soon; the others may come nearer to
+    what stops them, such as a touch. Those whose period grows are followed, for its law.
+    """
+    soon, late = 20, 100  # steps
+    return crawls(points, soon if is_steep(points[-1], family) else late) and not _nears_rest(points)
 
 
 def _past_steep(
@@ -233,7 +265,7 @@ def _past_steep(
     Returns the last equations with the last points in their unknowns; None if the branch is not followed on.
     """
     last: tuple[CutProblem, list[Point]] | None = None
-    is_cut = found.end == "stuck" and is_steep(found.points[-1], family) and not _nears_rest(found.points)
+    is_cut = found.end == "stuck" and _may_be_cut(family, found.points)
     while is_cut:
         problem, u = whole_orbit(family, found.points[-1]) if last is None else (last[0], last[1][-1].u)
         cut = yield from cut_where_steep(problem, u, found.points[-1].tangent, settings)
@@ -242,7 +274,8 @@ def _past_steep(
             break
         problem, start = cut
         own = Watch(problem, settings, n_steps=len(found.points) - 1)
-        rest = replace(settings, max_points=settings.max_points - len(found.points) + 1)
+        n_left = settings.max_points - len(found.points) + 1
+        rest = replace(settings, max_points=n_left, longest_step=settings.longest_cut)
         piece = yield from trace(problem, start, rest, _StopCut(problem, stop, found.points), own.between)
         found.end, is_cut = piece.end.replace(_MORE_CUTS, "stuck"), piece.end == _MORE_CUTS
         watch.found += [replace(one, point=problem.plain(one.point)) for one in own.found]
@@ -263,13 +296,36 @@ class _StopCut:
 
     def __call__(self, points: list[Point]) -> str:
         self.points.append(self.problem.plain(points[-1]))
-        end = self.stop(self.points) or ("stuck" if _nears_rest(self.points) else "")
+        end = self.stop(self.points)
+        if end == "equilibrium" and not is_small(points[-1]):
+            return "tangent"
+        if not end and (crawls(points) or _nears_saddle(self.stop.family, self.points)):
+            return "stuck"
         return end or (_MORE_CUTS if is_steeper(points[-1]) else "")
 
 
+def _may_be_cut(family: Family, points: list[Point]) -> bool:
+    """Return whether a branch may go on with its orbits in segments: they are limit cycles that are steep, or whose
+    period grows as near a canard.
+    """
+    if not family.period or family.system.section is None:
+        return False
+    return (is_steep(points[-1], family) or _nears_rest(points)) and not _nears_saddle(family, points)
+
+
 def _nears_rest(points: list[Point]) -> bool:
-    """Return whether the period grows without bound towards the end of a branch: no cuts lead on."""
+    """Return whether the period grows towards the end of a branch as if without bound."""
     return grows_without_bound(np.array([p.u for p in points]), np.array([p.value.seconds for p in points]))
+
+
+def _nears_saddle(family: Family, points: list[Point]) -> bool:
+    """Return whether the period grows as if without bound towards the end of a branch, and a saddle is near: no cuts
+    lead on. Near a canard the period grows as well.
+    """
+    if not _nears_rest(points):
+        return False
+    settings = RestSettings()
+    return len(saddles_near(family, points[-1], last_orbit(family, points[-1], settings), settings)[0]) > 0
 
 
 def grows_without_bound(unknowns: np.ndarray, seconds: np.ndarray) -> bool:

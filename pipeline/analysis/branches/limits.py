@@ -27,26 +27,28 @@ from scipy.optimize import least_squares
 from magpend_core.equilibria import find_equilibria
 from magpend_core.orbits import scaled_distance, wrap_angles
 from magpend_core.pointwise import jacobian_at, rates_at
-from magpend_core.precision import tolerances_at
-from magpend_core.sampling import Drive, sample
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.following import Branch, Limit, grows_without_bound, leading_of, opposite, problem_of
+from pipeline.analysis.branches.following import (
+    Branch,
+    Limit,
+    grows_without_bound,
+    leading_of,
+    leads_nowhere,
+    opposite,
+    problem_of,
+)
 from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.resting import RestSettings, last_orbit, saddles_near, size_of, slow_places
 from pipeline.layout.own_words import place_in_words
 from pipeline.products.reporting import track
-from pipeline.results.tolerances import BRANCH_RTOL
 from pipeline.specification.tables import FREQUENCY
 
 
 @dataclass(frozen=True)
-class LimitSettings:
+class LimitSettings(RestSettings):
     """Numbers of the search for the equilibrium at the end of a branch, and of the fit of the law of its period."""
 
-    near: float = 0.05  # largest distance of an equilibrium that is near to an orbit, in units of the orbit's size
-    samples: int = 4000  # points on the last orbit
-    # most slow places of the orbit from which equilibria are looked for; more find those that are hardly met
-    guesses: int = 8
     # largest distance between the values of two folds of equilibria that happen at once, in units of the interval
     same_fold: float = 1e-9
     agrees: float = 0.05  # largest relative difference between the fitted and the computed slope of the period's law
@@ -58,6 +60,10 @@ class LimitSettings:
     windows: tuple[tuple[float, int], ...] = ((3.0, 8), (4.5, 12))
     least_range: float = 2.5  # least natural logarithm of the first range of distances, if it is to confirm a law
 
+
+CRAWLED = (
+    "the last steps led nowhere: Newton's method finds the next orbit very near alone, as at a touch or near a canard"
+)
 
 TOO_FAR = "the last points are too few, or too far from a limit, to confirm a law of the period"
 
@@ -104,45 +110,6 @@ def limit_of(branch: Branch, points: Sequence[Point], settings: LimitSettings = 
         reason = f"{len(places)} saddles are near"
     fold = _snic(family, points, states, settings)
     return fold if fold is not None and (isinstance(fold, Limit) or not len(places)) else reason
-
-
-def last_orbit(family: Family, end: Point, settings: LimitSettings) -> np.ndarray:
-    """Return states of a flow's last orbit on a branch, at equal intervals of time, shape (time, state)."""
-    rows, seconds = family.rows(end.u[None]), end.value.seconds
-    times, drive = np.linspace(0.0, seconds, settings.samples), Drive(np.array([seconds]))
-    packed = rows.parameters[:1]
-    orbit = sample(family.system, packed, rows.states, [times], drives=[drive], **tolerances_at(BRANCH_RTOL))
-    return np.asarray(orbit.states[0][np.isfinite(orbit.states[0]).all(axis=1)])
-
-
-def saddles_near(
-    family: Family, end: Point, states: np.ndarray, settings: LimitSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the saddles near an orbit, shape (saddle, state), and their eigenvalues by falling real part [1/s]."""
-    system = family.system
-    none = np.empty((0, system.n_states))
-    if not len(states):
-        return none, none
-    packed, size = family.rows(end.u[None]).parameters[0], _size(family, states)
-    found = find_equilibria(system, states[_slow(family, packed, states, settings)], packed)
-    places, eigenvalues = none, none
-    for place, own in zip(found.states[found.converged], found.eigenvalues[found.converged], strict=True):
-        is_near = scaled_distance(states, place, system).min() <= settings.near * size
-        is_known = bool((scaled_distance(places, place, system) < settings.near * size).any())
-        if is_near and not is_known and own.real.min() < 0.0 < own.real.max():
-            places, eigenvalues = np.vstack([places, place]), np.vstack([eigenvalues, own])
-    return places, eigenvalues
-
-
-def _size(family: Family, states: np.ndarray) -> float:
-    return float((np.ptp(states, axis=0) / np.asarray(family.system.scales)).max())
-
-
-def _slow(family: Family, packed: np.ndarray, states: np.ndarray, settings: LimitSettings) -> np.ndarray:
-    """Return the indices of the slow places of an orbit, the slowest first."""
-    speed = np.linalg.norm(rates_at(family.system, states, packed) / np.asarray(family.system.scales), axis=1)
-    slow = np.flatnonzero((speed <= np.roll(speed, 1)) & (speed <= np.roll(speed, -1)))
-    return np.asarray(slow[np.argsort(speed[slow])][: settings.guesses])
 
 
 # ---- the laws ----------------------------------------------------------------------------------
@@ -313,8 +280,8 @@ def _folds(family: Family, value: float, states: np.ndarray, settings: LimitSett
     """
     if not len(states):
         return []
-    system, size, folds = family.system, _size(family, states), list[Fold]()
-    for place in _slow(family, _packed(family, value), states, settings):
+    system, size, folds = family.system, size_of(family, states), list[Fold]()
+    for place in slow_places(family, _packed(family, value), states, settings):
         with np.errstate(all="ignore"):
             found = _fold(family, value, states[place])
         is_near = found is not None and scaled_distance(states, found[0], system).min() <= settings.near * size
@@ -396,7 +363,7 @@ def _numbered(branches: Sequence[int]) -> str:
 
 def _met(branch: Branch, points: Sequence[Point], settings: LimitSettings) -> list[str]:
     """Describe the end of a branch whose last points are given, from within the branch to the end."""
-    met = [_why(branch, points[-1])]
+    met = [CRAWLED if leads_nowhere(branch.family, list(points)) else _why(branch, points[-1])]
     if not has_cycles(branch):
         return met
     grows = grows_without_bound(np.array([p.u for p in points]), np.array([p.value.seconds for p in points]))
@@ -432,7 +399,7 @@ def _saddles(branch: Branch, end: Point, settings: LimitSettings) -> list[tuple[
     system, states = branch.family.system, last_orbit(branch.family, end, settings)
     texts = []
     for place, values in zip(*saddles_near(branch.family, end, states, settings), strict=True):
-        away = float(scaled_distance(states, place, system).min()) / _size(branch.family, states)
+        away = float(scaled_distance(states, place, system).min()) / size_of(branch.family, states)
         is_focus = any(abs(v.imag) > 0.0 for v in leading_of(values))
         where = ", ".join(f"{name} {x + 0.0:.6g}" for name, x in zip(system.state_names, place.round(12), strict=True))
         own = ", ".join(f"{v.real:.5g}{v.imag:+.5g}i" if v.imag else f"{v.real:.5g}" for v in values)

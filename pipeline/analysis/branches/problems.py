@@ -34,9 +34,10 @@ ONE_SIDED_STEP = 1e-7
 """Step of one-sided differences of an orbit by a parameter: its slope needs seven digits for Newton's method."""
 
 STEEP, STEEPEST, SHORTER = 1e2, 10.0, 1e-2
-"""Norm of a scaled monodromy matrix above which the map bends over less than this step; the largest change of a state
-per unit of the parameter for which the step is then taken along the branch, where the orbit's image moves no more than
-its start; and the share of the step that is taken else.
+"""Norm of a scaled monodromy matrix, or of the slope by the parameter, above which the map bends over less than this
+step; the largest change of a state per unit of the parameter for which the step is then taken along the branch, where
+the orbit's image moves no more than its start; and the share of the step that is taken else. Where the slope is large,
+as near canards, the step is no longer than one that moves the image by the first norm times the step.
 """
 
 STATE_STEP = 1e-6
@@ -97,6 +98,11 @@ class Value:
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers, or the eigenvalues of an equilibrium [1/s], in no order."""
         return np.linalg.eigvals(self.monodromy) if self.graded is None else self.graded
+
+    @property
+    def is_graded(self) -> bool:
+        """Whether the multipliers have more digits than the monodromy matrix holds."""
+        return self.graded is not None
 
     @property
     def is_finite(self) -> bool:
@@ -301,13 +307,20 @@ class OrbitProblem(FamilyProblem):
 
 
 def _steep_step(monodromy: np.ndarray, derivative: np.ndarray) -> np.ndarray | None:
-    """Return the step to the orbit that gives the slope by the parameter next, if the monodromy matrix is large."""
-    if not (np.isfinite(derivative).all() and np.linalg.norm(monodromy) > STEEP):
+    """Return the step to the orbit that gives the slope by the parameter next, if the monodromy matrix or the slope is
+    large.
+    """
+    if not np.isfinite(derivative).all():
         return None
-    tangent = np.linalg.svd(derivative)[2][-1]
-    if np.abs(tangent).max() > STEEPEST * abs(tangent[-1]):
-        return np.append(np.zeros(len(monodromy)), SHORTER * ONE_SIDED_STEP)
-    return np.asarray(ONE_SIDED_STEP * tangent / tangent[-1])
+    step, by_parameter = ONE_SIDED_STEP, float(np.linalg.norm(derivative[:, -1]))
+    if np.linalg.norm(monodromy) > STEEP:
+        tangent = np.linalg.svd(derivative)[2][-1]
+        if np.abs(tangent).max() <= STEEPEST * abs(tangent[-1]):
+            return np.asarray(step * tangent / tangent[-1])
+        step *= SHORTER
+    elif by_parameter <= STEEP:
+        return None
+    return np.append(np.zeros(len(monodromy)), min(step, ONE_SIDED_STEP * STEEP / by_parameter))
 
 
 def _is_joined(gap: float, residual: float) -> bool:

@@ -37,13 +37,15 @@ from pipeline.results.tolerances import BRANCH_RTOL
 class CutSettings:
     """Settings of the cuts of an orbit."""
 
-    steep: float = 1e4  # norm of the scaled monodromy matrix from which an orbit may be cut
+    # norm of the derivative of a return, by the scaled state and parameter, from which an orbit may be cut
+    steep: float = 1e2
     # norms of a segment's derivative, in units of the orbit's extents: above the first it is halved, and above the
     # second all are looked at again; more growth makes fewer segments, from which Newton's method converges less far
     growth: float = 20.0
     most_growth: float = 200.0
     least_segments: int = 16
     most_segments: int = 400
+    small: float = 0.15  # largest range of the nodes of an orbit that shrinks to an equilibrium [scales of the states]
     sweeps: int = 12  # most sweeps of `graded_multipliers`; each separates moduli by their ratio
     separated: float = 1e-8  # part of one subspace in the next at which the multipliers of both are told apart
 
@@ -52,13 +54,19 @@ def is_steep(point: Point, family: Family, cuts: CutSettings = CutSettings()) ->
     """Return whether a limit cycle of a flow is too steep for shooting over its whole period."""
     if not family.period or family.system.section is None:
         return False
-    return bool(np.linalg.norm(family.scaled(point.value.monodromy), 2) > cuts.steep)
+    return bool(np.linalg.norm(point.value.derivative, 2) > cuts.steep)
 
 
 def is_steeper(point: Point, cuts: CutSettings = CutSettings()) -> bool:
     """Return whether a cut orbit needs more cuts."""
     assert isinstance(point.value, CutValue)
     return bool(point.value.steepest.max() > cuts.most_growth)
+
+
+def is_small(point: Point, cuts: CutSettings = CutSettings()) -> bool:
+    """Return whether a cut orbit is as small as one that shrinks to an equilibrium."""
+    assert isinstance(point.value, CutValue)
+    return bool(point.value.extents.max() < cuts.small)
 
 
 def flown(family: Family, rows: Rows, seconds: np.ndarray, atol: float) -> tuple[np.ndarray, np.ndarray]:
@@ -100,10 +108,19 @@ class CutValue(Value):
     speeds: np.ndarray
 
     @property
+    def is_graded(self) -> bool:
+        """Always: the multipliers come from the segments one by one."""
+        return True
+
+    @property
+    def extents(self) -> np.ndarray:
+        """Ranges of the nodes."""
+        return np.asarray(np.ptp(self.nodes, axis=0))
+
+    @property
     def steepest(self) -> np.ndarray:
         """Norms of the segments' derivatives, in units of the orbit's extents."""
-        extents = np.ptp(self.nodes, axis=0)
-        extents = np.where(extents > 0.0, extents, 1.0)
+        extents = np.where(self.extents > 0.0, self.extents, 1.0)
         return np.asarray(np.linalg.norm(self.tangents * extents / extents[:, None], 2, axis=(1, 2)))
 
     @cached_property
@@ -134,7 +151,8 @@ def graded_multipliers(tangents: np.ndarray, speeds: np.ndarray, cuts: CutSettin
         Shape (state,), by falling modulus; the last one is 0, for the flow's own direction.
     """
     n = tangents.shape[1]
-    across = np.array([np.linalg.qr(np.column_stack([speed, np.eye(n)]))[0][:, 1:] for speed in speeds])
+    bases = np.concatenate([speeds[:, :, None], np.broadcast_to(np.eye(n), (len(speeds), n, n))], axis=2)
+    across = np.linalg.qr(bases)[0][:, :, 1:]
     factors = np.roll(across, -1, axis=0).transpose(0, 2, 1) @ tangents @ across
     basis = np.eye(n - 1)
     for _ in range(cuts.sweeps):
@@ -209,7 +227,7 @@ class CutProblem:
         images, tangents = flown(self.family, rows, durations, tolerances_at(BRANCH_RTOL)["atol"])
         here = replace(rows, states=np.concatenate([rows.states[:m], images[:m]]))
         rates = rates_packed(self.system, here.states, rows.parameters[np.r_[:m, :m]], rows.frequency_hz) / scales
-        scaled = np.array([self.family.scaled(one) for one in tangents[:m]])
+        scaled = self.family.scaled(tangents[:m])
         slopes = self._wrapped((images[m:] - images[:m]) / scales) / ONE_SIDED_STEP
         by = self._by_unknowns(scaled, slopes, rates[m:])
         gaps = self._wrapped(images[:m] / scales - np.roll(nodes, -1, axis=0)).ravel()
@@ -230,12 +248,11 @@ class CutProblem:
     def _by_unknowns(self, tangents: np.ndarray, slopes: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         """Return the derivatives of the gaps, from those of the segments and the rates at their ends."""
         m, n = slopes.shape
-        by = np.zeros((m, n, self.size))
-        for k in range(m):
-            by[k, :, n * k : n * (k + 1)] += tangents[k] / self._weight
-            after = (k + 1) % m
-            by[k, :, n * after : n * (after + 1)] -= np.eye(n) / self._weight
-            by[k, :, m * n + self.returns[k]] = speeds[k] * self.shares[k] * self.unit
+        by, each = np.zeros((m, n, self.size)), np.arange(m)
+        by_nodes = by[:, :, : m * n].reshape(m, n, m, n)  # a view
+        by_nodes[each, :, each] += tangents / self._weight
+        by_nodes[each, :, (each + 1) % m] -= np.eye(n) / self._weight
+        by[each, :, m * n + self.returns] = speeds * self.shares[:, None] * self.unit
         by[:, :, -1] = slopes
         return by.reshape(m * n, -1)
 

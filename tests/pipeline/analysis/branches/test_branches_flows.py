@@ -235,6 +235,37 @@ def test_explore__unstable_cycle_of_lorenz():
     assert any("saddle quantity 4.4" in line and "an unstable cycle" in line for line in branches_table(ds).lines)
 
 
+CANARD = table("canard", {"x": "(y - x**3/3 + x)/eps", "y": "a - x"}, {"a": 0.95, "eps": 0.02})
+"""Van der Pol's oscillator with a constant force: relaxation cycles for a < a_c, rest for a > 1 (Hopf point at 1)."""
+
+
+def test_explore__through_a_canard_explosion():
+    """The cycles shrink at a_c = 1 - eps/8 - 3 eps^2/32 - 173 eps^3/1024 (Zvonkin and Shubin 1984) within exp(-1/eps),
+    and their section point stands still while the period grows.
+    """
+    ds = followed(CANARD, "x", [1.0, 0.8956], "a", 0.9, 1.01, level=1.0, longest=20.0, a=0.95)
+    ends = str(ds["first_end"].attrs["flag_meanings"]).split()
+    assert [ends[int(ds[name][0])] for name in ("first_end", "last_end")] == ["bound", "equilibrium"]
+    assert int(ds["n_points"][0]) < 600
+    assert not table_of(ds)
+    a, seconds = (ds[name].values[0, : int(ds["n_points"][0])] for name in ("parameter", "period_s"))
+    eps, longest = 0.02, int(np.argmax(seconds))
+    known = 1.0 - eps / 8.0 - 3.0 * eps**2 / 32.0 - 173.0 * eps**3 / 1024.0
+    assert a[longest] == pytest.approx(known, abs=eps**4)
+    assert np.ptp(a[np.abs(np.arange(len(a)) - longest) < 10]) < 1e-10
+    assert seconds[longest] > 4.8
+    # a cycle of the branch beside Hopf's point, by scipy
+    near = longest + int(np.argmin(np.abs(a[longest:] - 0.9995)))
+
+    def rates(_, u):
+        return [(u[1] - u[0] ** 3 / 3.0 + u[0]) / eps, a[near] - u[0]]
+
+    state = ds["section"].values[0, near, 0]
+    assert solve_ivp(rates, (0.0, seconds[near]), state, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1] == pytest.approx(
+        state, abs=1e-8
+    )
+
+
 HODGKIN_HUXLEY = table(
     "hodgkin-huxley",
     {

@@ -3,18 +3,20 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import xarray as xr
 
 from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.analysis import _no_equilibria, curves_table
-from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.arclength import Point, crawls
 from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.completeness import cut_words
-from pipeline.analysis.branches.curves import Curve, crawls, curves_dataset, not_followed
+from pipeline.analysis.branches.curves import Curve, curves_dataset, not_followed
+from pipeline.analysis.branches.following import leads_nowhere
 from pipeline.analysis.branches.lockstep import within
-from pipeline.analysis.branches.problems import Family, Value
+from pipeline.analysis.branches.problems import STEEP, Family, Value, _steep_step
 from pipeline.layout.vocabulary import model_attribute, section_attributes
 
 
@@ -71,6 +73,31 @@ def test_crawls():
     assert crawls(points([0.01] * 5 + [1e-7] * 25))
     assert not crawls(points([0.01] * 5 + [1e-7] * 15))
     assert not crawls(points(1e-7 * 1.5 ** np.arange(30)))
+
+
+@pytest.mark.parametrize(("is_flow", "slope", "many"), [(True, 1e3, 20), (True, 1.0, 100), (False, 1e3, 100)])
+def test_leads_nowhere(is_flow, slope, many):
+    """A branch that crawls ends: soon where its cycles may be cut, later where nothing leads on."""
+    family = Family(SimpleNamespace(section=(0, 1) if is_flow else None), 1, 1.0, np.zeros(1), ("p",), (1.0,))
+
+    def points(n):
+        value = SimpleNamespace(derivative=np.array([[0.0, slope]]), seconds=1.0)
+        return [SimpleNamespace(u=np.array([x, 0.0]), value=value) for x in np.append(-0.1, 1e-7 * np.arange(n))]
+
+    assert leads_nowhere(family, points(many + 1))
+    assert not leads_nowhere(family, points(many - 1))
+
+
+def test_steep_step():
+    """Where the image moves much with the parameter, as near a canard, its slope is taken over a shorter step."""
+    still = np.diag([1e-3, 1e-4])
+
+    def step(slope):
+        return _steep_step(still, np.column_stack([still - np.eye(2), [slope, 0.0]]))
+
+    assert step(0.9 * STEEP) is None
+    for slope in (1e4, 1e7):
+        np.testing.assert_allclose(step(slope), [0.0, 0.0, 1e-5 / slope], rtol=1e-12)
 
 
 def test_within():
